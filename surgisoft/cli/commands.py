@@ -1,0 +1,1 @@
+"""Import every module of commands, so that each registers itself on the app."""

@@ -1,0 +1,1 @@
+"""What a lab records: recordings, importers, protocols and the virtual rig."""

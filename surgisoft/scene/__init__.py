@@ -1,0 +1,1 @@
+"""Geometry: meshes, collision, rays, ablation, camera. Knows no arm physics."""

@@ -1,0 +1,1 @@
+"""The arm model: HAW-NN, effects, backbone, baselines. Knows no scene."""

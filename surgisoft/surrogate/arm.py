@@ -1,0 +1,81 @@
+"""What one arm is (`ArmSpec`) and where it stands (`ArmState`)."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+
+
+@dataclass(frozen=True)
+class ArmSpec:
+    """One arm's inputs, outputs and proportions."""
+
+    chambers: int
+    """Number m of chambers (or tendons)."""
+    key_points: int
+    """Number n of key points, base to tip."""
+    low: tuple[float, ...]
+    """Smallest actuation seen in each chamber, in `unit`."""
+    high: tuple[float, ...]
+    """Largest actuation seen in each chamber, in `unit`."""
+    unit: str = "kPa"
+    """Unit of the actuation: kPa, psi, deg, mm, V, norm."""
+    actuation: str = "measured"
+    """Which actuation the model takes: `measured` or `commanded`."""
+    band: tuple[float, ...] = ()
+    """Half width of the dead band of the direction of change in each chamber, in `unit`."""
+    length_mm: float | None = None
+    """Length at rest, mm."""
+    diameter_mm: float | None = None
+    """Outer diameter, mm."""
+    gravity: tuple[float, float, float] | None = None
+    """Unit vector of weight in the base frame, where the recordings say it."""
+
+    def __post_init__(self):
+        for name in ("low", "high", "band"):
+            value = getattr(self, name)
+            if name == "band" and not value:
+                value = tuple(0.0 for _ in range(self.chambers))
+                object.__setattr__(self, "band", value)
+            if len(value) != self.chambers:
+                raise InputError(
+                    f"arm: '{name}' has {len(value)} values, expected {self.chambers}, one a chamber"
+                )
+
+    @property
+    def span(self) -> tuple[float, ...]:
+        """Range of the actuation of each chamber, in `unit`; never zero."""
+        return tuple(
+            high - low if high > low else 1.0
+            for low, high in zip(self.low, self.high, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class ArmState:
+    """A batch of arms at one instant; every tensor has the batch in front."""
+
+    pressure: Tensor
+    """(B, m) actuation that was commanded to the model, in the arm's unit."""
+    anchor: Tensor
+    """(B, m) actuation of the last confirmed move, in the arm's unit."""
+    direction: Tensor
+    """(B, m) direction of change: -1 falling, +1 rising, 0 not yet moved."""
+    memory: dict[str, Tensor]
+    """State of each effect or network that remembers, keyed by its name; (B, ...)."""
+
+    def where(self, mask: Tensor, other: "ArmState") -> "ArmState":
+        """`other` where the (B,) mask holds, this state elsewhere; nothing is changed in place."""
+
+        def pick(theirs: Tensor, ours: Tensor) -> Tensor:
+            return torch.where(mask.view(-1, *[1] * (ours.ndim - 1)), theirs, ours)
+
+        return replace(
+            self,
+            pressure=pick(other.pressure, self.pressure),
+            anchor=pick(other.anchor, self.anchor),
+            direction=pick(other.direction, self.direction),
+            memory={name: pick(other.memory[name], value) for name, value in self.memory.items()},
+        )

@@ -1,0 +1,121 @@
+"""A model is a folder: `config.json` and `weights.safetensors`. Opening one runs no code of it."""
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from surgisoft import __version__
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.recurrent import RecurrentArm
+
+FORMAT = 1
+"""Version of the folder's layout."""
+
+NETWORKS = {
+    "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
+    "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
+    "recurrent": (RecurrentArm, ("key_points", "width")),
+}
+"""Every network by name: its class and the arguments that build it again."""
+
+
+def _network_config(network) -> dict:
+    for name, (kind, fields) in NETWORKS.items():
+        if type(network) is kind:
+            return {"kind": name, **{field: getattr(network, field) for field in fields}}
+    raise TypeError(f"no checkpoint format for {type(network).__name__}")
+
+
+def claim_folder(folder: str | Path, force: bool = False) -> Path:
+    """The folder to write to, which must be free or may be replaced; nothing is touched yet."""
+    folder = Path(folder)
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
+        raise InputError(f"{folder}: already there; choose another name or pass --force")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
+        raise InputError(f"{folder}: holds something that is no model; choose another name")
+    return folder
+
+
+def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, force=False):
+    """Write the model whole or not at all; `report` (JSON-able) is kept beside it."""
+    folder = claim_folder(folder, force)
+    config = {
+        "format": FORMAT,
+        "surgisoft": __version__,
+        "arm": asdict(model.spec),
+        "network": _network_config(model.network),
+        "effects": {name: effect.config() for name, effect in model.effects.items()},
+        "validation": model.validation,
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
+        save_file(weights, fresh / "weights.safetensors")
+        (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        if report is not None:
+            (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+        fresh.chmod(0o755)
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+            os.replace(folder, old / "old")
+            os.replace(fresh, folder)
+            shutil.rmtree(old)
+        else:
+            os.replace(fresh, folder)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+
+
+def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmModel:
+    """The model in a folder, ready to evaluate; bit-equal to what was saved."""
+    folder = Path(folder)
+    if not (folder / "config.json").is_file():
+        raise InputError(
+            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+        )
+    try:
+        config = json.loads((folder / "config.json").read_text())
+        weights = load_file(folder / "weights.safetensors")
+        if config["format"] != FORMAT:
+            raise InputError(
+                f"{folder}: model format {config['format']}, expected {FORMAT}; fit it again"
+            )
+        spec = ArmSpec(
+            **{
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in config["arm"].items()
+            }
+        )
+        low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+        network = dict(config["network"])
+        kind = network.pop("kind")
+        if kind not in NETWORKS:
+            raise unknown_name("network", kind, NETWORKS)
+        effects = {
+            name: make_effect(name, low, high, **arguments)
+            for name, arguments in config["effects"].items()
+        }
+        model = ArmModel(
+            spec, NETWORKS[kind][0](low, high, **network), effects, None, config["validation"]
+        )
+        model.load_state_dict(weights)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{folder}: damaged model ({type(error).__name__}: {str(error)[:120]}); fit it again"
+        ) from error
+    return model.to(device).eval().requires_grad_(False)

@@ -1,0 +1,106 @@
+"""Actuation and shape over time, as tensors: what models are fitted to and judged on."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+
+
+@dataclass(frozen=True)
+class History:
+    """Runs of equal (padded) length. Rows with `valid` false are padding."""
+
+    t_s: Tensor
+    """(R, T) float64, seconds since the start of each run's recording."""
+    pressure: Tensor
+    """(R, T, m) float32, actuation in the arm's unit; padding repeats the last row."""
+    key_points: Tensor
+    """(R, T, n, 3) float32, mm, base frame; NaN where missing and in the padding."""
+    valid: Tensor
+    """(R, T) bool."""
+    noise: tuple[float, ...] | None = None
+    """Standard deviation of the measured actuation at rest, one a chamber, if known."""
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.pressure.shape[0]
+
+    @property
+    def chambers(self) -> int:
+        """Number m of chambers."""
+        return self.pressure.shape[2]
+
+    @property
+    def dt_s(self) -> Tensor:
+        """(R, T) float32, time since the row before, s; 0 in the first row and in the padding."""
+        dt = torch.zeros_like(self.t_s)
+        dt[:, 1:] = self.t_s[:, 1:] - self.t_s[:, :-1]
+        return torch.where(self.valid, dt, torch.zeros_like(dt)).float()
+
+    def rows(self, tensor: Tensor) -> Tensor:
+        """The rows of a (R, T, ...) tensor that are no padding, (S, ...), run by run."""
+        return tensor[self.valid]
+
+    @property
+    def run_of_row(self) -> Tensor:
+        """(S,) index of the run of each row that is no padding."""
+        index = torch.arange(self.runs, device=self.valid.device)[:, None].expand_as(self.valid)
+        return index[self.valid]
+
+    def select(self, runs: Tensor) -> "History":
+        """Only the given runs, (k,) indices."""
+        length = int(self.valid[runs].sum(1).max())
+        return History(
+            self.t_s[runs, :length],
+            self.pressure[runs, :length],
+            self.key_points[runs, :length],
+            self.valid[runs, :length],
+            self.noise,
+        )
+
+    def to(self, device) -> "History":
+        """The same on another device."""
+        return History(
+            self.t_s.to(device),
+            self.pressure.to(device),
+            self.key_points.to(device),
+            self.valid.to(device),
+            self.noise,
+        )
+
+
+def pack(
+    t_s: list[Tensor],
+    pressure: list[Tensor],
+    key_points: list[Tensor],
+    noise: tuple[float, ...] | None = None,
+) -> History:
+    """Runs of any lengths as one padded history.
+
+    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm.
+    """
+    if not pressure:
+        raise InputError("no run: expected at least one with one row; check the recordings")
+    length = max(len(run) for run in pressure)
+
+    def stack(runs: list[Tensor], dtype, fill: float | None) -> Tensor:
+        out = []
+        for run in runs:
+            run = run.to(dtype)
+            rest = length - len(run)
+            tail = run[-1:].expand(rest, *run.shape[1:])
+            if fill is not None:
+                tail = torch.full_like(tail, fill)
+            out.append(torch.cat([run, tail]))
+        return torch.stack(out)
+
+    return History(
+        t_s=stack(t_s, torch.float64, None),
+        pressure=stack(pressure, torch.float32, None),
+        key_points=stack(key_points, torch.float32, float("nan")),
+        valid=stack([torch.ones(len(run), dtype=torch.bool) for run in pressure], torch.bool, 0),
+        noise=noise,
+    )

@@ -1,0 +1,168 @@
+"""The arm model: line effects -> material effects -> network -> body effects -> sensor effects."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate import direction as directions
+from surgisoft.surrogate.arm import ArmSpec, ArmState
+from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.effects import STAGES, Effect, Stage
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.recurrent import RecurrentArm
+
+NETWORK = "network"
+"""Key of a remembering network's state in `ArmState.memory`."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the network and the material effects see in each row of a history."""
+
+    pressure: Tensor
+    """(R, T, m) chamber pressure, after the line effects."""
+    direction: Tensor
+    """(R, T, m) direction of change."""
+    memory: dict[str, Tensor]
+    """(R, T, ...) memory of each material effect."""
+
+
+class ArmModel(nn.Module):
+    """Batched, differentiable arm: `step` for worlds, `predict` for whole recordings.
+
+    Both are built from the same `advance`, `scan` and `apply` of each part and agree.
+    """
+
+    def __init__(
+        self,
+        spec: ArmSpec,
+        network: HawNN | ConstantCurvature | RecurrentArm,
+        effects: dict[str, Effect] | None = None,
+        rest_mm: Tensor | None = None,
+        validation: dict | None = None,
+    ):
+        """`rest_mm` (n, 3): key points at rest, base frame; `validation`: the validated error."""
+        super().__init__()
+        effects = effects or {}
+        order = sorted(effects, key=lambda name: STAGES.index(effects[name].stage))
+        self.spec = spec
+        self.network = network
+        self.effects = nn.ModuleDict({name: effects[name] for name in order})
+        self.validation = dict(validation or {})
+        rest = torch.zeros(spec.key_points, 3) if rest_mm is None else rest_mm.float()
+        self.register_buffer("rest_mm", rest)
+        self.register_buffer("band", torch.tensor(spec.band, dtype=torch.float32))
+
+    def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
+        """The effects of one stage, by name, in order."""
+        return [(name, effect) for name, effect in self.effects.items() if effect.stage == stage]
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the network itself has a state."""
+        return isinstance(self.network, RecurrentArm)
+
+    def backbone(self, samples: int = 21, degree: int = 3) -> Backbone:
+        """The B-spline through this arm's key points."""
+        return Backbone.through(self.rest_mm, samples, degree).to(self.rest_mm.device)
+
+    def initial_state(self, batch: int = 1, pressure: Tensor | None = None) -> ArmState:
+        """(B) arms without history at `pressure` (B, m) in the arm's unit.
+
+        Without a pressure: at zero, or at the end of the range that is nearest to it.
+        """
+        if pressure is None:
+            low = self.band.new_tensor(self.spec.low)
+            high = self.band.new_tensor(self.spec.high)
+            pressure = torch.zeros_like(low).clamp(low, high).expand(batch, -1)
+        memory = {}
+        signal = pressure
+        for name, effect in self.stage("line") + self.stage("material"):
+            memory[name] = effect.rest(signal)
+            signal = effect.apply(signal, memory[name])
+        if self.remembers:
+            memory[NETWORK] = self.network.rest(pressure)
+        if self.stage("body") or self.stage("sensor"):
+            points = self._network(signal, torch.zeros_like(pressure), memory)
+            for name, effect in self.stage("body") + self.stage("sensor"):
+                memory[name] = effect.rest(points)
+                points = effect.apply(points, memory[name])
+        return ArmState(pressure, pressure, torch.zeros_like(pressure), memory)
+
+    def _network(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
+        if self.remembers:
+            return self.network(pressure, direction, memory[NETWORK])
+        return self.network(pressure, direction)
+
+    def step(self, state: ArmState, dp: Tensor, dt: Tensor | float) -> tuple[ArmState, Tensor]:
+        """Change the actuation by dp (B, m), in the arm's unit, over dt seconds.
+
+        Returns the new state and the key points (B, n, 3) in mm, base frame.
+        """
+        pressure = state.pressure + dp
+        dt = torch.as_tensor(dt, dtype=pressure.dtype, device=pressure.device).expand(len(pressure))
+        memory = dict(state.memory)
+
+        def advance(stage: Stage, signal: Tensor) -> Tensor:
+            for name, effect in self.stage(stage):
+                memory[name] = effect.advance(memory[name], signal, dt)
+                signal = effect.apply(signal, memory[name])
+            return signal
+
+        chamber = advance("line", pressure)
+        anchor, direction = directions.advance(state.anchor, state.direction, chamber, self.band)
+        effective = advance("material", chamber)
+        if self.remembers:
+            memory[NETWORK] = self.network.advance(memory[NETWORK], effective, direction)
+        points = advance("sensor", advance("body", self._network(effective, direction, memory)))
+        return ArmState(pressure, anchor, direction, memory), points
+
+    def trace(self, history: History) -> Trace:
+        """What `shape` needs in each row; every run starts without history at its first row."""
+        dt = history.dt_s
+        chamber = history.pressure
+        for _, effect in self.stage("line"):
+            chamber = effect.apply(chamber, effect.scan(chamber, dt))
+        _, direction = directions.trace(chamber, self.band)
+        memory, signal = {}, chamber
+        for name, effect in self.stage("material"):
+            memory[name] = effect.scan(signal, dt)
+            signal = effect.apply(signal, memory[name])
+        return Trace(chamber, direction, memory)
+
+    def effective(self, pressure: Tensor, memory: dict[str, Tensor]) -> Tensor:
+        """Effective actuation (..., m) from chamber pressure (..., m) and memories."""
+        for name, effect in self.stage("material"):
+            pressure = effect.apply(pressure, memory[name])
+        return pressure
+
+    def shape(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
+        """Key points (..., n, 3) in mm before body and sensor effects, of a static network."""
+        return self.network(self.effective(pressure, memory), direction)
+
+    def predict(self, history: History) -> Tensor:
+        """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
+        trace = self.trace(history)
+        if self.remembers:
+            effective = self.effective(trace.pressure, trace.memory)
+            hidden = self.network.scan(effective, trace.direction)
+            points = self.network(effective, trace.direction, hidden)
+        else:
+            points = self.shape(trace.pressure, trace.direction, trace.memory)
+        dt = history.dt_s
+        for _, effect in self.stage("body") + self.stage("sensor"):
+            points = effect.apply(points, effect.scan(points, dt))
+        return points
+
+    def summary(self) -> str:
+        """One line: inputs, network, effects."""
+        inputs = "pressure+direction" if self.network.directions else "pressure"
+        effects = " + ".join(self.effects) or "none"
+        return (
+            f"{type(self.network).__name__} ({inputs}), {self.spec.chambers} chambers in "
+            f"{self.spec.unit} ({self.spec.actuation}), {self.spec.key_points} key points, "
+            f"effects: {effects}"
+        )

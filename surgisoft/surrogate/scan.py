@@ -1,0 +1,41 @@
+"""Recurrences over a whole recording at once.
+
+A play operator clamps its last value into a band around the input. Clamps compose to clamps, so a
+run of T steps is a prefix scan of log2(T) passes over all runs, chambers and thresholds, and gives
+bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms").
+"""
+
+import torch
+from torch import Tensor
+
+
+def clamp_scan(low: Tensor, high: Tensor, start: Tensor) -> Tensor:
+    """y[:, t] = clamp(y[:, t-1], low[:, t], high[:, t]) with y[:, -1] = start.
+
+    Shapes: low, high (R, T, ...), start (R, ...); answer (R, T, ...).
+    """
+    steps = low.shape[1]
+    shift = 1
+    while shift < steps:
+        # Prefix ending at t - shift first, then the one ending at t.
+        first_low, first_high = low[:, :-shift], high[:, :-shift]
+        then_low, then_high = low[:, shift:], high[:, shift:]
+        low = torch.cat(
+            [low[:, :shift], torch.minimum(torch.maximum(first_low, then_low), then_high)], dim=1
+        )
+        high = torch.cat(
+            [high[:, :shift], torch.minimum(torch.maximum(first_high, then_low), then_high)], dim=1
+        )
+        shift *= 2
+    return torch.minimum(torch.maximum(start.unsqueeze(1), low), high)
+
+
+def last_nonzero(values: Tensor) -> Tensor:
+    """At each step the latest value along dim 1 that is not zero; 0 before the first.
+
+    Shape (R, T, ...) in and out.
+    """
+    steps = torch.arange(values.shape[1], device=values.device)
+    steps = steps.view(1, -1, *[1] * (values.ndim - 2)).expand_as(values)
+    index = torch.where(values != 0, steps, torch.zeros_like(steps)).cummax(dim=1).values
+    return torch.gather(values, 1, index)

@@ -1,0 +1,202 @@
+"""Rigid poses and rotations, for numpy arrays and torch tensors alike.
+
+A pose is a (..., 4, 4) matrix that maps points of its own frame into its parent's frame:
+`p_parent = pose @ p_own`. World frame: z up, millimetres. Quaternions are (w, x, y, z), unit norm.
+Every function returns the kind it was given (numpy stays numpy, torch keeps dtype and device).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def _library(array):
+    """numpy or torch, whichever the array belongs to."""
+    return torch if isinstance(array, torch.Tensor) else np
+
+
+def _as_arrays(*values):
+    """All values as torch tensors if one of them is, as float64 numpy arrays otherwise."""
+    tensors = [v for v in values if isinstance(v, torch.Tensor)]
+    if tensors:
+        like = tensors[0]
+        return [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
+    return [np.asarray(v, dtype=np.float64) for v in values]
+
+
+def norm(vector):
+    """Euclidean length of (..., 3) vectors: (...)."""
+    return _library(vector).sqrt((vector * vector).sum(-1))
+
+
+def normalise(vector):
+    """Unit vectors along (..., 3) vectors; a zero vector stays zero."""
+    length = norm(vector)[..., None]
+    return vector / (length + (length == 0))
+
+
+def cross(a, b):
+    """Cross product of (..., 3) vectors, broadcast."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return _library(a).stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
+
+
+def dot(a, b):
+    """Dot product of (..., 3) vectors, broadcast: (...)."""
+    return (a * b).sum(-1)
+
+
+def pose_from(rotation, position_mm):
+    """Pose (..., 4, 4) from a rotation (..., 3, 3) and a position (..., 3) in mm."""
+    rotation, position_mm = _as_arrays(rotation, position_mm)
+    lib = _library(rotation)
+    batch = np.broadcast_shapes(tuple(rotation.shape[:-2]), tuple(position_mm.shape[:-1]))
+    rotation = lib.broadcast_to(rotation, (*batch, 3, 3))
+    position_mm = lib.broadcast_to(position_mm, (*batch, 3))
+    top = lib.concatenate((rotation, position_mm[..., None]), -1)
+    bottom = lib.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return lib.concatenate((top, bottom), -2)
+
+
+def identity():
+    """The pose that changes nothing: (4, 4) float64."""
+    return np.eye(4)
+
+
+def compose(*poses):
+    """Product of poses (..., 4, 4), outermost first: compose(world_b, b_c) is world_c."""
+    arrays = _as_arrays(*poses)
+    result = arrays[0]
+    for pose in arrays[1:]:
+        result = result @ pose
+    return result
+
+
+def invert(pose):
+    """Inverse of rigid poses (..., 4, 4): transposed rotation, rotated negative position."""
+    (pose,) = _as_arrays(pose)
+    rotation = _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
+    return pose_from(rotation, -(rotation @ pose[..., :3, 3:])[..., 0])
+
+
+def apply(pose, points_mm):
+    """Points (..., N, 3) mm of the pose's own frame, in its parent's frame; pose (..., 4, 4)."""
+    pose, points_mm = _as_arrays(pose, points_mm)
+    turned = points_mm @ _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
+    return turned + pose[..., None, :3, 3]
+
+
+def rotate(pose, vectors):
+    """Directions (..., N, 3) of the pose's own frame, in its parent's frame; pose (..., 4, 4)."""
+    pose, vectors = _as_arrays(pose, vectors)
+    return vectors @ _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
+
+
+def rotation_from_z(z_axis, roll_rad=0.0):
+    """Rotation (..., 3, 3) with third column z_axis (..., 3), turned by roll_rad (...) about it.
+
+    At roll 0 the x axis is the parent's x axis projected into the plane across z (the parent's y
+    axis when z runs along x), so arms pointing straight up or down have an unsurprising x.
+    """
+    z_axis, roll_rad = _as_arrays(z_axis, roll_rad)
+    lib = _library(z_axis)
+    z = normalise(z_axis)
+    ex, ey = lib.zeros_like(z), lib.zeros_like(z)
+    ex[..., 0] = 1.0
+    ey[..., 1] = 1.0
+    along_x = (abs(z[..., :1]) > 1.0 - 1e-9) * lib.ones_like(z)
+    reference = lib.where(along_x > 0, ey, ex)
+    x = normalise(reference - dot(reference, z)[..., None] * z)
+    y = cross(z, x)
+    c, s = lib.cos(roll_rad)[..., None], lib.sin(roll_rad)[..., None]
+    return lib.stack((c * x + s * y, c * y - s * x, z * lib.ones_like(c)), -1)
+
+
+def pose_from_z(position_mm, z_axis, roll_rad=0.0):
+    """Pose (..., 4, 4) at position_mm (..., 3) with its z along z_axis (..., 3), see above."""
+    position_mm, z_axis, roll_rad = _as_arrays(position_mm, z_axis, roll_rad)
+    return pose_from(rotation_from_z(z_axis, roll_rad), position_mm)
+
+
+def look_at(eye_mm, target_mm, up=(0.0, 0.0, 1.0)):
+    """Camera pose (..., 4, 4) at eye_mm (..., 3): z looks at target_mm, x right, y down the image.
+
+    `up` (..., 3) is the direction that appears upwards. Looking along `up` itself, the parent's x
+    axis takes its place.
+    """
+    eye_mm, target_mm, up = _as_arrays(eye_mm, target_mm, up)
+    lib = _library(eye_mm)
+    z = normalise(target_mm - eye_mm)
+    right = cross(z, up * lib.ones_like(z))
+    across = norm(right)[..., None] > 1e-9
+    fallback = rotation_from_z(z)[..., :, 0]
+    x = normalise(lib.where(across, right, fallback))
+    return pose_from(lib.stack((x, cross(z, x), z), -1), eye_mm)
+
+
+def rotation_from_axis_angle(axis, angle_rad):
+    """Rotation (..., 3, 3) by angle_rad (...) about axis (..., 3) (Rodrigues 1840)."""
+    axis, angle_rad = _as_arrays(axis, angle_rad)
+    half = angle_rad / 2.0
+    lib = _library(axis)
+    vector = normalise(axis) * lib.sin(half)[..., None]
+    scalar = lib.cos(half)[..., None] * lib.ones_like(vector[..., :1])
+    return rotation_from_quaternion(lib.concatenate((scalar, vector), -1))
+
+
+def rotation_from_quaternion(quaternion):
+    """Rotation (..., 3, 3) of quaternions (..., 4) as (w, x, y, z); they are normalised first."""
+    (quaternion,) = _as_arrays(quaternion)
+    lib = _library(quaternion)
+    q = normalise(quaternion)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = (
+        lib.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
+        lib.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
+        lib.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
+    )
+    return lib.stack(rows, -2)
+
+
+def quaternion_from_rotation(rotation):
+    """Quaternions (..., 4) as (w, x, y, z), w >= 0, of rotations (..., 3, 3).
+
+    Each of the four columns of 4 q q^T is a multiple of q; the longest is taken (Shepperd 1978).
+    """
+    (r,) = _as_arrays(rotation)
+    lib = _library(r)
+    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
+    a, b, c = (
+        r[..., 2, 1] - r[..., 1, 2],
+        r[..., 0, 2] - r[..., 2, 0],
+        r[..., 1, 0] - r[..., 0, 1],
+    )
+    xy, xz, yz = (
+        r[..., 0, 1] + r[..., 1, 0],
+        r[..., 0, 2] + r[..., 2, 0],
+        r[..., 1, 2] + r[..., 2, 1],
+    )
+    diagonal = [1 + trace] + [1 + 2 * r[..., i, i] - trace for i in range(3)]
+    rows = (
+        lib.stack((diagonal[0], a, b, c), -1),
+        lib.stack((a, diagonal[1], xy, xz), -1),
+        lib.stack((b, xy, diagonal[2], yz), -1),
+        lib.stack((c, xz, yz, diagonal[3]), -1),
+    )
+    candidates = lib.stack(rows, -2)
+    best = lib.stack(diagonal, -1).argmax(-1)[..., None, None]
+    if lib is torch:
+        row = torch.take_along_dim(candidates, best.expand(*candidates.shape[:-2], 1, 4), -2)
+    else:
+        row = np.take_along_axis(candidates, best, -2)
+    q = normalise(row[..., 0, :])
+    return lib.where(q[..., :1] < 0, -q, q)
+
+
+def angle_between(a, b):
+    """Angle in rad between (..., 3) vectors, exact near 0 and pi (Kahan 2006: atan2 form)."""
+    a, b = _as_arrays(a, b)
+    return _library(a).arctan2(norm(cross(a, b)), dot(a, b))

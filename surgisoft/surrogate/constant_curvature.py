@@ -54,7 +54,7 @@ class ConstantCurvature(nn.Module):
             raise InputError("constant curvature needs at least 2 key points; this arm has 1")
         self.key_points, self.sections = key_points, sections
         self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
         self.register_buffer("fraction", torch.linspace(0, 1, key_points))
         self.register_buffer("length", torch.ones(()))
         self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))
@@ -70,7 +70,7 @@ class ConstantCurvature(nn.Module):
 
     def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
         """Key points (..., n, 3) in mm, base frame, from pressure (..., m)."""
-        x = (pressure - self.centre) / self.half
+        x = (pressure - self.centre) / self.half_range
         x = torch.cat([x, torch.ones_like(x[..., :1])], -1)
         values = torch.einsum("scm,...m->...sc", self.table, x)
         turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)

@@ -30,7 +30,7 @@ class HawNN(nn.Module):
         self.hidden = tuple(hidden)
         self.directions = directions
         self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
         self.register_buffer("use", torch.ones(chambers))
         self.register_buffer("mean", torch.zeros(3 * key_points))
         self.register_buffer("scale", torch.ones(3 * key_points))
@@ -43,7 +43,7 @@ class HawNN(nn.Module):
 
     def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
         """Key points (..., n, 3) in mm, base frame, from pressure and direction, each (..., m)."""
-        x = (pressure - self.centre) / self.half
+        x = (pressure - self.centre) / self.half_range
         if self.directions:
             x = torch.cat([x, direction * self.use], dim=-1)
         y = torch.addcmul(self.mean, self.layers(x), self.scale)
@@ -56,8 +56,8 @@ class HawNN(nn.Module):
         `use` (m,) is 1 for each chamber whose direction the data supports, 0 elsewhere.
         """
         grown = HawNN(
-            self.centre - self.half,
-            self.centre + self.half,
+            self.centre - self.half_range,
+            self.centre + self.half_range,
             self.key_points,
             self.hidden,
             directions=True,

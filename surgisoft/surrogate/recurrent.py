@@ -19,7 +19,7 @@ class RecurrentArm(nn.Module):
         chambers = len(low)
         self.key_points, self.width = key_points, width
         self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
         self.register_buffer("mean", torch.zeros(3 * key_points))
         self.register_buffer("scale", torch.ones(3 * key_points))
         self.cell = nn.GRU(2 * chambers, width, batch_first=True)
@@ -28,7 +28,7 @@ class RecurrentArm(nn.Module):
         )
 
     def _inputs(self, pressure: Tensor, direction: Tensor) -> Tensor:
-        return torch.cat([(pressure - self.centre) / self.half, direction], dim=-1)
+        return torch.cat([(pressure - self.centre) / self.half_range, direction], dim=-1)
 
     def rest(self, pressure: Tensor) -> Tensor:
         """(B, width) hidden state of an arm without history, for pressure (B, m)."""

@@ -33,7 +33,7 @@ class Hysteresis(Effect):
         span = (high - low).where(high > low, torch.ones_like(low))
         self.radii = tuple(radii)
         self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half", span / 2)
+        self.register_buffer("half_range", span / 2)
         self.register_buffer("radius", span[:, None] * torch.tensor(self.radii))
         self.register_buffer("use", torch.ones(len(low)))
         shape = (len(low), len(low), len(self.radii))
@@ -57,7 +57,7 @@ class Hysteresis(Effect):
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from pressure (..., m) and plays (..., m, J)."""
         lag = (memory - signal.unsqueeze(-1)) * self.use[:, None]
-        x = (signal - self.centre) / self.half
+        x = (signal - self.centre) / self.half_range
         both = torch.cat([lag.flatten(-2), (lag * x.unsqueeze(-1)).flatten(-2)], dim=-1)
         table = torch.cat([self.weight.flatten(1), self.slope.flatten(1)], dim=1)
         return signal + both @ table.T

@@ -1,8 +1,32 @@
-"""What is odd but usable in a recording: channels that froze and jumps in the marker data."""
+"""What is odd but usable in a recording: channels that froze and jumps in the marker data.
 
+A frozen signal repeats one value bit for bit, for longer than it ever does otherwise, while other
+signals live on. A jump is one step of a key point that neither the rows around it, nor the other
+key points, nor the actuation explain; settled rows stand for themselves, so there each key point is
+compared with a smooth function of the actuation instead of with the row before.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from surgisoft.measurement.recording import Recording
+
+LEAST_FROZEN_ROWS = 20
+"""Shorter repeats are never called frozen."""
+FROZEN_RATIO = 5.0
+"""How many times longer than its usual longest repeat (99 % quantile) a frozen signal repeats."""
+JUMP_RATIO = 6.0
+"""How many times larger than the usual steps before and after it a jump is."""
+JUMP_SHARE = 0.02
+"""The least jump, as a share of the arm's largest motion."""
+STEP_WINDOW = 12
+"""Steps before and steps after that say what is usual."""
+SETTLED_RATIO = 15.0
+"""How many robust standard deviations a settled key point lies off before it is called a jump."""
+SETTLED_SHARE = 0.1
+"""The least deviation of a settled key point called a jump, as a share of its motion."""
 
 
 @dataclass(frozen=True)
@@ -17,4 +41,254 @@ class Oddity:
 
 def find_oddities(recording: Recording) -> list[Oddity]:
     """The findings, in the order of their samples."""
-    return []
+    jumps = _settled_jumps if recording.kind == "settled" else _continuous_jumps
+    found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
+    return sorted(found, key=lambda oddity: oddity.sample)
+
+
+# --- frozen signals ----------------------------------------------------------------------------
+
+
+def _changes(signal: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """(T,) bool: where a signal (T, d) differs from the row before or a run (T,) starts."""
+    with np.errstate(invalid="ignore"):
+        differs = (signal[1:] != signal[:-1]).any(axis=1)
+    known = ~np.isnan(signal).any(axis=1)
+    differs |= ~(known[1:] & known[:-1])
+    return np.concatenate([[True], differs | (run[1:] != run[:-1])])
+
+
+def _long_repeats(changed: np.ndarray) -> list[slice]:
+    """The stretches that repeat one value for much longer than the signal usually does."""
+    starts = np.flatnonzero(changed)
+    lengths = np.diff(np.append(starts, len(changed)))
+    usual = np.quantile(lengths, 0.99, method="lower")
+    least = max(LEAST_FROZEN_ROWS, FROZEN_RATIO * usual)
+    return [
+        slice(int(start), int(start + length))
+        for start, length in zip(starts, lengths, strict=True)
+        if length >= least
+    ]
+
+
+def _lives(changed: np.ndarray, stretch: slice) -> bool:
+    """Whether a signal with these changes (T,) changes in at least a tenth of the stretch."""
+    inside = changed[stretch][1:]
+    return bool(inside.mean() >= 0.1)
+
+
+def _outside(stretch: slice, rows: int) -> np.ndarray:
+    mask = np.ones(rows, bool)
+    mask[stretch] = False
+    return mask
+
+
+def _flickers(channel: np.ndarray, changed: np.ndarray) -> bool:
+    """Whether a reading (T,) goes up and down like noise over the rows (T,) where it changes."""
+    steps = np.diff(channel[changed])
+    turns = np.sign(steps[1:]) * np.sign(steps[:-1]) < 0
+    return len(turns) > 10 and turns.mean() > 0.25
+
+
+def _channel_froze(recording: Recording, i: int, changed: np.ndarray, stretch: slice) -> bool:
+    """Whether this repeat of channel i is a fault: its command moves, or it is never at rest."""
+    outside = _outside(stretch, recording.samples)
+    if recording.commanded is None:
+        return _flickers(recording.measured[:, i], changed & outside)
+    command = recording.commanded[:, i]
+    rest = ~_changes(command[:, None], recording.run)
+    if _flickers(recording.measured[:, i], changed & outside & rest):
+        return True
+    moves = np.abs(command[stretch] - command[stretch.start]) > 0.01 * np.ptp(command)
+    return int(moves.sum()) >= LEAST_FROZEN_ROWS
+
+
+def _frozen_channels(recording: Recording) -> list[Oddity]:
+    channels = [
+        _changes(recording.measured[:, i : i + 1], recording.run) for i in range(recording.chambers)
+    ]
+    points = _key_point_changes(recording)
+    frozen: list[tuple[int, slice]] = []
+    for i, changed in enumerate(channels):
+        others = [*channels[:i], *channels[i + 1 :], *points]
+        for stretch in _long_repeats(changed):
+            alive = any(_lives(other, stretch) for other in others)
+            if alive and _channel_froze(recording, i, changed, stretch):
+                frozen.append((i, stretch))
+    return [
+        Oddity(
+            stretch.start,
+            f"{_names(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
+            f"{_duration(recording, stretch)} while other signals move; frozen?",
+        )
+        for members, stretch in _merged(frozen)
+    ]
+
+
+def _merged(frozen: list[tuple[int, slice]]) -> list[tuple[list[int], slice]]:
+    """Signals that froze together, as one finding: most of one stretch lies inside the other."""
+    groups: list[tuple[list[int], slice]] = []
+    for i, stretch in sorted(frozen, key=lambda item: (item[1].start, item[0])):
+        for members, first in groups:
+            common = min(first.stop, stretch.stop) - max(first.start, stretch.start)
+            if i not in members and common > 0.8 * (stretch.stop - stretch.start):
+                members.append(i)
+                break
+        else:
+            groups.append(([i], stretch))
+    return [(sorted(members), stretch) for members, stretch in groups]
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
+def _duration(recording: Recording, stretch: slice) -> str:
+    seconds = recording.t_s[stretch.stop - 1] - recording.t_s[stretch.start]
+    return f"{stretch.stop - stretch.start} rows ({seconds:.3g} s)"
+
+
+def _key_point_changes(recording: Recording) -> list[np.ndarray]:
+    return [
+        _changes(recording.key_points_mm[:, j], recording.run) for j in range(recording.key_points)
+    ]
+
+
+def _actuation_moves(recording: Recording, rows: slice, share: float) -> bool:
+    """Whether any channel moves by this share of its whole range within the rows."""
+    for values in (recording.measured, recording.commanded):
+        if values is not None and len(values[rows]):
+            moved = np.ptp(values[rows], axis=0)
+            if (moved > share * np.maximum(np.ptp(values, axis=0), 1e-300)).any():
+                return True
+    return False
+
+
+def _frozen_key_points(recording: Recording) -> list[Oddity]:
+    changes = _key_point_changes(recording)
+    frozen: list[tuple[int, slice]] = []
+    for j, changed in enumerate(changes):
+        if j == 0 and not changed[_outside_run_starts(recording)].any():
+            continue  # the base may be fixed
+        for stretch in _long_repeats(changed):
+            known = not np.isnan(recording.key_points_mm[stretch.start, j]).any()
+            others = any(_lives(c, stretch) for c in (*changes[:j], *changes[j + 1 :]))
+            if known and (others or _actuation_moves(recording, stretch, 0.05)):
+                frozen.append((j, stretch))
+    return [
+        Oddity(
+            stretch.start,
+            f"key point {_names(f'k{j}' for j in members)} repeats bit-equal for "
+            f"{_duration(recording, stretch)} while other signals move; frozen?",
+        )
+        for members, stretch in _merged(frozen)
+    ]
+
+
+def _outside_run_starts(recording: Recording) -> np.ndarray:
+    mask = np.ones(recording.samples, bool)
+    mask[[run.start for run in recording.runs]] = False
+    return mask
+
+
+# --- jumps of key points -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The fresh positions of one key point in one run: known, and not the stale row before."""
+
+    rows: np.ndarray
+    """(F,) sample index of each fresh position."""
+    steps_mm: np.ndarray
+    """(F - 1,) length of the step to each fresh position from the one before, per row [mm]."""
+
+    def ratio(self, at: int) -> float:
+        """Step `at` against the usual steps before and after it, whichever is the larger."""
+        before = self.steps_mm[max(0, at - STEP_WINDOW) : at]
+        after = self.steps_mm[at + 1 : at + 1 + STEP_WINDOW]
+        if len(before) < 3 or len(after) < 3:
+            return 0.0
+        return float(self.steps_mm[at] / max(np.median(before), np.median(after), 1e-12))
+
+    def ratio_near(self, row: int) -> float:
+        """The largest ratio of the steps that end within one fresh position of a sample."""
+        at = int(np.searchsorted(self.rows[1:], row))
+        near = range(max(0, at - 1), min(len(self.steps_mm), at + 2))
+        return max((self.ratio(i) for i in near), default=0.0)
+
+
+def _track(points: np.ndarray, start: int) -> _Track:
+    """The track of positions (R, 3) [mm] of a run that begins at sample `start`."""
+    known = np.flatnonzero(~np.isnan(points).any(axis=1))
+    fresh = known[_changes(points[known], np.zeros(len(known)))] if len(known) else known
+    steps = np.linalg.norm(np.diff(points[fresh], axis=0), axis=1)
+    return _Track(fresh + start, steps / np.diff(fresh) if len(fresh) > 1 else steps)
+
+
+def _motion_mm(points: np.ndarray) -> np.ndarray:
+    """(n,) diagonal of the box that holds 98 % of each key point's positions (T, n, 3) [mm]."""
+    seen = ~np.isnan(points).any(axis=(0, 2)) | (~np.isnan(points).all(axis=0)).all(axis=1)
+    motion = np.zeros(points.shape[1])
+    if seen.any():
+        low, high = np.nanquantile(points[:, seen], [0.01, 0.99], axis=0)
+        motion[seen] = np.linalg.norm(high - low, axis=1)
+    return motion
+
+
+def _continuous_jumps(recording: Recording) -> list[Oddity]:
+    points = recording.key_points_mm
+    least = JUMP_SHARE * _motion_mm(points).max()
+    hits: dict[int, list[tuple[int, float]]] = {}
+    for run in recording.runs:
+        tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
+        for j, track in enumerate(tracks):
+            others = [*tracks[:j], *tracks[j + 1 :]]
+            for at in np.flatnonzero(track.steps_mm > least).tolist():
+                row = int(track.rows[at + 1])
+                if track.ratio(at) > JUMP_RATIO and not _explained(recording, others, run, row):
+                    before = int(track.rows[at])
+                    size = float(np.linalg.norm(points[row, j] - points[before, j]))
+                    hits.setdefault(j, []).append((row, size))
+    return [_jump(j, found) for j, found in hits.items()]
+
+
+def _explained(recording: Recording, others: list[_Track], run: slice, row: int) -> bool:
+    """Whether the actuation moves and the other key points, where there are any, move too."""
+    if others and max(other.ratio_near(row) for other in others) <= JUMP_RATIO / 2:
+        return False
+    early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
+    rows = slice(int(max(run.start, min(early, row - 5))), row + 1)
+    return _actuation_moves(recording, rows, 0.02)
+
+
+def _jump(j: int, found: list[tuple[int, float]]) -> Oddity:
+    row, size = found[0]
+    more = f", and {len(found) - 1} more times" if len(found) > 1 else ""
+    return Oddity(row, f"key point k{j} jumps by {size:.3g} mm{more}; markers swapped or lost?")
+
+
+def _settled_jumps(recording: Recording) -> list[Oddity]:
+    """Settled rows against the quadratic function of the actuation that fits them all."""
+    channels = [
+        recording.measured[:, i]
+        for i in range(recording.chambers)
+        if np.ptp(recording.measured[:, i]) > 0
+    ]
+    scaled = [(c - c.mean()) / np.ptp(c) for c in channels]
+    products = [a * b for i, a in enumerate(scaled) for b in scaled[i:]]
+    basis = np.column_stack([np.ones(recording.samples), *scaled, *products])
+    found = []
+    motion = _motion_mm(recording.key_points_mm)
+    for j in range(recording.key_points):
+        points = recording.key_points_mm[:, j]
+        known = np.flatnonzero(~np.isnan(points).any(axis=1))
+        if len(known) < 5 * basis.shape[1]:
+            continue
+        fit = basis[known] @ np.linalg.lstsq(basis[known], points[known], rcond=None)[0]
+        off = np.linalg.norm(points[known] - fit, axis=1)
+        least = max(SETTLED_RATIO * 1.4826 * np.median(off), SETTLED_SHARE * motion[j])
+        hits = np.flatnonzero(off > least)
+        if len(hits):
+            found.append(_jump(j, [(int(known[i]), float(off[i])) for i in hits]))
+    return found

@@ -1,0 +1,342 @@
+"""FCL, the referee: whole-body collision, clearance and the first hit of rays, one moment a call.
+
+The only file that speaks FCL. FCL works in millimetres throughout: its iterations stop at an
+absolute tolerance. It sees surfaces only, so being inside a closed body is tested apart, by the
+winding number. Poses of many environments at once are the business of `distance` and `rays`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import fcl
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.scene.capsules import (
+    ArmShape,
+    chain_normal,
+    folding_pairs,
+    ray_chain,
+    ray_free_segments,
+)
+from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.rays import RayHit, Struck, struck_of
+from surgisoft.scene.winding import winding_numbers
+
+HORIZON_MM = 60.0
+"""Clearances saturate here: farther is reported as this far (mm)."""
+PROBE_WIDTH_MM = 1e-3
+"""Width of the sliver that stands for a ray; without width FCL misses one hit in six (mm)."""
+MOST_CONTACTS = 100_000
+"""Upper limit of contacts asked of one FCL query; never reached by a ray or a capsule."""
+
+
+@dataclass(frozen=True)
+class Collision:
+    """One pair of things that overlap."""
+
+    arm: str
+    """Name of the arm."""
+    other: str
+    """Name of the body or of the other arm; the arm's own name for contact with itself."""
+    kind: str
+    """body, arm or self."""
+    inside: bool
+    """True when the arm lies wholly inside the body and touches its surface nowhere."""
+    segment: int
+    """Index of the arm's first colliding segment, base to tip."""
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Signed distances between surfaces (mm); negative is overlap, saturating at the horizon.
+
+    Against a body: the least of the distance from the centreline to the surface and of the signed
+    distance of the centreline's points (negative inside a closed body), less the radius.
+    """
+
+    bodies_mm: Mapping[tuple[str, str], float]
+    """(arm, body): mm."""
+    arms_mm: Mapping[tuple[str, str], float]
+    """(arm, other arm), each pair once: mm."""
+    self_mm: Mapping[str, float]
+    """Arm against itself, between stretches far enough apart along it to touch: mm.
+
+    A straight arm reports the distance to its own next such stretch, (pi - 2) radii or more."""
+
+    @property
+    def least_mm(self) -> float:
+        """The smallest against bodies and other arms (mm), inf when there are none."""
+        values = [*self.bodies_mm.values(), *self.arms_mm.values()]
+        return min(values, default=float("inf"))
+
+
+def collect_all(first, second, pairs) -> bool:
+    """FCL broad-phase callback: narrow-phase every candidate, keep the hits, never halt.
+
+    FCL's own default callback stops once `num_max_contacts` is reached over all pairs together
+    and so drops pairs that collide. Pairs are ids of geometries: the objects FCL hands over here
+    are copies.
+    """
+    result = fcl.CollisionResult()
+    if fcl.collide(first, second, fcl.CollisionRequest(), result):
+        contact = result.contacts[0]
+        pairs.append((id(contact.o1), id(contact.o2)))
+    return False
+
+
+def surface_model(vertices_mm: np.ndarray, faces: np.ndarray) -> fcl.BVHModel:
+    """FCL's tree over triangles: vertices (V, 3) mm, faces (F, 3)."""
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices_mm), len(faces))
+    model.addSubModel(np.asarray(vertices_mm), np.asarray(faces))
+    model.endModel()
+    return model
+
+
+def _placed(geometry, pose: np.ndarray) -> fcl.CollisionObject:
+    return fcl.CollisionObject(geometry, fcl.Transform(pose[:3, :3], pose[:3, 3]))
+
+
+class _Chain:
+    """One arm in FCL's terms: capsules for overlap, its bare centreline for distances."""
+
+    def __init__(self, name: str, shape: ArmShape):
+        self.name, self.shape = name, shape
+        points = shape.centreline_mm
+        axes = points[1:] - points[:-1]
+        turns = frames.rotation_from_z(axes + (frames.norm(axes) == 0)[:, None])
+        lengths, middles = frames.norm(axes), 0.5 * (points[1:] + points[:-1])
+        self.capsules = [fcl.Capsule(shape.radius_mm, length) for length in lengths]
+        self.segment_of = {id(capsule): i for i, capsule in enumerate(self.capsules)}
+        objects = [
+            fcl.CollisionObject(capsule, fcl.Transform(turn, middle))
+            for capsule, turn, middle in zip(self.capsules, turns, middles, strict=True)
+        ]
+        self.manager = fcl.DynamicAABBTreeCollisionManager()
+        self.manager.registerObjects(objects)
+        self.manager.setup()
+
+    def line(self, start: int = 0, stop: int | None = None) -> fcl.CollisionObject:
+        """Segments start..stop as a tree of triangles without width, exact for distances."""
+        points = self.shape.centreline_mm
+        index = np.arange(len(points) - 1)[start:stop]
+        faces = np.stack((index, index + 1, index + 1), axis=1)
+        return fcl.CollisionObject(surface_model(points, faces))
+
+    def touches(self, other: fcl.CollisionObject) -> list[int]:
+        """Segments that overlap the surface of another object."""
+        pairs: list[tuple[int, int]] = []
+        self.manager.collide(other, pairs, collect_all)
+        return self._segments(pairs)
+
+    def touches_chain(self, other: _Chain) -> list[int]:
+        """Segments that overlap any segment of another arm."""
+        pairs: list[tuple[int, int]] = []
+        self.manager.collide(other.manager, pairs, collect_all)
+        return self._segments(pairs)
+
+    def _segments(self, pairs: list[tuple[int, int]]) -> list[int]:
+        """This arm's segments among pairs of geometries, base to tip."""
+        return sorted({self.segment_of[key] for pair in pairs for key in pair if self.owns(key)})
+
+    def owns(self, geometry: int) -> bool:
+        """Whether a geometry's id is one of this arm's capsules."""
+        return geometry in self.segment_of
+
+    def folds(self) -> list[int]:
+        """Segments that overlap a stretch of the same arm far enough away along it."""
+        allowed = folding_pairs(self.shape.centreline_mm, self.shape.radius_mm)
+        if not allowed.any():
+            return []
+        pairs: list[tuple[int, int]] = []
+        self.manager.collide(pairs, collect_all)
+        found = [sorted((self.segment_of[a], self.segment_of[b])) for a, b in pairs]
+        return sorted(i for i, j in found if allowed[i, j])
+
+
+def _distance(first: fcl.CollisionObject, second: fcl.CollisionObject) -> float:
+    """Distance in mm between two trees, 0 when they cross."""
+    return max(0.0, fcl.distance(first, second, fcl.DistanceRequest(), fcl.DistanceResult()))
+
+
+class Referee:
+    """Exact geometry of a scene, one pose of the arms a call. Build once for a set of bodies.
+
+    `arms` is always a mapping from the arm's name to its `ArmShape`.
+    """
+
+    def __init__(self, bodies: Sequence[Body], horizon_mm: float = HORIZON_MM):
+        names = [body.name for body in bodies]
+        if len(set(names)) != len(names):
+            raise InputError(f"body names repeat: {', '.join(sorted(names))}; rename one")
+        self.bodies = tuple(bodies)
+        self.horizon_mm = float(horizon_mm)
+        self._objects = [
+            _placed(surface_model(body.mesh.vertices_mm, body.mesh.faces), body.pose)
+            for body in bodies
+        ]
+
+    def inside(self, body: int, points_mm: np.ndarray) -> np.ndarray:
+        """(N,) bool: world points (N, 3) mm inside body number `body`; never in an open mesh."""
+        mesh = self.bodies[body].mesh
+        points = frames.apply(frames.invert(self.bodies[body].pose), points_mm)
+        return points_inside(mesh, points)
+
+    def collisions(self, arms: Mapping[str, ArmShape]) -> tuple[Collision, ...]:
+        """Every overlapping pair: arm and body, arm and arm, arm and itself."""
+        chains = [_Chain(name, shape) for name, shape in arms.items()]
+        found: list[Collision] = []
+        for chain in chains:
+            for index, body in enumerate(self.bodies):
+                found += self._body_collision(chain, index, body.name)
+            if folded := chain.folds():
+                found.append(Collision(chain.name, chain.name, "self", False, folded[0]))
+        for first, second in combinations(chains, 2):
+            if touching := first.touches_chain(second):
+                found.append(Collision(first.name, second.name, "arm", False, touching[0]))
+        return tuple(found)
+
+    def _body_collision(self, chain: _Chain, index: int, name: str) -> list[Collision]:
+        if touching := chain.touches(self._objects[index]):
+            return [Collision(chain.name, name, "body", False, touching[0])]
+        if self.inside(index, chain.shape.centreline_mm[:1])[0]:
+            return [Collision(chain.name, name, "body", True, 0)]
+        return []
+
+    def clearance(self, arms: Mapping[str, ArmShape]) -> Clearance:
+        """Signed distances of every pair (mm), see `Clearance`."""
+        chains = [_Chain(name, shape) for name, shape in arms.items()]
+        bodies = {
+            (chain.name, body.name): self._body_clearance(chain, index)
+            for chain in chains
+            for index, body in enumerate(self.bodies)
+        }
+        pairs = {
+            (a.name, b.name): self._saturated(
+                _distance(a.line(), b.line()) - a.shape.radius_mm - b.shape.radius_mm
+            )
+            for a, b in combinations(chains, 2)
+        }
+        return Clearance(bodies, pairs, {c.name: self._self_clearance(c) for c in chains})
+
+    def _saturated(self, clearance_mm: float) -> float:
+        return min(clearance_mm, self.horizon_mm)
+
+    def _body_clearance(self, chain: _Chain, index: int) -> float:
+        centre = _distance(chain.line(), self._objects[index])
+        inside = self.inside(index, chain.shape.centreline_mm)
+        for point in chain.shape.centreline_mm[inside]:
+            ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
+            centre = min(centre, -_distance(ball, self._objects[index]))
+        return self._saturated(centre - chain.shape.radius_mm)
+
+    def _self_clearance(self, chain: _Chain) -> float:
+        allowed = folding_pairs(chain.shape.centreline_mm, chain.shape.radius_mm)
+        least = np.inf
+        for i in np.flatnonzero(allowed.any(axis=1)):
+            first = int(np.argmax(allowed[i]))
+            least = min(least, _distance(chain.line(i, i + 1), chain.line(first)))
+        return self._saturated(least - 2.0 * chain.shape.radius_mm)
+
+    def cast(
+        self,
+        origins_mm,
+        directions,
+        range_mm: float,
+        arms: Mapping[str, ArmShape] | None = None,
+        own: str | None = None,
+    ) -> RayHit:
+        """First hits of rays: origins (..., 3) mm and directions (..., 3), world frame.
+
+        `own` names the arm that carries the beam: its segments near the tip do not block it.
+        """
+        origins = np.asarray(origins_mm, dtype=np.float64)
+        directions = frames.normalise(np.asarray(directions, dtype=np.float64))
+        hits = [
+            self._cast_one(o, d, range_mm, arms or {}, own)
+            for o, d in zip(origins.reshape(-1, 3), directions.reshape(-1, 3), strict=True)
+        ]
+        shape = origins.shape[:-1]
+        kinds = (np.int8, np.int32, np.int32, float, float, float, float)
+        columns = [
+            np.array(c, dtype=k).reshape(shape + np.shape(c[0]))
+            for c, k in zip(zip(*hits, strict=True), kinds, strict=True)
+        ]
+        return RayHit(*columns)
+
+    def _cast_one(self, origin, direction, range_mm, arms, own) -> tuple:
+        best = (Struck.NOTHING, -1, -1, range_mm, origin + range_mm * direction, -direction)
+        for index, body in enumerate(self.bodies):
+            face, t = self._first_face(index, origin, direction, best[3])
+            if face >= 0:
+                normal = body.pose[:3, :3] @ body.mesh.face_normals[face]
+                best = (struck_of(body), index, face, t, origin + t * direction, normal)
+        for name, shape in arms.items():
+            free, kind = None, Struck.OTHER_ARM
+            if name == own:
+                free = ray_free_segments(shape.centreline_mm, shape.radius_mm)
+                kind = Struck.OWN_ARM
+            line = shape.centreline_mm
+            t, segment = ray_chain(origin, direction, line, shape.radius_mm, free)
+            if t < best[3]:
+                point = origin + t * direction
+                best = (kind, -1, -1, t, point, chain_normal(point, line, segment))
+        cosine = abs(np.dot(best[5], direction))
+        sine = frames.norm(np.cross(best[5], direction))
+        return (*best, float(np.arctan2(sine, cosine)))
+
+    def _first_face(self, index: int, origin, direction, range_mm: float) -> tuple[int, float]:
+        """Nearest face of a body on a ray and its distance, (-1, range) for none."""
+        end = origin + range_mm * direction
+        side = frames.rotation_from_z(direction)[:, 0] * PROBE_WIDTH_MM
+        sliver = surface_model(np.stack((origin, end, end + side)), np.array([[0, 1, 2]]))
+        request = fcl.CollisionRequest(num_max_contacts=MOST_CONTACTS, enable_contact=True)
+        result = fcl.CollisionResult()
+        fcl.collide(self._objects[index], fcl.CollisionObject(sliver), request, result)
+        faces = np.unique([contact.b1 for contact in result.contacts]).astype(int)
+        if len(faces) == 0:
+            return -1, range_mm
+        body = self.bodies[index]
+        inward = frames.invert(body.pose)
+        o = frames.apply(inward, origin[None])[0]
+        t = ray_triangles(o, inward[:3, :3] @ direction, body.mesh.triangles_mm[faces])
+        nearest = int(np.argmin(t))
+        return (
+            (int(faces[nearest]), float(t[nearest])) if t[nearest] <= range_mm else (-1, range_mm)
+        )
+
+
+def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
+    """(N,) distances along a ray to triangles (N, 3, 3), inf for a miss; from either side.
+
+    Moeller & Trumbore 1997; a hit on an edge belongs to the triangle within rounding.
+    """
+    slack = 1e-12
+    a = triangles_mm[:, 0]
+    e1, e2 = triangles_mm[:, 1] - a, triangles_mm[:, 2] - a
+    p = np.cross(direction, e2)
+    determinant = frames.dot(e1, p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = origin - a
+        u = frames.dot(s, p) / determinant
+        q = np.cross(s, e1)
+        v = frames.dot(np.broadcast_to(direction, q.shape), q) / determinant
+        t = frames.dot(e2, q) / determinant
+        hit = (u >= -slack) & (v >= -slack) & (u + v <= 1 + slack) & (t >= 0)
+    return np.where(hit, t, np.inf)
+
+
+def points_inside(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) mm in a closed mesh's own frame that it encloses; open: never."""
+    inside = np.zeros(len(points_mm), dtype=bool)
+    if not mesh.is_watertight:
+        return inside
+    low, high = mesh.bounds_mm
+    near = ((points_mm >= low) & (points_mm <= high)).all(axis=1)
+    inside[near] = winding_numbers(mesh, points_mm[near]) > 0.5
+    return inside

@@ -41,15 +41,15 @@ class ArmSpec:
                 object.__setattr__(self, "band", value)
             if len(value) != self.chambers:
                 raise InputError(
-                    f"arm: '{name}' has {len(value)} values, expected {self.chambers}, one a chamber"
+                    f"arm: '{name}' has {len(value)} values, expected one for each of "
+                    f"{self.chambers} chambers"
                 )
 
     @property
     def span(self) -> tuple[float, ...]:
         """Range of the actuation of each chamber, in `unit`; never zero."""
         return tuple(
-            high - low if high > low else 1.0
-            for low, high in zip(self.low, self.high, strict=True)
+            high - low if high > low else 1.0 for low, high in zip(self.low, self.high, strict=True)
         )
 
 
@@ -79,3 +79,8 @@ class ArmState:
             direction=pick(other.direction, self.direction),
             memory={name: pick(other.memory[name], value) for name, value in self.memory.items()},
         )
+
+
+def centre_and_half(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Middle and half width (m,) of the range low, high (m,); half is 1 where it is empty."""
+    return (high + low) / 2, ((high - low) / 2).where(high > low, torch.ones_like(low))

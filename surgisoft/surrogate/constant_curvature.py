@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import centre_and_half
 
 
 def _rotation(vector: Tensor) -> Tensor:
@@ -53,8 +54,9 @@ class ConstantCurvature(nn.Module):
         if key_points < 2:
             raise InputError("constant curvature needs at least 2 key points; this arm has 1")
         self.key_points, self.sections = key_points, sections
-        self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
         self.register_buffer("fraction", torch.linspace(0, 1, key_points))
         self.register_buffer("length", torch.ones(()))
         self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))

@@ -72,8 +72,10 @@ class ChamberExcitation:
         return f"chamber {self.chamber}: {why}"
 
 
-def excitation(history: History, low: Tensor, high: Tensor, band: Tensor):
-    """One `ChamberExcitation` a chamber. Pressure range low, high (m,) and band (m,), arm's unit."""
+def excitation(
+    history: History, low: Tensor, high: Tensor, band: Tensor
+) -> list[ChamberExcitation]:
+    """What a history excites, one answer a chamber; low, high, band (m,) in the arm's unit."""
     _, direction = directions.trace(history.pressure, band)
     pressure = history.rows(history.pressure)
     span = (high - low).where(high > low, torch.ones_like(low))

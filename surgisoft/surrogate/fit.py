@@ -14,29 +14,34 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import EFFECTS, make_effect
 from surgisoft.surrogate.excitation import ChamberExcitation, excitation
+from surgisoft.surrogate.fit_recurrent import held_rows, new_recurrent, train_recurrent
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.network import HIDDEN, HawNN, range_weights, weighted_mse
-from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.network import HIDDEN, HawNN
+from surgisoft.surrogate.rows import (
+    Rows,
+    hold_out,
+    known_to,
+    make_rows,
+    measured_rows,
+    model_rows,
+    normalise,
+    rest_shape,
+    validated_error,
+)
+from surgisoft.surrogate.training import CHECK_EVERY, PATIENCE
+from surgisoft.surrogate.training import train as train_rows
 
 INPUTS = ("pressure", "pressure+direction")
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
-CHECK_EVERY = 10
-"""Epochs between validations (Chen et al. 2025)."""
-PATIENCE = 10
-"""Validations without improvement before training stops (Chen et al. 2025)."""
-AVERAGE_EPOCHS = 3
-"""Span of the running average of the weights (Polyak & Juditsky 1992) that is validated."""
-HOLD_BLOCKS = 20
-"""Blocks that a single run is cut into where no validation recording is given."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +70,6 @@ class FitConfig:
     """Seed of weights, order of rows and held-out blocks."""
     check_excitation: bool = True
     """Whether inputs that the data cannot support are left out."""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Rows of histories without padding, with what a static model sees in each."""
-
-    pressure: Tensor
-    direction: Tensor
-    memory: dict[str, Tensor]
-    target: Tensor
-    block: Tensor
-    """(S,) id of the block of time that a row belongs to, for bootstraps."""
-
-    def take(self, index: Tensor) -> "Rows":
-        """The rows at an index or mask (S,)."""
-        return Rows(
-            self.pressure[index],
-            self.direction[index],
-            {name: value[index] for name, value in self.memory.items()},
-            self.target[index],
-            self.block[index],
-        )
 
 
 @dataclass
@@ -128,11 +111,11 @@ def fit(
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
     excited = excitation(train, low, high, band)
     judge = _Judge.make(train, valid, spec, config, low, high, band)
-    if config.network == "recurrent":
-        from surgisoft.surrogate.fit_recurrent import fit_recurrent
-
-        return fit_recurrent(train, valid, spec, config, excited, judge.held, progress)
     result = FitResult(None, [], excited, [], 0.0)
+    if config.network == "recurrent":
+        _fit_recurrent(train, valid, spec, config, judge.held, result, progress)
+        result.seconds = time.perf_counter() - start
+        return result
     for name in _stages(config):
         candidate = _grow(result.model, name, spec, config, excited, judge, train, result.warnings)
         if candidate is not None:
@@ -142,6 +125,20 @@ def fit(
     model.validation = validated_error(rows.target, model_rows(model, rows))
     result.seconds = time.perf_counter() - start
     return result
+
+
+def _fit_recurrent(train, valid, spec, config, held, result: FitResult, progress) -> None:
+    model = new_recurrent(spec)
+    normalise(model.network, train)
+    model.rest_mm.copy_(rest_shape(train))
+    result.loss, epochs = train_recurrent(
+        model, train, held, valid, config.epochs, config.learning_rate, config.seed,
+        CHECK_EVERY, PATIENCE, progress,
+    )  # fmt: skip
+    predicted, measured = held_rows(model, train, held, valid)
+    model.validation = validated_error(measured, predicted)
+    result.model = model.eval().requires_grad_(False)
+    result.stages.append(StageReport("recurrent", model.validation["rmse_mm"], epochs, 0.0, True))
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
@@ -194,68 +191,8 @@ class _Judge:
             return make_rows(model, train), make_rows(model, valid)
         every = make_rows(model, train)
         held = train.rows(self.held)
-        held = held[_seen(train)]
+        held = held[measured_rows(train)]
         return every.take(~held), every.take(held)
-
-
-def hold_out(history: History, seed: int) -> Tensor:
-    """(R, T) mask of held-out rows: a fifth of the runs, or of long blocks where runs are few."""
-    generator = torch.Generator().manual_seed(seed)
-    held = torch.zeros_like(history.valid)
-    if history.runs >= 5:
-        order = torch.randperm(history.runs, generator=generator)
-        held[order[: max(1, round(0.2 * history.runs))]] = True
-        return held & history.valid
-    for run in range(history.runs):
-        length = int(history.valid[run].sum())
-        edges = torch.linspace(0, length, HOLD_BLOCKS + 1).round().long()
-        for block in torch.randperm(HOLD_BLOCKS, generator=generator)[: HOLD_BLOCKS // 5].tolist():
-            held[run, edges[block] : edges[block + 1]] = True
-    return held
-
-
-def _seen(history: History) -> Tensor:
-    """(S,) rows, without padding, in which at least one key point was measured."""
-    return history.rows((~history.key_points.isnan()).all(-1).any(-1))
-
-
-def make_rows(model: ArmModel, history: History, block_rows: int = 25) -> Rows:
-    """The measured rows of a history as the model sees them."""
-    with torch.no_grad():
-        trace = model.trace(history)
-    seen = _seen(history)
-    steps = torch.arange(history.valid.shape[1]).expand_as(history.valid)
-    block = history.rows(steps // block_rows) + 1_000_000 * history.run_of_row
-    return Rows(
-        history.rows(trace.pressure)[seen],
-        history.rows(trace.direction)[seen],
-        {name: history.rows(value)[seen] for name, value in trace.memory.items()},
-        history.rows(history.key_points)[seen],
-        torch.unique(block[seen], return_inverse=True)[1],
-    )
-
-
-def model_rows(model: ArmModel, rows: Rows) -> Tensor:
-    """(S, n, 3) key points in mm that a static model predicts for rows."""
-    with torch.no_grad():
-        return torch.cat(
-            [
-                model.shape(
-                    rows.pressure[at], rows.direction[at], {k: v[at] for k, v in rows.memory.items()}
-                )
-                for at in torch.arange(len(rows.pressure)).split(16384)
-            ]
-        )
-
-
-def validated_error(target: Tensor, predicted: Tensor) -> dict:
-    """Held-out error: RMSE of each key point's distance and of all, mm; and the number of rows."""
-    square = (predicted - target).square().sum(-1)
-    return {
-        "rmse_mm": math.sqrt(float(square.nanmean())),
-        "per_key_point_mm": [math.sqrt(float(x)) for x in square.nanmean(0)],
-        "rows": len(target),
-    }
 
 
 def _grow(model, name, spec, config, excited, judge, train, warnings) -> ArmModel | None:
@@ -263,7 +200,7 @@ def _grow(model, name, spec, config, excited, judge, train, warnings) -> ArmMode
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     if name == "pressure":
         network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
-        _normalise(network, train)
+        normalise(network, train)
         return ArmModel(spec, network)
     if name == "constant curvature":
         network = ConstantCurvature(low, high, spec.key_points, config.sections)
@@ -290,27 +227,6 @@ def _grow(model, name, spec, config, excited, judge, train, warnings) -> ArmMode
     return ArmModel(spec, grown.network, {**grown.effects, name: effect})
 
 
-def _normalise(network: nn.Module, history: History) -> None:
-    points = history.rows(history.key_points)
-    seen = ~points.isnan()
-    count = seen.sum(0).clamp(min=1)
-    mean = points.nan_to_num().sum(0) / count
-    spread = (((points - mean).nan_to_num() * seen).square().sum(0) / count).sqrt()
-    network.mean.copy_(mean.flatten())
-    network.scale.copy_(spread.clamp(min=1e-6).flatten())
-
-
-def rest_shape(history: History) -> Tensor:
-    """(n, 3) key points in mm where the actuation is nearest to zero: mean of 20 such rows."""
-    size = history.rows(history.pressure).abs().sum(-1)
-    points = history.rows(history.key_points)
-    whole = ~points.isnan().any(-1).any(-1)
-    if not whole.any():
-        return points.nanmean(0)
-    nearest = size[whole].argsort()[:20]
-    return points[whole][nearest].mean(0)
-
-
 def _stage(candidate, name, config, judge, train, valid, result, progress) -> None:
     """Train one stage and keep it if held-out data rewards it."""
     begin = time.perf_counter()
@@ -319,8 +235,8 @@ def _stage(candidate, name, config, judge, train, valid, result, progress) -> No
     epochs = config.epochs if last else max(CHECK_EVERY, round(config.epochs * config.first_share))
     before = None
     if result.model is not None:
-        before = (model_rows(result.model, _without(held, result.model)) - held.target).square()
-    done = _train(candidate, fitted, held, name, epochs, config, result.loss, progress)
+        before = (model_rows(result.model, known_to(result.model, held)) - held.target).square()
+    done = train_rows(candidate, fitted, held, name, epochs, config, result.loss, progress)
     after = (model_rows(candidate, held) - held.target).square()
     rmse = math.sqrt(float(after.sum(-1).nanmean()))
     kept, reason = True, ""
@@ -333,11 +249,6 @@ def _stage(candidate, name, config, judge, train, valid, result, progress) -> No
         result.model = candidate
     seconds = time.perf_counter() - begin
     result.stages.append(StageReport(name, rmse, done, seconds, kept, reason))
-
-
-def _without(rows: Rows, model: ArmModel) -> Rows:
-    memory = {name: rows.memory[name] for name in model.effects if name in rows.memory}
-    return Rows(rows.pressure, rows.direction, memory, rows.target, rows.block)
 
 
 def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:
@@ -354,66 +265,3 @@ def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:
         f"the held-out squared error changes by {-share:+.1%} (standard error "
         f"{error / max(float(before.nanmean()), 1e-12):.1%}), which is no gain beyond chance"
     )
-
-
-def _train(model, rows: Rows, held: Rows, name, epochs, config, losses, progress) -> int:
-    """Adam with a cosine schedule; the model ends as its best running average on held-out rows."""
-    weights = range_weights(rows.target)
-    generator = torch.Generator().manual_seed(config.seed)
-    count = len(rows.target)
-    batch = min(config.batch, max(32, count // 16))
-    steps = max(1, count // batch)
-    rate = config.learning_rate
-    optimiser = torch.optim.Adam(model.parameters(), lr=rate)
-    schedule = torch.optim.lr_scheduler.LambdaLR(
-        optimiser, lambda step: _cosine(step, epochs * steps, warm_up=2 * steps)
-    )
-
-    average = copy.deepcopy(model)
-    fast, slow = list(model.parameters()), list(average.parameters())
-
-    def error_on_held() -> float:
-        return float(weighted_mse(model_rows(average, held), held.target, weights))
-
-    best, best_state, waited, total = error_on_held(), copy.deepcopy(model.state_dict()), 0, 0.0
-    epoch = 0
-    for epoch in range(1, epochs + 1):
-        order = torch.randperm(count, generator=generator)
-        for part in order[: steps * batch].split(batch):
-            loss = weighted_mse(
-                model.shape(
-                    rows.pressure[part],
-                    rows.direction[part],
-                    {key: value[part] for key, value in rows.memory.items()},
-                ),
-                rows.target[part],
-                weights,
-            )
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            with torch.no_grad():
-                share = max(1 / (AVERAGE_EPOCHS * steps), 1 / (schedule.last_epoch + 1))
-                torch._foreach_lerp_(slow, fast, share)
-        total = float(loss.detach())
-        if epoch % CHECK_EVERY == 0 or epoch == epochs:
-            now = error_on_held()
-            losses.append((name, epoch, total, now))
-            if now < best:
-                best, best_state, waited = now, copy.deepcopy(average.state_dict()), 0
-            else:
-                waited += 1
-            if progress is not None:
-                progress(name, epoch, epochs, best)
-            if waited >= PATIENCE:
-                break
-    model.load_state_dict(best_state)
-    return epoch
-
-
-def _cosine(step: int, steps: int, warm_up: int) -> float:
-    if step < warm_up:
-        return (step + 1) / warm_up
-    share = (step - warm_up) / max(steps - warm_up, 1)
-    return 0.5 * (1 + math.cos(math.pi * min(share, 1.0))) + 1e-3

@@ -1,7 +1,11 @@
 """HAW-NN: the Hysteresis-Aware Whole-body Neural Network (Chen et al. 2025, sec. III-A)."""
 
+import itertools
+
 import torch
 from torch import Tensor, nn
+
+from surgisoft.surrogate.arm import centre_and_half
 
 HIDDEN = (128, 128, 128, 128)
 """Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
@@ -29,14 +33,15 @@ class HawNN(nn.Module):
         self.key_points = key_points
         self.hidden = tuple(hidden)
         self.directions = directions
-        self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
         self.register_buffer("use", torch.ones(chambers))
         self.register_buffer("mean", torch.zeros(3 * key_points))
         self.register_buffer("scale", torch.ones(3 * key_points))
         widths = [chambers * (2 if directions else 1), *hidden]
         layers = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in itertools.pairwise(widths):
             layers += [nn.Linear(before, after), nn.SiLU()]
         layers.append(nn.Linear(widths[-1], 3 * key_points))
         self.layers = nn.Sequential(*layers)

@@ -7,6 +7,8 @@ steps are the rows of a recording, however far apart.
 import torch
 from torch import Tensor, nn
 
+from surgisoft.surrogate.arm import centre_and_half
+
 
 class RecurrentArm(nn.Module):
     """[p, d] at each row -> hidden state -> key points."""
@@ -18,8 +20,9 @@ class RecurrentArm(nn.Module):
         super().__init__()
         chambers = len(low)
         self.key_points, self.width = key_points, width
-        self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half_range", ((high - low) / 2).where(high > low, torch.ones_like(low)))
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
         self.register_buffer("mean", torch.zeros(3 * key_points))
         self.register_buffer("scale", torch.ones(3 * key_points))
         self.cell = nn.GRU(2 * chambers, width, batch_first=True)

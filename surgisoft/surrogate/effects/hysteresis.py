@@ -14,6 +14,7 @@ density that is not constant along the diagonal (Mayergoyz 2003, ch. 1).
 import torch
 from torch import Tensor, nn
 
+from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import Effect, Quantity
 from surgisoft.surrogate.scan import clamp_scan
 
@@ -30,11 +31,11 @@ class Hysteresis(Effect):
     def __init__(self, low: Tensor, high: Tensor, radii: tuple[float, ...] = RADII):
         """Pressure range low, high (m,) in the arm's unit; radii as shares of it."""
         super().__init__()
-        span = (high - low).where(high > low, torch.ones_like(low))
+        centre, half = centre_and_half(low, high)
         self.radii = tuple(radii)
-        self.register_buffer("centre", (high + low) / 2)
-        self.register_buffer("half_range", span / 2)
-        self.register_buffer("radius", span[:, None] * torch.tensor(self.radii))
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.register_buffer("radius", 2 * half[:, None] * torch.tensor(self.radii))
         self.register_buffer("use", torch.ones(len(low)))
         shape = (len(low), len(low), len(self.radii))
         self.weight = nn.Parameter(torch.zeros(shape))

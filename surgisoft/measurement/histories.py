@@ -1,0 +1,103 @@
+"""Recordings as the tensors that arm models are fitted to and judged on."""
+
+import numpy as np
+import torch
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.history import History, pack
+
+ACTUATIONS = ("measured", "commanded")
+BAND_SHARE = (0.003, 0.02)
+"""Least and largest half width of the direction's dead band, as shares of a chamber's range."""
+BAND_NOISES = 4.0
+"""Half width of the dead band in standard deviations of the pressure at rest."""
+
+
+def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
+    """(T, m) measured or commanded actuation, in the recording's unit."""
+    if actuation not in ACTUATIONS:
+        raise unknown_name("actuation", actuation, ACTUATIONS)
+    if actuation == "measured":
+        return recording.measured
+    if recording.commanded is None:
+        raise InputError(
+            f"{recording.label}: no commanded actuation (columns c1_{recording.unit} ...); "
+            "use --actuation measured"
+        )
+    return recording.commanded
+
+
+def history_of(recordings: list[Recording], actuation: str = "measured") -> History:
+    """All runs of all recordings as one padded history."""
+    times, pressures, points = [], [], []
+    for recording in recordings:
+        signal = actuation_of(recording, actuation)
+        for run in recording.runs:
+            times.append(torch.from_numpy(recording.t_s[run].copy()))
+            pressures.append(torch.from_numpy(signal[run].copy()))
+            points.append(torch.from_numpy(recording.key_points_mm[run].copy()))
+    noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
+    return pack(times, pressures, points, tuple(float(x) for x in noise))
+
+
+def actuation_noise(recording: Recording, actuation: str = "measured") -> np.ndarray:
+    """(m,) standard deviation of the actuation at rest, in the recording's unit.
+
+    From differences between neighbouring samples whose command did not change; without commands,
+    from those differences that are small beside the chamber's range. Robust by the median.
+    """
+    signal = actuation_of(recording, actuation)
+    answer = np.zeros(recording.chambers)
+    if actuation == "commanded":
+        return answer
+    inside = np.diff(recording.run) == 0
+    steps = np.diff(signal, axis=0)
+    span = np.ptp(signal, axis=0)
+    for chamber in range(recording.chambers):
+        if recording.commanded is not None:
+            rest = inside & (np.diff(recording.commanded[:, chamber]) == 0)
+        else:
+            rest = inside & (np.abs(steps[:, chamber]) < BAND_SHARE[1] * span[chamber])
+        if rest.sum() >= 10:
+            # 1.4826: from the median absolute deviation to the standard deviation (normal noise).
+            answer[chamber] = 1.4826 * np.median(np.abs(steps[rest, chamber])) / np.sqrt(2)
+    return answer
+
+
+def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpec:
+    """The arm that the recordings were made on: ranges, dead bands, proportions."""
+    signal = np.concatenate([actuation_of(recording, actuation) for recording in recordings])
+    low, high = signal.min(0), signal.max(0)
+    noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
+    span = high - low
+    band = np.clip(BAND_NOISES * noise, BAND_SHARE[0] * span, BAND_SHARE[1] * span)
+    first = recordings[0]
+    return ArmSpec(
+        chambers=first.chambers,
+        key_points=first.key_points,
+        low=tuple(low.tolist()),
+        high=tuple(high.tolist()),
+        unit=first.unit,
+        actuation=actuation,
+        band=tuple(band.tolist()),
+        length_mm=first.arm.length_mm,
+        diameter_mm=first.arm.diameter_mm,
+        gravity=None if first.gravity is None else tuple(first.gravity.tolist()),
+    )
+
+
+def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
+    """Raise unless every recording has the model's chambers, key points and unit."""
+    for recording in recordings:
+        for what, came, expected in (
+            ("chambers", recording.chambers, spec.chambers),
+            ("key points", recording.key_points, spec.key_points),
+            ("actuation unit", recording.unit, spec.unit),
+        ):
+            if came != expected:
+                raise InputError(
+                    f"{recording.label}: {what}: {came}, but the model has {expected}; "
+                    "use recordings of the model's own arm"
+                )

@@ -1,0 +1,133 @@
+"""Build the phantom's meshes from an implicit liver: `python scenes/phantom_liver/build.py [DIR]`.
+
+Everything is made of formulas in this file; the same file gives the same meshes. Frame of the
+phantom, mm: x from the right lobe (-) to the left lobe (+), y from the lower margin (-) to the
+diaphragm (+), z up from the tray; the liver lies on its visceral (under) side.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.scene.isosurface import settle, surface_nets
+
+SPACING_MM = 2.3
+VISCERAL = np.array([0.16, -0.66, -0.74]) / np.linalg.norm([0.16, -0.66, -0.74])
+VISCERAL_POINT = np.array([0.0, -8.0, -6.0])
+BOUNDS_MM = np.array([[-112.0, -112.0, -80.0], [122.0, 92.0, 90.0]])
+
+
+def ellipsoid(points, centre, radii, turn_z_deg=0.0, turn_y_deg=0.0):
+    """Signed distance to first order (mm), negative inside (Quilez, 2008, "ellipsoid SDF")."""
+    local = turned(points - np.asarray(centre), turn_z_deg, turn_y_deg)
+    k0 = np.linalg.norm(local / radii, axis=-1)
+    k1 = np.linalg.norm(local / np.square(radii), axis=-1)
+    return k0 * (k0 - 1.0) / np.maximum(k1, 1e-12)
+
+
+def capsule(points, start, end, radius_start, radius_end):
+    """Distance (mm) to a segment, less a radius that runs linearly from one end to the other."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    along = end - start
+    t = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
+    nearest = start + t[..., None] * along
+    radius = radius_start + t * (radius_end - radius_start)
+    return np.linalg.norm(points - nearest, axis=-1) - radius
+
+
+def turned(points, turn_z_deg, turn_y_deg):
+    """Points in the frame turned about y, then z (degrees)."""
+    a, b = np.radians([turn_z_deg, turn_y_deg])
+    about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    return points @ (about_z @ about_y)
+
+
+def union(a, b, blend_mm):
+    """Smooth minimum, polynomial (Quilez, 2013, "smooth minimum", quadratic)."""
+    h = np.maximum(blend_mm - np.abs(a - b), 0.0) / blend_mm
+    return np.minimum(a, b) - 0.25 * blend_mm * h * h
+
+
+def without(a, b, blend_mm):
+    """`a` less `b`, with the edge rounded over `blend_mm`."""
+    return -union(-a, b, blend_mm)
+
+
+def liver(points):
+    """The liver in its anatomical frame: lobes joined, under side cut, impressions taken away."""
+    dome = ellipsoid(points, (-36, 6, 0), (50, 60, 54))
+    lower_right = ellipsoid(points, (-45, -34, -4), (36, 50, 40))
+    middle = ellipsoid(points, (-2, -2, 6), (44, 52, 42))
+    left = ellipsoid(points, (36, 16, 10), (44, 40, 30), turn_z_deg=-10)
+    tip = ellipsoid(points, (62, 25, 8), (32, 22, 18), turn_z_deg=-18)
+    right = union(union(dome, lower_right, 36.0), middle, 16.0)
+    body = union(right, union(left, tip, 24.0), 9.0)
+    body = without(body, heart(points), 14.0)
+    body = without(body, under_side(points), 6.0)
+    caudate = ellipsoid(resting(points), (-1, 30, 1), (10, 21, 10), turn_z_deg=8)
+    body = union(body, caudate, 8.0)
+    for impression, blend_mm in impressions(resting(points)):
+        body = without(body, impression, blend_mm)
+    return without(body, gallbladder(points) - 0.4, 3.0)
+
+
+def impressions(points):
+    """What presses into the under side (points in the resting frame): distance, edge rounding."""
+    yield capsule(points, (-16, -4, -3), (16, 0, -3), 6.5, 6.5), 5.0  # porta hepatis
+    yield capsule(points, (25, -72, 4), (16, 0, -3), 7, 6), 6.0  # fissure of the round ligament
+    yield capsule(points, (16, 0, -3), (12, 54, -5), 6, 6), 5.0  # fissure of the venous ligament
+    yield capsule(points, (-12, 24, -9), (-16, 80, -5), 14, 14), 6.0  # inferior vena cava
+    yield ellipsoid(points, (-56, 14, -18), (24, 34, 27)), 10.0  # right kidney
+    yield ellipsoid(points, (-54, -36, -24), (22, 20, 27)), 9.0  # colon
+    yield ellipsoid(points, (56, 22, -18), (36, 36, 26)), 12.0  # stomach
+
+
+def under_side(points):
+    """What the visceral surface cuts off: a large ball behind and below."""
+    return ellipsoid(resting(points), (0, 0, -330), (330, 330, 330))
+
+
+def resting(points):
+    """Points from the anatomical frame into the one in which the visceral surface faces -z."""
+    left = np.array([1.0, 0.0, 0.0]) - VISCERAL[0] * VISCERAL
+    left /= np.linalg.norm(left)
+    frame = np.stack([left, np.cross(left, VISCERAL), -VISCERAL], axis=1)
+    return (points - VISCERAL_POINT) @ frame
+
+
+def heart(points):
+    """The shallow bed of the heart on the left lobe's upper face."""
+    return ellipsoid(points, (34, 92, 34), (46, 40, 40))
+
+
+def gallbladder(points):
+    """A pear: wide fundus under the lower margin, thin neck towards the porta hepatis."""
+    points = resting(points)
+    return union(
+        capsule(points, (-24, -65, 0), (-19, -38, 1), 11.5, 9.5),
+        capsule(points, (-19, -38, 1), (-12, -12, 0), 8.5, 4),
+        8.0,
+    )
+
+
+def tray(points):
+    """A flat plate with rounded edges under the organs (top at z = 0)."""
+    half = np.array([115.0, 95.0, 3.0])
+    q = np.abs(points - np.array([0.0, 0.0, -4.0])) - half
+    outside = np.linalg.norm(np.maximum(q, 0.0), axis=-1)
+    return outside + np.minimum(q.max(axis=-1), 0.0) - 1.0
+
+
+def mesh_of(field, spacing_mm=SPACING_MM, bounds_mm=BOUNDS_MM, rounds=40):
+    """Vertices (V, 3) mm and faces (F, 3) of the field's zero level, evened out."""
+    axes = [np.arange(low, high + spacing_mm, spacing_mm) for low, high in bounds_mm.T]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    values = np.concatenate([field(slab[None]) for slab in grid])
+    vertices, faces = surface_nets(values, bounds_mm[0], spacing_mm)
+    return settle(vertices, faces, field, rounds, 0.05 * spacing_mm), faces
+
+
+if __name__ == "__main__":
+    pass

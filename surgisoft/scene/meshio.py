@@ -1,0 +1,186 @@
+"""Mesh files: read STL, OBJ, PLY, OFF and GLB, tell the unit, write exact PLY."""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene.mesh import Mesh
+from surgisoft.toml_config import write_atomically
+
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
+PLAUSIBLE_MM = (20.0, 600.0)
+"""Largest side of an organ or of an organ phantom: from a gland to a whole abdomen (mm)."""
+TYPICAL_MM = 180.0
+"""Largest side of a liver (mm), Gray's Anatomy, 42nd ed., chapter 67: 15 to 20 cm across."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One named piece of a mesh file, as it stands there."""
+
+    name: str
+    """Name inside the file, or the file's own."""
+    vertices: np.ndarray
+    """(V, 3) float64 in the file's unit and frame."""
+    faces: np.ndarray
+    """(F, 3) int64, rows of vertex indices."""
+
+
+def read_parts(path: str | Path) -> tuple[Part, ...]:
+    """All triangle meshes of a file in its own unit and frame."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file; expected a mesh")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; expected a mesh file ({', '.join(SUFFIXES)})")
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"{path}: file type '{path.suffix}' is not read; expected one of {', '.join(SUFFIXES)}"
+        )
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: the file is empty; expected a mesh")
+    if path.suffix.lower() == ".stl":
+        _check_stl(path)
+    pieces, points = _load(path)
+    if not pieces and points:
+        raise InputError(
+            f"{path}: holds {points} points or lines but no faces; "
+            "expected a surface (build one from the points first)"
+        )
+    if not pieces:
+        raise InputError(f"{path}: holds no triangle; expected a mesh")
+    return tuple(_checked(path, part) for part in pieces)
+
+
+def _check_stl(path: Path) -> None:
+    """A binary STL that is shorter than its own count, or neither binary nor text STL."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(84)
+    count = struct.unpack("<I", head[80:])[0] if len(head) == 84 else 0
+    if len(head) == 84 and size == 84 + 50 * count:
+        return
+    if head.lstrip()[:5].lower() == b"solid":
+        return
+    if len(head) == 84:
+        raise InputError(
+            f"{path}: a binary STL of {count} triangles needs {84 + 50 * count} bytes and this "
+            f"file has {size}; it is cut off or not an STL"
+        )
+    raise InputError(f"{path}: is neither a text nor a binary STL; expected a mesh")
+
+
+def _load(path: Path) -> tuple[list[Part], int]:
+    """Parts with faces, and the number of points in parts that have none."""
+    import trimesh
+
+    options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+    try:
+        scene = trimesh.load_scene(path, process=False, **options)
+        order = {name: i for i, name in enumerate(scene.geometry)}
+        nodes = [(order[scene.graph[node][1]], node) for node in scene.graph.nodes_geometry]
+        parts, points = [], 0
+        for _, node in sorted(nodes):
+            pose, name = scene.graph[node]
+            geometry = scene.geometry[name]
+            faces = np.asarray(getattr(geometry, "faces", ()), dtype=np.int64).reshape(-1, 3)
+            vertices = np.asarray(geometry.vertices, dtype=np.float64).reshape(-1, 3)
+            if len(faces):
+                moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+                if np.linalg.det(pose[:3, :3]) < 0.0:
+                    faces = faces[:, ::-1]
+                parts.append(Part(str(node), moved, faces))
+            else:
+                points += len(vertices)
+    except Exception as error:  # parsers of foreign files raise anything
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(
+            f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason}); "
+            "the file is damaged or has another type"
+        ) from None
+    return parts, points
+
+
+def _checked(path: Path, part: Part) -> Part:
+    """The part, unless its numbers cannot be a mesh."""
+    if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+        raise InputError(
+            f"{path}: a face names vertex {part.faces.max()} of {len(part.vertices)}; "
+            "the file is damaged"
+        )
+    bad = ~np.isfinite(part.vertices[np.unique(part.faces)]).all(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{path}: {bad.sum()} of {len(bad)} vertices are NaN or infinite; expected finite "
+            "coordinates"
+        )
+    return part
+
+
+@dataclass(frozen=True)
+class UnitGuess:
+    """The unit of a file's coordinates and why."""
+
+    unit: str
+    """`mm`, `cm` or `m`."""
+    sentence: str
+    """Why, for the user."""
+
+    @property
+    def mm(self) -> float:
+        """Millimetres in one unit."""
+        return MM_PER_UNIT[self.unit]
+
+
+def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
+    """The unit that gives the file's largest side `size` the size of an organ.
+
+    Where two units do, mm is taken (metres for glTF, whose standard says so); where none does, the
+    one that comes nearest to a liver.
+    """
+    low, high = PLAUSIBLE_MM
+    fits = [unit for unit, mm in MM_PER_UNIT.items() if low <= size * mm <= high]
+    preferred = ("m", "mm", "cm") if is_gltf else ("mm", "cm", "m")
+    if fits:
+        unit = next(unit for unit in preferred if unit in fits)
+        other = [u for u in fits if u != unit]
+        doubt = (
+            f"; {other[0]} would give {size * MM_PER_UNIT[other[0]]:.4g} mm (--unit {other[0]})"
+            if other
+            else ""
+        )
+        return UnitGuess(unit, f"{unit}: {size:.4g} {unit} across is an organ's size{doubt}")
+    unit = min(MM_PER_UNIT, key=lambda u: abs(np.log(size * MM_PER_UNIT[u] / TYPICAL_MM)))
+    return UnitGuess(
+        unit,
+        f"{unit}, in doubt: no unit gives {size:.4g} an organ's size of {low:g} to {high:g} mm; "
+        f"in {unit} it is {size * MM_PER_UNIT[unit]:.4g} mm (--unit says it)",
+    )
+
+
+def write_ply(mesh: Mesh, path: str | Path) -> None:
+    """Write a binary PLY with float64 vertices: reading it gives the same mesh, bit for bit."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment surgisoft, millimetres\n"
+        f"element vertex {len(mesh.vertices_mm)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    rows["count"], rows["corner"] = 3, mesh.faces
+    body = mesh.vertices_mm.astype("<f8").tobytes() + rows.tobytes()
+    write_atomically(Path(path), header.encode("ascii") + body)
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """A mesh file in mm as one mesh, unchanged; the counterpart of `write_ply` and of repairs."""
+    parts = read_parts(path)
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
+    )

@@ -1,0 +1,390 @@
+"""Repair triangle soups into closed, outward-wound bodies, and say what was done.
+
+The order matters: vertices are joined first, then faces are cleaned, wound alike, holes closed,
+bodies turned outwards, and what lies inside another body is taken out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from surgisoft.errors import InputError
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.winding import winding_numbers
+
+JOIN = (1e-7, 1e-6, 1e-5, 1e-4, 5e-4)
+"""Distances at which vertices are joined, tried in turn until the surface closes (of its size)."""
+SPECK = 0.01
+"""A closed piece smaller than this fraction of the whole size is dirt, not a body."""
+OPEN_SPECK = 0.1
+"""The same for a piece that is open, and so no body anyhow."""
+HOLE = 0.3
+"""A hole wider than this fraction of its body is no longer guessed shut."""
+MOST_BODIES = 16
+"""More separate bodies than this in one part are not a scene but a broken file."""
+
+
+@dataclass(frozen=True)
+class Repair:
+    """One kind of repair."""
+
+    done: str
+    """What was done, for the user."""
+    count: int
+    """How often."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repaired:
+    """Closed bodies, largest first, and what it took."""
+
+    bodies: tuple[Mesh, ...]
+    """Closed meshes, wound outwards."""
+    repairs: tuple[Repair, ...]
+    """What was done; empty when nothing had to be."""
+
+
+def repair(vertices: np.ndarray, faces: np.ndarray, what: str) -> Repaired:
+    """Closed bodies from vertices (V, 3) mm and faces (F, 3); `what` names them in errors."""
+    used = np.unique(faces)
+    size = float(np.ptp(vertices[used], axis=0).max())
+    if size == 0.0:
+        raise InputError(f"{what}: all vertices are one point; expected a surface")
+    log: dict[str, int] = {}
+    vertices, faces = _join(vertices, faces, size, log)
+    vertices, faces = _unbranch(vertices, faces)
+    vertices, faces = _drop_specks(vertices, faces, size, log)
+    if len(faces) < 4:
+        raise InputError(f"{what}: {len(faces)} faces enclose nothing; expected a closed body")
+    faces = _wind_alike(faces, what, log)
+    vertices, faces = _close_holes(vertices, faces, what, log)
+    shells = _outward(vertices, faces, log)
+    for shell in shells:
+        if not shell.is_watertight:
+            raise InputError(
+                f"{what}: the surface crosses itself along edges that three or more faces share, "
+                "beyond repair; expected a closed body (remesh it in a mesh editor)"
+            )
+    flat = [s for s in shells if s.volume_mm3 <= 1e-6 * size * float(s.face_areas_mm2.sum())]
+    if len(flat) == len(shells):
+        raise InputError(f"{what}: the surface is flat and encloses no volume; expected a body")
+    shells = [shell for shell in shells if all(shell is not f for f in flat)]
+    bodies = _merge_touching(_drop_inner(shells, log))
+    if len(bodies) > MOST_BODIES:
+        raise InputError(
+            f"{what}: {len(bodies)} separate bodies; expected at most {MOST_BODIES} "
+            "(keep the organ and what must not be touched)"
+        )
+    bodies.sort(key=lambda mesh: -float(mesh.face_areas_mm2.sum()))
+    return Repaired(tuple(bodies), tuple(Repair(done, n) for done, n in log.items() if n))
+
+
+def _join(vertices, faces, size, log):
+    """Join vertices as little as it takes to close the surface: none, equal ones, near ones."""
+    used, dense = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], dense.reshape(-1, 3)
+    unique, same = np.unique(vertices, axis=0, return_inverse=True)
+    same = same.reshape(-1)
+    best = None
+    for fraction in (None, *JOIN):
+        if fraction is None:
+            base, label = vertices, np.arange(len(vertices))
+        else:
+            base, label = unique, _clusters(unique, fraction * size)[same]
+        cleaned, counts = _clean_faces(label[faces])
+        open_edges = _open_edges(cleaned)
+        if best is None or open_edges < best[0]:
+            best = (open_edges, base, cleaned, counts, len(vertices) - len(np.unique(label)))
+        if open_edges == 0:
+            break
+    _, base, cleaned, counts, joined = best
+    log["duplicate vertices joined"] = joined
+    log["degenerate faces removed"], log["duplicate faces removed"] = counts
+    return base, cleaned
+
+
+def _clusters(points, tolerance):
+    """For each point the index of the first point of its cluster; (N,)."""
+    pairs = cKDTree(points).query_pairs(tolerance, output_type="ndarray")
+    if not len(pairs):
+        return np.arange(len(points))
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    _, label = connected_components(graph, directed=False)
+    first = np.full(label.max() + 1, len(points))
+    np.minimum.at(first, label, np.arange(len(points)))
+    return first[label]
+
+
+def _clean_faces(faces):
+    """Faces without repeated corners and without doubles; counts of both.
+
+    A face and its own reverse are a flap without thickness: both go, unless that leaves the
+    surface more open than keeping one of the two.
+    """
+    proper = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    kept = faces[proper]
+    if not len(kept):
+        return kept, (len(faces), 0)
+    key = np.sort(kept, axis=1)
+    _, first, which, count = np.unique(
+        key, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    turn = np.bincount(which.reshape(-1), weights=_parity(kept), minlength=len(first))
+    flap = (count == 2) & (turn == 0)
+    without, with_one = kept[np.sort(first[~flap])], kept[np.sort(first)]
+    chosen = without if _open_edges(without) <= _open_edges(with_one) else with_one
+    return chosen, (len(faces) - len(kept), len(kept) - len(chosen))
+
+
+def _parity(faces):
+    """+1 or -1: whether the corners run as an even or odd permutation of their sorted order."""
+    a, b, c = faces.T
+    return np.sign((b - a) * (c - b) * (c - a)).astype(float)
+
+
+def _edges(faces):
+    """Sorted edges (3 F, 2) 01, 12, 20 of each face in turn, and the face of each (3 F,)."""
+    edges = np.sort(np.stack((faces, np.roll(faces, -1, axis=1)), axis=-1).reshape(-1, 2), axis=1)
+    return edges, np.repeat(np.arange(len(faces)), 3)
+
+
+def _open_edges(faces) -> int:
+    """Number of edges that do not lie between exactly two faces."""
+    edges, _ = _edges(faces)
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    return int(np.sum(count != 2))
+
+
+def _pairs(faces, vertices=None):
+    """Half-edges (P, 2) that meet, numbered 3 * face + corner, and whether both run alike (P,).
+
+    Edges with two faces; with `vertices`, also those with more, resolved by `_around_edge`.
+    """
+    edges, _ = _edges(faces)
+    forward = (faces == edges.reshape(-1, 3, 2)[:, :, 0]).reshape(-1)
+    order = np.lexsort(edges.T)
+    ranked = edges[order]
+    start = np.flatnonzero(np.r_[True, np.any(ranked[1:] != ranked[:-1], axis=1)])
+    count = np.diff(np.r_[start, len(ranked)])
+    two = start[count == 2]
+    pairs = [np.stack((order[two], order[two + 1]), axis=1)]
+    if vertices is not None:
+        for i in np.flatnonzero(count > 2):
+            half_edges = order[start[i] : start[i] + count[i]]
+            pairs.append(_around_edge(vertices, faces, half_edges, forward))
+    pairs = np.concatenate(pairs)
+    return pairs, forward[pairs[:, 0]] == forward[pairs[:, 1]]
+
+
+def _around_edge(vertices, faces, half_edges, forward):
+    """Pairs (P, 2) of an edge's half-edges with solid between them, as the faces' winding says.
+
+    Seen along the edge, a face that runs it forwards has its solid at smaller angles, one that
+    runs it backwards at greater ones; in order of angle the two must alternate (Gueziec et al.,
+    2001, "Cutting and stitching", IEEE TVCG 7, section 4.2). Otherwise nothing is paired.
+    """
+    face, corner = np.divmod(half_edges, 3)
+    ends = vertices[np.sort([faces[face[0], corner[0]], faces[face[0], (corner[0] + 1) % 3]])]
+    axis = (ends[1] - ends[0]) / max(np.linalg.norm(ends[1] - ends[0]), 1e-300)
+    apex = vertices[faces[face, (corner + 2) % 3]] - ends[0]
+    x = apex[0] - (apex[0] @ axis) * axis
+    angle = np.arctan2(apex @ np.cross(axis, x), apex @ x)
+    ring = half_edges[np.argsort(angle)]
+    if forward[ring[0]]:
+        ring = np.roll(ring, -1)
+    starts, stops = ring[0::2], ring[1::2]
+    if len(ring) % 2 or forward[starts].any() or not forward[stops].all():
+        return np.empty((0, 2), dtype=np.int64)
+    return np.stack((starts, stops), axis=1)
+
+
+def _components(faces):
+    """Component number (F,) of faces joined across edges with two faces."""
+    pairs, _ = _pairs(faces)
+    return _linked(pairs // 3, len(faces))
+
+
+def _linked(pairs, count):
+    """Component number (count,) of things joined by pairs (P, 2)."""
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _unbranch(vertices, faces):
+    """Where surfaces share an edge or only a vertex, give each its own vertices."""
+    pairs, alike = _pairs(faces, vertices)
+    face, corner = np.divmod(pairs, 3)
+    after = 3 * face + (corner + 1) % 3
+    crossed = np.where(alike[:, None], pairs, np.stack((pairs[:, 0], after[:, 1]), axis=1))
+    also = np.where(alike[:, None], after, np.stack((after[:, 0], pairs[:, 1]), axis=1))
+    label = _linked(np.concatenate((crossed, also)), 3 * len(faces))
+    first = np.unique(label, return_index=True)[1]
+    return vertices[faces.reshape(-1)[first]], label.reshape(-1, 3)
+
+
+def _drop_specks(vertices, faces, size, log):
+    """Leave out loose pieces too small for a body; open ones count as such up to a larger size."""
+    if not len(faces):
+        return vertices, faces
+    label = _components(faces)
+    low = np.full((label.max() + 1, 3), np.inf)
+    high = -low
+    for corner in faces.T:
+        np.minimum.at(low, label, vertices[corner])
+        np.maximum.at(high, label, vertices[corner])
+    is_open = np.bincount(label, minlength=len(low)) * 3 > 2 * np.bincount(
+        label[_pairs(faces)[0][:, 0] // 3], minlength=len(low)
+    )
+    keep = (high - low).max(axis=1) >= np.where(is_open, OPEN_SPECK, SPECK) * size
+    log["loose specks removed"] = int(np.sum(~keep))
+    used, dense = np.unique(faces[keep[label]], return_inverse=True)
+    return vertices[used], dense.reshape(-1, 3)
+
+
+def _wind_alike(faces, what, log):
+    """Turn faces so that neighbours run their common edge in opposite directions.
+
+    Each face appears twice in a graph, as it is and turned; neighbours that fit are joined. The
+    two copies of a surface come out apart, unless it has only one side.
+    """
+    count = len(faces)
+    pairs, alike = _pairs(faces)
+    a, b = (pairs // 3).T
+    other = np.where(alike, b + count, b)
+    mirror = np.where(alike, b, b + count)
+    label = _linked(np.concatenate(([a, other], [a + count, mirror]), axis=1).T, 2 * count)
+    if np.any(label[:count] == label[count:]):
+        raise InputError(f"{what}: the surface has only one side (Moebius); expected a closed body")
+    # of the two ways to wind each piece, the one that turns fewer faces
+    kept_as_is = np.bincount(label[:count], minlength=label.max() + 1)
+    turned = kept_as_is[label[:count]] < kept_as_is[label[count:]]
+    log["faces wound alike"] = int(turned.sum())
+    return np.where(turned[:, None], faces[:, ::-1], faces)
+
+
+def _boundary_loops(faces):
+    """Closed loops of boundary edges as vertex lists, run against the faces."""
+    directed = np.stack((faces, np.roll(faces, -1, axis=1)), axis=-1).reshape(-1, 2)
+    key = np.sort(directed, axis=1)
+    _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
+    step: dict[int, list[int]] = {}
+    for a, b in directed[first[count == 1]]:
+        step.setdefault(int(b), []).append(int(a))
+    loops = []
+    while step:
+        start = here = next(iter(step))
+        path, place = [start], {start: 0}
+        while here in step:
+            following = step[here].pop()
+            if not step[here]:
+                del step[here]
+            here = following
+            if here in place:
+                loops.append(path[place[here] :])
+                for vertex in path[place[here] + 1 :]:
+                    del place[vertex]
+                path = path[: place[here] + 1]
+                if here not in step:
+                    break
+            else:
+                place[here] = len(path)
+                path.append(here)
+    return loops
+
+
+def _close_holes(vertices, faces, what, log):
+    """Fan every hole shut from its middle; one as wide as a good part of the body is refused."""
+    loops = _boundary_loops(faces)
+    new_vertices, new_faces = [vertices], [faces]
+    label = _components(faces)
+    part_of = np.zeros(len(vertices), dtype=np.int64)
+    part_of[faces.reshape(-1)] = np.repeat(label, 3)
+    following = len(vertices)
+    for loop in loops:
+        rim = vertices[loop]
+        body = vertices[np.unique(faces[label == part_of[loop[0]]])]
+        width, size = np.ptp(rim, axis=0).max(), np.ptp(body, axis=0).max()
+        if width > HOLE * size:
+            raise InputError(
+                f"{what}: a hole {width:.3g} mm wide in a surface of {size:.3g} mm is too large "
+                f"to guess shut (up to {100 * HOLE:.0f} %); expected a closed body"
+            )
+        if len(loop) == 3:
+            new_faces.append(np.array([loop]))
+            continue
+        new_vertices.append(rim.mean(axis=0)[None])
+        ring = np.array(loop)
+        new_faces.append(np.stack((ring, np.roll(ring, -1), np.full_like(ring, following)), axis=1))
+        following += 1
+    log["holes closed"] = len(loops)
+    return np.concatenate(new_vertices), np.concatenate(new_faces)
+
+
+def _outward(vertices, faces, log):
+    """One mesh a closed shell, with positive volume."""
+    label = _components(faces)
+    shells, turned = [], 0
+    for part in range(label.max() + 1):
+        mine = faces[label == part]
+        used, dense = np.unique(mine, return_inverse=True)
+        mesh = Mesh(vertices[used], dense.reshape(-1, 3))
+        if mesh.volume_mm3 < 0.0:
+            mesh = Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
+            turned += 1
+        shells.append(mesh)
+    log["inside-out bodies turned"] = turned
+    return shells
+
+
+def _encloses(outer: Mesh, inner: Mesh) -> np.ndarray:
+    """Whether each of up to 64 spread vertices of `inner` lies within `outer`: bools."""
+    points = inner.vertices_mm[:: max(1, len(inner.vertices_mm) // 64)]
+    return np.abs(winding_numbers(outer, points)) > 0.5
+
+
+def _boxes_meet(a: Mesh, b: Mesh) -> bool:
+    return bool(
+        np.all(a.bounds_mm[0] <= b.bounds_mm[1]) and np.all(b.bounds_mm[0] <= a.bounds_mm[1])
+    )
+
+
+def _drop_inner(shells, log):
+    """Bodies that do not lie wholly inside a larger one."""
+    shells = sorted(shells, key=lambda mesh: -mesh.volume_mm3)
+    kept: list[Mesh] = []
+    for shell in shells:
+        if not any(_boxes_meet(outer, shell) and _encloses(outer, shell).all() for outer in kept):
+            kept.append(shell)
+    log["inner bodies removed"] = len(shells) - len(kept)
+    return kept
+
+
+def _merge_touching(shells):
+    """Shells that run into each other become one body of several shells."""
+    pairs = [
+        (i, j)
+        for i in range(len(shells))
+        for j in range(i)
+        if _boxes_meet(shells[i], shells[j])
+        and (_encloses(shells[i], shells[j]).any() or _encloses(shells[j], shells[i]).any())
+    ]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(pairs)), (rows, columns)), shape=(len(shells),) * 2)
+    _, label = connected_components(graph, directed=False)
+    return [
+        _together([shells[i] for i in np.flatnonzero(label == part)])
+        for part in range(label.max() + 1)
+    ]
+
+
+def _together(shells) -> Mesh:
+    starts = np.cumsum([0, *(len(shell.vertices_mm) for shell in shells[:-1])])
+    return Mesh(
+        np.concatenate([shell.vertices_mm for shell in shells]),
+        np.concatenate([s.faces + i for s, i in zip(shells, starts, strict=True)]),
+    )

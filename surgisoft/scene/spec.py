@@ -1,0 +1,258 @@
+"""The scene file `scene.toml` as frozen dataclasses: what stands where, in which units.
+
+Lengths in mm, times in s; angles are in degrees in the file (the field says so) and in radians
+everywhere else. World frame: z up. An arm's base frame: z along the arm at rest.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.scene.mesh import ROLES
+from surgisoft.toml_config import Rule, Where, from_table, read_toml, to_table, write_toml
+
+FORMAT = 1
+FILE = "scene.toml"
+TOOLS = ("laser", "endoscope")
+
+
+def _one_of(known: tuple[str, ...]) -> Rule:
+    return Rule("one of " + ", ".join(known), lambda value: value in known)
+
+
+def _between(low: float, high: float, unit: str) -> Rule:
+    unit = f" {unit}" if unit else ""
+    return Rule(f"a number from {low:g} to {high:g}{unit}", lambda value: low <= value <= high)
+
+
+def _is_inside_path(text: str) -> bool:
+    path = PurePosixPath(text)
+    return bool(text) and not path.is_absolute() and ".." not in path.parts and "\\" not in text
+
+
+Length = Annotated[float, Rule("a length above 0 mm", lambda mm: 0.0 < mm <= 1e4)]
+Distance = Annotated[float, _between(0.0, 1e4, "mm")]
+Coordinate = Annotated[float, _between(-1e6, 1e6, "mm")]
+Angle = Annotated[float, _between(-360.0, 360.0, "degrees")]
+Point = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate], Rule("3 numbers [x, y, z] in mm", lambda p: True)
+]
+Angles = Annotated[
+    tuple[Angle, Angle, Angle], Rule("3 numbers [x, y, z] in degrees", lambda p: True)
+]
+Direction = Annotated[
+    tuple[float, float, float],
+    Rule("3 numbers [x, y, z], not all zero", lambda d: 1e-6 < np.linalg.norm(d) < 1e6),
+]
+Range = Annotated[
+    tuple[Distance, Distance],
+    Rule("2 numbers [nearest, farthest] in mm, rising from 0", lambda r: 0.0 <= r[0] < r[1]),
+]
+Name = Annotated[
+    str,
+    Rule(
+        "a name of letters, digits, '_' and '-' (at most 64)",
+        lambda text: re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) is not None,
+    ),
+]
+MeshPath = Annotated[
+    str, Rule("a file inside the scene's folder, such as 'liver.stl'", _is_inside_path)
+]
+
+
+@dataclass(frozen=True)
+class BodySpec:
+    """One closed mesh that stands still in the scene."""
+
+    name: Name
+    """Name of the body, unique in the scene."""
+    mesh: MeshPath
+    """Mesh file in mm, relative to the scene's folder."""
+    role: Annotated[str, _one_of(ROLES)]
+    """`organ` is operated on, `keep-out` must not be touched, `support` carries the others."""
+    position_mm: Point = (0.0, 0.0, 0.0)
+    """Origin of the mesh in the world frame (mm)."""
+    rotation_deg: Angles = (0.0, 0.0, 0.0)
+    """Turns about the world's x, then y, then z axis (degrees), before the shift."""
+
+    def pose(self) -> np.ndarray:
+        """Mesh frame to world frame, (4, 4) homogeneous, mm."""
+        turns = frames.rotation_from_axis_angle(np.eye(3), np.radians(self.rotation_deg))
+        return frames.pose_from(turns[2] @ turns[1] @ turns[0], self.position_mm)
+
+
+@dataclass(frozen=True)
+class LesionSpec:
+    """What is to be cut around."""
+
+    body: Name
+    """The organ that carries the lesion."""
+    centre_mm: Point
+    """Centre on the organ's surface, world frame (mm)."""
+    diameter_mm: Length = 20.0
+    """Diameter of the ring, measured in the plane of the surface at the centre (mm)."""
+    path_mm: tuple[Point, ...] = ()
+    """Closed path on the surface to cut in place of the circle, world frame (mm); empty: circle."""
+
+
+@dataclass(frozen=True)
+class MountSpec:
+    """Where one arm is fixed, and what it carries."""
+
+    tool: Annotated[str, _one_of(TOOLS)]
+    """`laser` or `endoscope`; a scene has one of each."""
+    position_mm: Point
+    """Centre of the arm's base, world frame (mm)."""
+    direction: Direction
+    """Where the arm points at rest, world frame; any length."""
+    roll_deg: Angle = 0.0
+    """Turn of the arm about its own axis (degrees)."""
+    arm: Annotated[str, Rule("an arm model's name or folder", bool)] = "default"
+    """Arm model: `default`, or the folder of a fitted model."""
+    length_mm: Length = 70.0
+    """Length of the arm at rest (mm)."""
+    diameter_mm: Length = 15.0
+    """Outer diameter of the arm (mm)."""
+    shaft_mm: Distance = 100.0
+    """Straight rigid shaft behind the base, as thick as the arm (mm); 0: none."""
+
+    def pose(self) -> np.ndarray:
+        """Base frame to world frame, (4, 4) homogeneous, mm.
+
+        z is `direction`; x lies as `frames.rotation_from_z` puts it, turned by `roll_deg`.
+        """
+        return frames.pose_from_z(self.position_mm, self.direction, np.radians(self.roll_deg))
+
+
+@dataclass(frozen=True)
+class LaserSpec:
+    """The beam that leaves the laser arm's tip along the tip's direction."""
+
+    power_w: Annotated[float, _between(0.0, 1e4, "W")] = 20.0
+    """Optical power (W)."""
+    spot_mm: Length = 0.6
+    """Diameter of the Gaussian beam at 1/e^2 of its peak (mm); the beam is collimated."""
+    wavelength_nm: Annotated[float, _between(100.0, 20000.0, "nm")] = 1940.0
+    """Wavelength in vacuum (nm); 1940 nm is a thulium fibre laser."""
+    absorption_per_mm: Annotated[
+        float, Rule("an absorption coefficient above 0 1/mm", lambda a: 0.0 < a <= 1e5)
+    ] = 9.0
+    """Absorption of the tissue at this wavelength (1/mm)."""
+    standoff_mm: Range = (20.0, 60.0)
+    """Least and greatest distance from the tip to the tissue (mm)."""
+    max_incidence_deg: Annotated[float, _between(0.0, 89.0, "degrees")] = 60.0
+    """Greatest angle between the beam and the surface's normal (degrees)."""
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """The camera in the endoscope arm's tip, looking along the tip's direction."""
+
+    fov_deg: Annotated[float, _between(1.0, 179.0, "degrees")] = 70.0
+    """Full cone angle of the round field of view (degrees)."""
+    range_mm: Range = (10.0, 100.0)
+    """Least and greatest distance at which the picture is sharp (mm)."""
+
+
+@dataclass(frozen=True)
+class LimitsSpec:
+    """What every task on this scene has to keep."""
+
+    clearance_mm: Distance = 1.0
+    """Least distance between an arm's skin and any body or the other arm (mm)."""
+    time_s: Annotated[float, Rule("a time above 0 s", lambda t: 0.0 < t <= 1e6)] = 60.0
+    """Time for the whole ring (s)."""
+    view_fraction: Annotated[float, _between(0.0, 1.0, "")] = 0.95
+    """Least fraction of the ring that the endoscope must see."""
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """A whole scene file."""
+
+    name: Name
+    """Name of the scene."""
+    bodies: tuple[BodySpec, ...]
+    """All bodies; at least one organ."""
+    lesion: LesionSpec
+    """The lesion on one organ."""
+    mounts: tuple[MountSpec, ...]
+    """The two mounts: one laser, one endoscope."""
+    laser: LaserSpec = field(default_factory=LaserSpec)
+    """The laser's beam."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """The endoscope's camera."""
+    limits: LimitsSpec = field(default_factory=LimitsSpec)
+    """Limits of every task."""
+    note: str = ""
+    """Free text."""
+    format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
+    """Version of this file format."""
+
+    def mount(self, tool: str) -> MountSpec:
+        """The mount that carries `tool`."""
+        return next(mount for mount in self.mounts if mount.tool == tool)
+
+    def body(self, name: str) -> BodySpec:
+        """The body of that name."""
+        return next(body for body in self.bodies if body.name == name)
+
+
+def spec_path(path: str | Path) -> Path:
+    """The scene file of a scene folder (or the file itself)."""
+    path = Path(path)
+    return path / FILE if path.is_dir() else path
+
+
+def load_spec(path: str | Path) -> SceneSpec:
+    """Read `scene.toml` (or a folder that holds one); every bad field is one line."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: there is no such scene; expected a folder with {FILE}")
+    if path.is_dir() and not (path / FILE).exists():
+        raise InputError(f"{path}: holds no {FILE}; make a scene with 'surgisoft scene new'")
+    table, where = read_toml(spec_path(path))
+    spec = from_table(SceneSpec, table, where)
+    _check_whole(spec, where)
+    return spec
+
+
+def save_spec(spec: SceneSpec, path: str | Path) -> None:
+    """Write the scene file; loading it gives an equal spec."""
+    path = Path(path)
+    table, where = to_table(spec), Where(path)
+    _check_whole(from_table(SceneSpec, table, where), where)
+    write_toml(path, table)
+
+
+def _check_whole(spec: SceneSpec, where: Where) -> None:
+    """What only several fields together can break."""
+    seen: set[str] = set()
+    for i, body in enumerate(spec.bodies):
+        if body.name in seen:
+            raise (where / "bodies" / i / "name").error(
+                f"a second body '{body.name}'", "names that differ"
+            )
+        seen.add(body.name)
+    organs = [body.name for body in spec.bodies if body.role == "organ"]
+    if not organs:
+        raise (where / "bodies").error("no body has the role 'organ'", "at least one organ")
+    if spec.lesion.body not in organs:
+        raise (where / "lesion" / "body").error(
+            f"got '{spec.lesion.body}'", f"one of the organs: {', '.join(organs)}"
+        )
+    if 0 < len(spec.lesion.path_mm) < 3:
+        raise (where / "lesion" / "path_mm").error(
+            f"got {len(spec.lesion.path_mm)} points", "no point (a circle) or at least 3"
+        )
+    tools = sorted(mount.tool for mount in spec.mounts)
+    if tools != sorted(TOOLS):
+        raise (where / "mounts").error(
+            f"got {len(tools)} mounts with tools {', '.join(tools) or '(none)'}",
+            "two mounts: one laser, one endoscope",
+        )

@@ -3,18 +3,21 @@
 import os
 import sys
 
-import click
 import typer
+from typer.exceptions import TyperException
 
 from surgisoft.errors import InputError
 
 app = typer.Typer(
     name="surgisoft",
-    help="Soft robots in surgical scenes: arm models judged by measurements.",
+    help="Soft robots in surgical scenes, with arm models judged by measurements.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+MANY = {"--valid", "--effects", "--hidden"}
+"""Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 
 def _version(value: bool) -> None:
@@ -34,33 +37,55 @@ def _root(
     pass
 
 
+def spread(arguments: list[str]) -> list[str]:
+    """Repeat each option of `MANY` before every value that follows it."""
+    answer, option = [], None
+    for argument in arguments:
+        if argument.startswith("-") and not argument.lstrip("-").replace(".", "").isdigit():
+            option = argument if argument in MANY else None
+            first = option is not None
+            answer.append(argument)
+            continue
+        if option is not None and not first:
+            answer.append(option)
+        first = False
+        answer.append(argument)
+    return answer
+
+
 def _fail(message: str) -> int:
     print(f"surgisoft: error: {' '.join(message.split())}", file=sys.stderr)
     return 2
+
+
+def _usage(error: TyperException) -> int:
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(error.format_message())
+        return 2
+    context = getattr(error, "ctx", None)
+    where = context.command_path if context else "surgisoft"
+    return _fail(f"{error.format_message().rstrip('.')}; see '{where} --help'")
 
 
 def run(arguments: list[str] | None = None) -> int:
     """Run one command; the exit code: 0, 2 for bad input, 130 when interrupted."""
     from surgisoft.cli import commands  # noqa: F401  (registers every command on `app`)
 
+    arguments = spread(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = app(args=arguments, standalone_mode=False, prog_name="surgisoft")
     except InputError as error:
         return _fail(str(error))
-    except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message())
-        return 2
-    except click.UsageError as error:
-        where = error.ctx.command_path if error.ctx else "surgisoft"
-        return _fail(f"{error.format_message().rstrip('.')}; see '{where} --help'")
-    except click.ClickException as error:
-        return _fail(error.format_message())
-    except (KeyboardInterrupt, click.Abort):
+    except TyperException as error:
+        return _usage(error)
+    except (KeyboardInterrupt, typer.Abort):
         print("surgisoft: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
     return code if isinstance(code, int) else 0
 
 

@@ -11,7 +11,7 @@ import copy
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import torch
 from torch import Tensor
@@ -95,6 +95,36 @@ class FitResult:
     seconds: float
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
+
+    def report(self) -> dict:
+        """What happened, for a JSON file beside the model."""
+        return {
+            "stages": [asdict(stage) for stage in self.stages],
+            "excitation": [asdict(chamber) for chamber in self.excitation],
+            "warnings": self.warnings,
+            "seconds": self.seconds,
+            "loss": [
+                dict(zip(("stage", "epoch", "training_mm2", "held_out_mm2"), row, strict=True))
+                for row in self.loss
+            ],
+        }
+
+    def lines(self) -> list[str]:
+        """What happened, for a person."""
+        lines = [
+            f"{stage.name:20s} held-out RMSE {stage.valid_rmse_mm:8.4f} mm  "
+            f"{stage.epochs:4d} epochs {stage.seconds:6.1f} s  "
+            f"{'kept' if stage.kept else 'left out'}"
+            for stage in self.stages
+        ]
+        lines += [f"note: {warning}" for warning in self.warnings]
+        error = self.model.validation
+        points = " ".join(f"{value:.4f}" for value in error["per_key_point_mm"])
+        lines.append(
+            f"held-out RMSE {error['rmse_mm']:.4f} mm over {error['rows']} rows; "
+            f"key points base to tip: {points} mm"
+        )
+        return lines
 
 
 Progress = Callable[[str, int, int, float], None]

@@ -5,10 +5,22 @@ import itertools
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import centre_and_half
 
 HIDDEN = (128, 128, 128, 128)
 """Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
+
+
+def parse_widths(text: str) -> tuple[int, ...]:
+    """Widths of hidden layers from text such as `128,128`."""
+    try:
+        widths = tuple(int(word) for word in text.replace("x", ",").split(","))
+    except ValueError:
+        widths = ()
+    if not widths or min(widths) < 1:
+        raise InputError(f"hidden widths '{text}': expected whole numbers such as 128,128,128,128")
+    return widths
 
 
 class HawNN(nn.Module):

@@ -1,0 +1,90 @@
+"""`surgisoft fit`: an arm model from recordings."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.progress import progress
+
+
+@app.command()
+def fit(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the new model.")],
+    valid: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="REC",
+            help="Held-out recordings that choose the model; without them whole runs, or blocks "
+            "of time, of the training recordings are held out.",
+        ),
+    ] = None,
+    inputs: Annotated[
+        Literal["pressure", "pressure+direction"],
+        typer.Option(help="What the network sees of each chamber."),
+    ] = "pressure+direction",
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME...", help="Physical effects to add: hysteresis."),
+    ] = None,
+    network: Annotated[
+        Literal["haw_nn", "constant_curvature", "recurrent"],
+        typer.Option(help="HAW-NN, or a baseline."),
+    ] = "haw_nn",
+    widths: Annotated[
+        str, typer.Option(help="Widths of HAW-NN's hidden layers.")
+    ] = "128,128,128,128",
+    actuation: Annotated[
+        Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
+    ] = "measured",
+    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 400,
+    seed: Annotated[int, typer.Option(help="Seed of weights and order of rows.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing model.")] = False,
+) -> None:
+    """Fit an arm model (HAW-NN, optionally with effects) to recordings.
+
+    Grows from pressure to direction to effects, keeps each only where held-out data rewards it,
+    and says which inputs the recordings cannot support.
+    """
+    from surgisoft.measurement.histories import arm_spec, check_fits, history_of
+    from surgisoft.measurement.recording import check_same_arm, load_recordings
+    from surgisoft.surrogate.checkpoint import claim_folder, save_model
+    from surgisoft.surrogate.fit import FitConfig
+    from surgisoft.surrogate.fit import fit as fit_model
+    from surgisoft.surrogate.network import parse_widths
+
+    claim_folder(output, force)
+    train = load_recordings(recordings, on_warning=_warn)
+    held = load_recordings(valid, on_warning=_warn) if valid else None
+    check_same_arm(train)
+    spec = arm_spec(train, actuation)
+    if held:
+        check_fits(spec, held)
+    config = FitConfig(
+        network=network,
+        inputs=inputs,
+        effects=tuple(name for item in effects or [] for name in item.split(",")),
+        hidden=parse_widths(widths),
+        epochs=epochs,
+        seed=seed,
+    )
+    with progress("fit") as report:
+        result = fit_model(
+            history_of(train, actuation),
+            history_of(held, actuation) if held else None,
+            spec,
+            config,
+            lambda stage, epoch, of, loss: report(epoch, of, f"{stage}: held-out {loss:.4f} mm2"),
+        )
+    save_model(result.model, output, result.report(), force)
+    for line in result.lines():
+        print(line)
+    print(f"wrote {output}: {result.model.summary()}")
+
+
+def _warn(message: str) -> None:
+    typer.echo(f"surgisoft: warning: {message}", err=True)

@@ -1,0 +1,154 @@
+"""Pictures of a comparison: hysteresis loops, the body in space, the error over time."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.residuals import Residuals
+from surgisoft.surrogate.backbone import Backbone
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+MEASURED, PREDICTED = "#222222", "#d1495b"
+LOOP_ROWS = 400
+"""Most rows that one picture of loops shows; more would hide each other."""
+POSTURES = 7
+"""Bodies that the picture in space shows."""
+
+
+def draw_all(
+    rest: Residuals, backbone: Backbone, unit: str, folder: Path, title: str = ""
+) -> list[Path]:
+    """Write loops.png, body.png and error.png into a folder; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = []
+    for name, figure in (
+        ("loops", loops(rest, unit, title)),
+        ("body", body(rest, backbone, title)),
+        ("error", error_over_time(rest, title)),
+    ):
+        path = folder / f"{name}.png"
+        figure.savefig(path, dpi=130)
+        plt.close(figure)
+        drawn.append(path)
+    return drawn
+
+
+def loops(rest: Residuals, unit: str, title: str = ""):
+    """Tip against the actuation of each chamber, measured and predicted.
+
+    For each chamber the stretch of rows in which it moves most and the others least.
+    """
+    chambers = rest.pressure.shape[1]
+    figure, axes = plt.subplots(
+        2, chambers, figsize=(4.2 * chambers, 6.2), layout="constrained", squeeze=False
+    )
+    figure.suptitle(title or "Tip against actuation")
+    for chamber in range(chambers):
+        rows = _stretch(rest, chamber)
+        along = _main_direction(rest.measured_mm[rows, -1])
+        measured = rest.measured_mm[rows, -1] @ along
+        predicted = rest.predicted_mm[rows, -1] @ along
+        pressure = rest.pressure[rows, chamber]
+        line = np.polyval(np.polyfit(pressure, predicted, 3), pressure)
+        for row, (offset, what) in enumerate(
+            ((0, "tip, main direction [mm]"), (line, "the same less a cubic [mm]"))
+        ):
+            axis = axes[row, chamber]
+            axis.plot(pressure, measured - offset, ".-", c=MEASURED, lw=0.7, ms=3, label="measured")
+            axis.plot(pressure, predicted - offset, "-", c=PREDICTED, lw=1.0, label="predicted")
+            axis.set_xlabel(f"chamber {chamber + 1} [{unit}]")
+            axis.grid(alpha=0.25)
+            if chamber == 0:
+                axis.set_ylabel(what)
+    axes[0, 0].legend(frameon=False)
+    return figure
+
+
+def _stretch(rest: Residuals, chamber: int) -> np.ndarray:
+    """Rows of one run, at most LOOP_ROWS, in which one chamber moves most and others least."""
+    best, score = None, -np.inf
+    span = np.ptp(rest.pressure, axis=0)
+    span = np.where(span > 0, span, 1)
+    for run in np.unique(rest.run):
+        rows = np.flatnonzero((rest.run == run) & ~np.isnan(rest.measured_mm[:, -1, 0]))
+        for start in range(0, max(1, len(rows) - LOOP_ROWS // 2), LOOP_ROWS // 2):
+            part = rows[start : start + LOOP_ROWS]
+            if len(part) < 4:
+                continue
+            moves = np.ptp(rest.pressure[part], axis=0) / span
+            now = 2 * moves[chamber] - moves.sum()
+            if now > score + 1e-9:
+                best, score = part, now
+    return best if best is not None else np.arange(min(LOOP_ROWS, len(rest.run)))
+
+
+def _main_direction(points: np.ndarray) -> np.ndarray:
+    """(3,) unit vector along which points (S, 3) spread most."""
+    centred = np.nan_to_num(points - np.nanmean(points, axis=0))
+    return np.linalg.svd(centred, full_matrices=False)[2][0]
+
+
+def body(rest: Residuals, backbone: Backbone, title: str = ""):
+    """A few postures in space: measured key points, predicted ones and their backbone."""
+    whole = np.flatnonzero(~np.isnan(rest.measured_mm).any(axis=(1, 2)))
+    figure = plt.figure(figsize=(6.5, 6.2), layout="constrained")
+    axis = figure.add_subplot(projection="3d")
+    for number, row in enumerate(_spread(rest.measured_mm[whole, -1])):
+        row = whole[row]
+        points = torch.tensor(rest.predicted_mm[row], dtype=torch.float32)
+        line = backbone.centreline(points).numpy()
+        first = number == 0
+        axis.plot(*line.T, c=PREDICTED, lw=2, label="predicted backbone" if first else None)
+        axis.scatter(*points.numpy().T, c=PREDICTED, s=14)
+        axis.scatter(
+            *rest.measured_mm[row].T,
+            facecolors="none",
+            edgecolors=MEASURED,
+            s=55,
+            label="measured key points" if first else None,
+        )
+    axis.set_xlabel("x [mm]")
+    axis.set_ylabel("y [mm]")
+    axis.set_zlabel("z [mm]")
+    axis.set_aspect("equal")
+    axis.legend(frameon=False, loc="upper left")
+    axis.set_title(title or "Body, measured and predicted")
+    return figure
+
+
+def _spread(tips: np.ndarray) -> list[int]:
+    """Indices of postures whose tips (S, 3) lie far apart (farthest-point sampling)."""
+    if not len(tips):
+        return []
+    picked = [int(np.linalg.norm(tips - tips.mean(0), axis=1).argmax())]
+    distance = np.full(len(tips), np.inf)
+    while len(picked) < min(POSTURES, len(tips)):
+        distance = np.minimum(distance, np.linalg.norm(tips - tips[picked[-1]], axis=1))
+        picked.append(int(distance.argmax()))
+    return picked
+
+
+def error_over_time(rest: Residuals, title: str = ""):
+    """Tip and mean error over the rows, runs marked, and the distribution per key point."""
+    error = rest.error_mm
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(11, 3.8), layout="constrained", width_ratios=(3, 1)
+    )
+    left.plot(error[:, -1], c=PREDICTED, lw=0.6, label="tip")
+    left.plot(np.nanmean(error, axis=1), c=MEASURED, lw=0.6, label="mean of the key points")
+    for edge in np.flatnonzero(np.diff(rest.run)):
+        left.axvline(edge + 0.5, c="#bbbbbb", lw=0.6)
+    left.set_xlabel("row (runs are divided by lines)")
+    left.set_ylabel("error [mm]")
+    left.set_ylim(bottom=0)
+    left.legend(frameon=False)
+    left.set_title(title or "Error over the recording")
+    columns = [column[~np.isnan(column)] for column in error.T]
+    right.boxplot(columns, showfliers=False, tick_labels=[f"k{k}" for k in range(len(columns))])
+    right.set_ylabel("error [mm]")
+    right.set_title("by key point")
+    return figure

@@ -1,0 +1,75 @@
+"""The spline against polynomials that it must reproduce and arcs with known tangents."""
+
+import math
+
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.backbone import Backbone
+
+REST = torch.tensor([[0.0, 0.0, z] for z in (0.0, 17.5, 35.0, 52.5, 70.0)])
+
+
+def arc(angle: float, share: torch.Tensor, length: float = 70.0) -> torch.Tensor:
+    """(K, 3) points of a planar circular arc at shares of its length."""
+    radius = length / angle
+    turned = angle * share
+    return torch.stack(
+        [radius * (1 - turned.cos()), torch.zeros_like(share), radius * turned.sin()], -1
+    )
+
+
+def test_straight_arm_stays_straight_and_reaches_both_ends():
+    backbone = Backbone.through(REST, samples=11)
+    line = backbone.centreline(REST)
+    assert torch.allclose(line[:, 2], torch.linspace(0, 70, 11), atol=1e-4)
+    assert torch.allclose(backbone.tip_direction(REST), torch.tensor([0.0, 0.0, 1.0]), atol=1e-6)
+
+
+def test_cubics_are_reproduced_exactly():
+    """An interpolating cubic spline with not-a-knot ends contains every cubic."""
+    backbone = Backbone.through(REST, samples=33)
+    u = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
+    dense = torch.linspace(0, 1, 33, dtype=torch.float64)
+
+    def cubic(x):
+        return torch.stack([30 * x**3 - 9 * x, 12 * x**2 + x**3, 70 * x], -1)
+
+    line = backbone.centreline(cubic(u).float())
+    assert torch.allclose(line.double(), cubic(dense), atol=1e-4)
+    slope = torch.stack([90 * dense**2 - 9, 24 * dense + 3 * dense**2, 0 * dense + 70], -1)
+    tangent = torch.nn.functional.normalize(slope, dim=-1)
+    assert torch.allclose(backbone.tangents(cubic(u).float()).double(), tangent, atol=1e-5)
+
+
+def test_error_on_an_arc_falls_with_the_fourth_power_of_the_spacing():
+    angle, errors = math.pi / 2, []
+    for points in (5, 9, 17):
+        share = torch.linspace(0, 1, points)
+        rest = torch.stack([0 * share, 0 * share, 70 * share], -1)
+        backbone = Backbone.through(rest, samples=201)
+        dense = torch.linspace(0, 1, 201, dtype=torch.float64)
+        line = backbone.position.double() @ arc(angle, share.double())
+        errors.append(float((line - arc(angle, dense)).norm(dim=-1).max()))
+    assert errors[0] < 0.15
+    # Spacing halves: the error of a cubic spline falls 16 times.
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.5)
+    assert errors[1] / errors[2] == pytest.approx(16, rel=0.5)
+
+
+def test_batches_are_rows_of_the_same_matrix():
+    backbone = Backbone.through(REST)
+    batch = torch.randn(4, 6, 5, 3)
+    line = backbone.centreline(batch)
+    assert line.shape == (4, 6, 21, 3)
+    assert torch.allclose(line[2, 3], backbone.centreline(batch[2, 3]), atol=1e-5)
+
+
+def test_two_key_points_make_a_line_and_one_is_refused():
+    backbone = Backbone.through(REST[:2], samples=3)
+    assert torch.allclose(backbone.centreline(REST[:2])[1], torch.tensor([0.0, 0.0, 8.75]))
+    with pytest.raises(InputError, match="at least 2"):
+        Backbone.through(REST[:1])
+    with pytest.raises(InputError, match="coincide"):
+        Backbone.through(torch.zeros(3, 3))

@@ -1,0 +1,109 @@
+"""One set of promises over every effect, and hysteresis by hand."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.effects import EFFECTS, STAGES, make_effect
+
+LOW, HIGH = torch.tensor([-10.0, -10.0, -10.0]), torch.tensor([50.0, 50.0, 50.0])
+
+
+def signal(effect, runs: int, steps: int, seed: int) -> torch.Tensor:
+    """Random walks of what the effect acts on: actuation, or key points."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (3,) if effect.stage in ("line", "material") else (4, 3)
+    return 20 + 6 * torch.randn(runs, steps, *shape, generator=generator).cumsum(1)
+
+
+def stirred(name: str):
+    """The effect with every parameter moved off its first value."""
+    effect = make_effect(name, LOW, HIGH)
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in effect.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
+    return effect
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_no_strength_no_change(name):
+    effect = make_effect(name, LOW, HIGH)
+    x = signal(effect, 2, 30, 0)
+    y = effect.apply(x, effect.scan(x, torch.full((2, 30), 0.05)))
+    assert torch.equal(x, y)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("seed", range(3))
+def test_stepping_is_scanning(name, seed):
+    effect = stirred(name)
+    x, dt = signal(effect, 3, 50, seed), torch.rand(3, 50) * 0.2
+    dt[:, 0] = 0
+    scanned = effect.scan(x, dt)
+    memory = effect.rest(x[:, 0])
+    for t in range(50):
+        memory = effect.advance(memory, x[:, t], dt[:, t])
+        assert torch.allclose(memory, scanned[:, t], rtol=1e-5, atol=1e-4)
+        assert torch.allclose(
+            effect.apply(x[:, t], memory), effect.apply(x, scanned)[:, t], atol=1e-3
+        )
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_registered_under_its_file_and_rebuilt_from_its_config(name):
+    effect = make_effect(name, LOW, HIGH)
+    assert type(effect).__module__.rsplit(".", 1)[1] == name
+    assert effect.stage in STAGES
+    again = make_effect(name, LOW, HIGH, **effect.config())
+    again.load_state_dict(stirred(name).state_dict())
+    x = signal(effect, 2, 20, 1)
+    dt = torch.full((2, 20), 0.1)
+    stir = stirred(name)
+    assert torch.equal(again.apply(x, again.scan(x, dt)), stir.apply(x, stir.scan(x, dt)))
+    assert all(quantity.name and quantity.value is not None for quantity in effect.quantities())
+
+
+def test_unknown_effect_names_the_known_ones():
+    with pytest.raises(InputError, match="known are .*hysteresis"):
+        make_effect("gremlins", LOW, HIGH)
+
+
+def lag(pressures: list[float]) -> torch.Tensor:
+    """Plays less the pressure of chamber 1 with radius 6 (one tenth of 60), by the effect."""
+    effect = make_effect("hysteresis", LOW, HIGH, radii=(0.1,))
+    x = torch.zeros(1, len(pressures), 3)
+    x[0, :, 0] = torch.tensor(pressures)
+    return (effect.scan(x, torch.zeros(1, len(pressures)))[..., 0] - x)[0, :, 0]
+
+
+def test_play_by_hand():
+    assert lag([0.0, 3.0, 6.0, 20.0, 15.0, 8.0, 0.0, 2.0]).tolist() == [
+        0, -3, -6, -6, -1, 6, 6, 4,
+    ]  # fmt: skip
+
+
+@given(st.floats(15, 45), st.floats(-5, 12))
+def test_return_point_memory(high, low):
+    """A closed inner loop leaves no trace (Mayergoyz 2003: return-point memory)."""
+    effect = stirred("hysteresis")
+    x = torch.zeros(1, 4, 3)
+    x[0, :, 1] = torch.tensor([-10.0, high, low, high])
+    memory = effect.scan(x, torch.zeros(1, 4))
+    assert torch.allclose(memory[0, 1], memory[0, 3], atol=1e-5)
+
+
+@given(st.lists(st.floats(0, 20), min_size=1, max_size=12))
+def test_a_larger_sweep_wipes_out_smaller_ones(inner):
+    """After a sweep beyond every earlier extremum, what came before is forgotten."""
+    effect = stirred("hysteresis")
+
+    def end(history):
+        x = torch.zeros(1, len(history), 3)
+        x[0, :, 2] = torch.tensor(history)
+        return effect.scan(x, torch.zeros(1, len(history)))[0, -1]
+
+    tail = [-10.0, 50.0, 30.0]
+    assert torch.allclose(end([10.0, *inner, *tail]), end([10.0, *tail]), atol=1e-5)

@@ -1,0 +1,86 @@
+"""HAW-NN's formulas by hand, and the constant-curvature arc in closed form."""
+
+import math
+
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.constant_curvature import ConstantCurvature, arc_point, arc_rotation
+from surgisoft.surrogate.network import HawNN, parse_widths, range_weights, weighted_mse
+
+LOW, HIGH = torch.tensor([-15.0, -15.0, -15.0]), torch.tensor([54.0, 54.0, 54.0])
+
+
+def test_the_papers_layout():
+    network = HawNN(LOW, HIGH, key_points=5)
+    linear = [layer for layer in network.layers if isinstance(layer, torch.nn.Linear)]
+    widths = [(layer.in_features, layer.out_features) for layer in linear]
+    assert widths == [(6, 128), (128, 128), (128, 128), (128, 128), (128, 15)]
+    assert HawNN(LOW, HIGH, 5, directions=False).layers[0].in_features == 3
+
+
+def test_range_weights_by_hand():
+    """Ranges 0, 1 | 3, 0 | 0, 4 over 6 coordinates: w = 1 + 6 r / 8."""
+    points = torch.tensor([[[0.0, 1.0, 0.0], [5.0, 0.0, 2.0]], [[0.0, 2.0, 3.0], [5.0, 0.0, 6.0]]])
+    expected = 1 + 6 * torch.tensor([[0.0, 1.0, 3.0], [0.0, 0.0, 4.0]]) / 8
+    assert torch.allclose(range_weights(points), expected)
+    points = torch.cat([points, torch.full((1, 2, 3), torch.nan)])
+    assert torch.allclose(range_weights(points), expected)
+
+
+def test_weighted_mse_by_hand_without_missing_values():
+    predicted = torch.zeros(2, 1, 3)
+    measured = torch.tensor([[[1.0, 2.0, torch.nan]], [[0.0, 1.0, 3.0]]])
+    weights = torch.tensor([[1.0, 2.0, 3.0]])
+    # (1*1 + 2*4 + 1*0 + 2*1 + 3*9) / 5 measured values
+    assert float(weighted_mse(predicted, measured, weights)) == pytest.approx(38 / 5)
+
+
+def test_added_directions_change_nothing_at_first():
+    torch.manual_seed(0)
+    plain = HawNN(LOW, HIGH, 5, directions=False)
+    plain.mean.normal_()
+    grown = plain.with_directions(torch.tensor([1.0, 0.0, 1.0]))
+    pressure, direction = torch.rand(20, 3) * 60 - 10, torch.randn(20, 3).sign()
+    assert torch.allclose(grown(pressure, direction), plain(pressure, direction), atol=1e-6)
+    with torch.no_grad():
+        grown.layers[0].weight[:, 3:] = 0.3
+    moved = grown(pressure, direction)
+    flipped = grown(pressure, direction * torch.tensor([1.0, -1.0, 1.0]))
+    assert torch.equal(moved, flipped), "chamber 2 has no direction input"
+    assert not torch.allclose(moved, plain(pressure, direction))
+
+
+def test_widths_are_read_or_refused():
+    assert parse_widths("64x32") == (64, 32)
+    with pytest.raises(InputError, match="whole numbers"):
+        parse_widths("64,many")
+
+
+def test_arc_point_in_closed_form():
+    quarter = arc_point(torch.tensor([math.pi / 2, 0.0]), torch.tensor(70.0))
+    radius = 70 / (math.pi / 2)
+    assert torch.allclose(quarter, torch.tensor([radius, 0.0, radius]), atol=1e-4)
+    straight = arc_point(torch.zeros(2), torch.tensor(70.0))
+    assert torch.allclose(straight, torch.tensor([0.0, 0.0, 70.0]), atol=1e-4)
+
+
+def test_arc_rotation_turns_the_tangent():
+    bend = torch.tensor([0.6, -0.8]) * 1.1
+    tangent = arc_rotation(bend) @ torch.tensor([0.0, 0.0, 1.0])
+    expected = torch.tensor([0.6 * math.sin(1.1), -0.8 * math.sin(1.1), math.cos(1.1)])
+    assert torch.allclose(tangent, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("sections", [1, 2, 4])
+def test_equal_sections_make_one_arc(sections):
+    """A chain of equal arcs is one longer arc, whatever the number of pieces."""
+    model = ConstantCurvature(LOW, HIGH, 5, sections)
+    model.set_rest(torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)]))
+    with torch.no_grad():
+        model.table[:, 0, -1] = 1.2 / sections
+    points = model(torch.zeros(1, 3), torch.zeros(1, 3))[0]
+    share = torch.linspace(0, 1, 5)[:, None]
+    expected = arc_point(torch.tensor([1.2, 0.0]) * share, 70 * share[:, 0])
+    assert torch.allclose(points, expected, atol=1e-3)

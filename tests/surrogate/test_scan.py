@@ -1,0 +1,46 @@
+"""Prefix scans against the plain loop that they replace."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.surrogate.direction import advance, trace
+from surgisoft.surrogate.scan import clamp_scan, last_nonzero
+
+
+def walk(steps: int, seed: int, chambers: int = 2, runs: int = 2) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(runs, steps, chambers, generator=generator).cumsum(1)
+
+
+@given(st.integers(1, 70), st.integers(0, 10_000), st.floats(0.0, 3.0))
+def test_clamp_scan_is_the_loop_to_the_bit(steps, seed, radius):
+    x = walk(steps, seed)
+    y, expected = x[:, 0], []
+    for t in range(steps):
+        y = torch.minimum(torch.maximum(y, x[:, t] - radius), x[:, t] + radius)
+        expected.append(y)
+    assert torch.equal(clamp_scan(x - radius, x + radius, x[:, 0]), torch.stack(expected, 1))
+
+
+def test_last_nonzero_by_hand():
+    values = torch.tensor([0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 1.0]).view(1, -1, 1)
+    expected = torch.tensor([0.0, 0.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0]).view(1, -1, 1)
+    assert torch.equal(last_nonzero(values), expected)
+
+
+def test_direction_keeps_its_value_while_the_pressure_rests():
+    pressure = torch.tensor([0.0, 0.0, 3.0, 3.0, 3.05, 2.95, 3.0, 1.0, 1.0]).view(1, -1, 1)
+    _, direction = trace(pressure, torch.tensor([0.2]))
+    assert direction.flatten().tolist() == [0, 0, 1, 1, 1, 1, 1, -1, -1]
+
+
+@given(st.integers(1, 60), st.integers(0, 10_000))
+def test_direction_steps_as_it_traces(steps, seed):
+    pressure, band = walk(steps, seed), torch.tensor([0.3, 0.6])
+    anchors, directions = trace(pressure, band)
+    anchor, direction = pressure[:, 0], torch.zeros_like(pressure[:, 0])
+    for t in range(steps):
+        anchor, direction = advance(anchor, direction, pressure[:, t], band)
+        assert torch.equal(anchor, anchors[:, t])
+        assert torch.equal(direction, directions[:, t])

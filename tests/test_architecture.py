@@ -1,0 +1,82 @@
+"""Imports run one way, and each outside library is spoken to in one place."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "surgisoft"
+
+MAY_IMPORT = {
+    "scene": set(),
+    "surrogate": set(),
+    "measurement": {"surrogate"},
+    "measurement/rig": {"measurement"},
+    "diagnosis": {"surrogate", "measurement"},
+    "replay": {"scene"},
+    "cli": {"scene", "surrogate", "measurement", "diagnosis", "replay"},
+}
+"""What each part may import beside itself and the ground; the nearest folder's row counts."""
+
+GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
+"""Modules that every part may use; they import no part."""
+
+ONLY_IN = {
+    "rerun": "replay",
+    "pettingzoo": "tasks/parallel",
+    "rsl_rl": "agents",
+    "fcl": "scene/collision",
+}
+
+
+def _imports(path: Path) -> set[str]:
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.add(node.module)
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def _part(relative: str) -> str:
+    known = [part for part in MAY_IMPORT if relative.removesuffix(".py").startswith(part)]
+    return max(known, key=len) if known else ""
+
+
+FILES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_run_one_way(path):
+    relative = str(path.relative_to(PACKAGE))
+    part = _part(relative)
+    assert part, f"{relative} belongs to no known part"
+    top = part.split("/")[0]
+    for name in _imports(path):
+        if name.startswith("surgisoft."):
+            other = name.split(".")[1]
+            if other in ("__version__", top):
+                continue
+            assert other in MAY_IMPORT[part], f"{relative} imports {name}"
+        library = name.split(".")[0]
+        if library in ONLY_IN:
+            assert relative.startswith(ONLY_IN[library]), f"{relative} imports {library}"
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.name)
+def test_the_ground_stands_on_nothing(path):
+    if path.name != "__init__.py":
+        parts = {name.split(".")[1] for name in _imports(path) if name.startswith("surgisoft.")}
+        assert parts <= GROUND
+
+
+def test_rig_shares_nothing_with_the_models():
+    """The virtual rig is the independent truth: no model code, not even torch, reaches it."""
+    for path in (PACKAGE / "measurement" / "rig").glob("*.py"):
+        for name in _imports(path):
+            assert not name.startswith(("surgisoft.surrogate", "surgisoft.diagnosis", "torch"))
+            assert name != "surgisoft.measurement.histories"

@@ -1,0 +1,105 @@
+"""The known protocols by name."""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.protocols import continuous, settled
+from surgisoft.measurement.protocols.protocol import Protocol
+from surgisoft.measurement.protocols.schedule_file import load_schedule
+
+PERIOD_S = 0.05
+"""Samples of a continuous protocol are counted at 20 Hz."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One protocol of the catalogue."""
+
+    about: str
+    """One line."""
+    points: int
+    """Samples where none are asked for: settled points, or frames at 20 Hz."""
+    settled: Callable | None = None
+    """Builder of settled points."""
+    figures: tuple[Callable, ...] = ()
+    """Figures of a continuous schedule, one run each."""
+
+
+FIGURES = (
+    continuous.ramps,
+    continuous.holds,
+    continuous.reversals,
+    continuous.ladder,
+    continuous.wander,
+)
+
+PROTOCOLS: dict[str, Entry] = {
+    "grid": Entry(
+        "every point of the 24-level lattice once, direction and memory excited everywhere",
+        13824,
+        settled=settled.grid,
+    ),
+    "traverse": Entry(
+        "plain back-and-forth traverse of the lattice; the slow chamber only ever rises",
+        13824,
+        settled=settled.traverse,
+    ),
+    "walk": Entry(
+        "random walk over 24 levels, all chambers, minor loops", 13824, settled=settled.walk
+    ),
+    "validation": Entry(
+        "straight legs between random pressures, off the lattice", 1000, settled=settled.validation
+    ),
+    "test": Entry(
+        "smooth oscillations of all chambers, off the lattice", 1000, settled=settled.test
+    ),
+    "ramps": Entry("ramps at 2, 4, 8 and 16 kPa/s, 5 minutes", 6000, figures=(continuous.ramps,)),
+    "holds": Entry("quick steps held for 5 to 40 s, 5 minutes", 6000, figures=(continuous.holds,)),
+    "reversals": Entry(
+        "small reversals about many mean pressures, 5 minutes",
+        6000,
+        figures=(continuous.reversals,),
+    ),
+    "ladder": Entry(
+        "triangles of growing and shrinking amplitude, 5 minutes",
+        6000,
+        figures=(continuous.ladder,),
+    ),
+    "mixed": Entry(
+        "ramps, holds, reversals, ladder and a random walk, one run each, 10 minutes",
+        12000,
+        figures=FIGURES,
+    ),
+}
+
+
+def make_protocol(
+    name: str | Path, limits: np.ndarray, points: int | None = None, seed: int = 0
+) -> Protocol:
+    """A protocol of the catalogue, or a schedule file by its path.
+
+    limits: (m, 2) lowest and highest actuation [kPa]; points: samples (default: the catalogue's);
+    seed: draws the random parts; each protocol draws its own numbers.
+    """
+    if str(name).endswith(".csv"):
+        if points is not None:
+            raise InputError(f"--points {points} does not apply to the schedule file {name}")
+        return load_schedule(name)
+    if name not in PROTOCOLS:
+        raise unknown_name("protocol", str(name), [*PROTOCOLS, "SCHEDULE.csv"])
+    entry = PROTOCOLS[str(name)]
+    points = entry.points if points is None else points
+    if points < 10:
+        raise InputError(f"--points is {points}, expected at least 10")
+    rng = np.random.default_rng([seed, zlib.crc32(str(name).encode())])
+    limits = np.asarray(limits, np.float64)
+    if entry.settled:
+        commands, run = entry.settled(points, limits, rng)
+        return Protocol(str(name), "settled", commands, run)
+    t_s, commands, run = continuous.schedule(entry.figures, points, PERIOD_S, limits, rng)
+    return Protocol(str(name), "continuous", commands, run, t_s)

@@ -1,0 +1,249 @@
+"""The bench's clockwork: pumps, arm and cameras step by step, in compiled code.
+
+Randomness comes from outside as a tape of standard normal numbers, so that one sample after the
+other and a whole schedule at once read the same numbers in the same order.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from surgisoft.measurement.rig.arm import (
+    Memory,
+    Specimen,
+    add_line_forces,
+    chamber_thrusts,
+    friction_forces,
+    new_memory,
+    remember,
+)
+from surgisoft.measurement.rig.motion_capture import (
+    Cameras,
+    Tracking,
+    circle_centre,
+    look,
+    new_tracking,
+    normals_per_frame,
+    normals_per_pause,
+    wander,
+)
+from surgisoft.measurement.rig.pneumatics import (
+    CHAMBER,
+    PRESSURE,
+    Pumps,
+    drive_piston,
+    fill,
+    read_sensor,
+    vent,
+    vented,
+)
+from surgisoft.measurement.rig.rod import Loads, Shape, balance, new_shape
+from surgisoft.measurement.rig.wall import line_strain
+
+
+class Plant(NamedTuple):
+    """Everything about the bench that does not change."""
+
+    specimen: Specimen
+    """The arm."""
+    loads: Loads
+    """What acts on it."""
+    pumps: Pumps
+    """Its pneumatics."""
+    cameras: Cameras
+    """Its motion capture."""
+
+
+class State(NamedTuple):
+    """Everything that does change, in place."""
+
+    steps: np.ndarray
+    """(1,) int64 controller periods since the bench was switched on."""
+    gas: np.ndarray
+    """(m, COLUMNS) pumps."""
+    target: np.ndarray
+    """(m,) commanded pressures [kPa]."""
+    chamber: np.ndarray
+    """(m,) pressures in the chambers [kPa gauge]."""
+    memory: Memory
+    """The wall's history."""
+    shape: Shape
+    """The rod's last equilibrium."""
+    tracking: Tracking
+    """The cameras."""
+    forces: np.ndarray
+    """(J,) friction of the wall's lines [N]."""
+    thrusts: np.ndarray
+    """(K, m) chamber thrusts along the arm [N]."""
+    scratch: np.ndarray
+    """(m,) work space."""
+
+
+class Frames(NamedTuple):
+    """Room for F frames."""
+
+    measured: np.ndarray
+    """(F, m) sensor readings [kPa]."""
+    points: np.ndarray
+    """(F, n, 3) circle fits of the seen markers [mm]."""
+    clean: np.ndarray
+    """(F, n, 3) circle fits without noise and losses [mm]."""
+    centres: np.ndarray
+    """(F, n, 3) the body's true centres [mm]."""
+    chamber: np.ndarray
+    """(F, m) true chamber pressures [kPa]."""
+
+
+def new_state(plant: Plant) -> State:
+    """A rested, vented arm on a bench just switched on."""
+    rod = plant.specimen.rod
+    m, lines = len(rod.wall.areas), len(plant.specimen.friction.force)
+    return State(
+        steps=np.zeros(1, np.int64),
+        gas=vented(plant.pumps),
+        target=np.zeros(m),
+        chamber=np.zeros(m),
+        memory=new_memory(lines),
+        shape=new_shape(rod),
+        tracking=new_tracking(plant.cameras),
+        forces=np.zeros(lines),
+        thrusts=np.zeros((len(rod.stiffness), m)),
+        scratch=np.zeros(m),
+    )
+
+
+def new_frames(plant: Plant, count: int) -> Frames:
+    """Room for `count` frames."""
+    m, n = len(plant.pumps.tube), len(plant.cameras.at)
+    return Frames(
+        measured=np.empty((count, m)),
+        points=np.empty((count, n, 3)),
+        clean=np.empty((count, n, 3)),
+        centres=np.empty((count, n, 3)),
+        chamber=np.empty((count, m)),
+    )
+
+
+def steps_in(plant: Plant, seconds: float) -> int:
+    """Controller periods in a time [s]."""
+    return round(seconds / plant.pumps.step)
+
+
+def tape_of_pause(plant: Plant, steps: int) -> int:
+    """Normal numbers that a pause of so many controller periods takes."""
+    return steps * len(plant.pumps.tube) + normals_per_pause(plant.cameras)
+
+
+def tape_of_sample(plant: Plant) -> int:
+    """Normal numbers that one sample takes."""
+    m = len(plant.pumps.tube)
+    return (steps_in(plant, plant.cameras.period) + 1) * m + normals_per_frame(plant.cameras)
+
+
+@njit(cache=True)
+def rest(plant, state):
+    """Vent the arm and let it forget."""
+    vent(plant.pumps, state.gas)
+    state.target[:] = 0.0
+    state.chamber[:] = 0.0
+    state.memory.free[:] = 0.0
+    state.memory.last[:] = 0.0
+    state.memory.depth[:] = 0
+    state.shape.unknown[:] = 0.0
+    state.shape.status[:] = 0.0
+
+
+@njit(cache=True)
+def advance(plant, state, steps, tape, at):
+    """Pumps and wall over `steps` controller periods; the tape's next index, -1 on failure."""
+    pumps = plant.pumps
+    wall = plant.specimen.rod.wall
+    for _ in range(steps):
+        for i in range(state.gas.shape[0]):
+            row = state.gas[i]
+            reading = read_sensor(pumps, row[PRESSURE], tape[at])
+            at += 1
+            drive_piston(pumps, row, state.target[i], reading)
+            stretch = line_strain(state.memory.free, wall.chambers[i, 0], wall.chambers[i, 1])
+            fill(pumps, row, i, stretch)
+            state.chamber[i] = row[CHAMBER]
+        if not remember(plant.specimen, state.chamber, state.scratch, state.memory):
+            return -1
+        state.steps[0] += 1
+    return at
+
+
+@njit(cache=True)
+def pause(plant, state, steps, tape, at):
+    """Let controller periods pass unseen; the tape's next index, -1 on failure."""
+    at = advance(plant, state, steps, tape, at)
+    if at < 0:
+        return at
+    return wander(plant.cameras, state.tracking, steps * plant.pumps.step, tape, at)
+
+
+@njit(cache=True)
+def take_shape(plant, state):
+    """The arm's equilibrium under the present pressures and memory; False where none was found."""
+    specimen = plant.specimen
+    friction_forces(specimen.friction, state.memory, state.forces)
+    state.shape.active[:] = 0.0
+    add_line_forces(specimen.friction, state.forces, state.shape.active)
+    chamber_thrusts(specimen.rod, state.chamber, state.thrusts)
+    return balance(
+        specimen.rod, plant.loads, 1.0, state.thrusts, specimen.rod.base, state.shape
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def sample(plant, state, steps, tape, at, frames, index):
+    """One period of `steps` controller periods and the frame at its end, into frames[index].
+
+    Returns the tape's next index, -1 on failure.
+    """
+    at = advance(plant, state, steps, tape, at)
+    if at < 0 or not take_shape(plant, state):
+        return -1
+    for i in range(state.gas.shape[0]):
+        frames.measured[index, i] = read_sensor(plant.pumps, state.gas[i, PRESSURE], tape[at])
+        at += 1
+    shape, tracking = state.shape, state.tracking
+    at = look(plant.cameras, tracking, shape.centres, shape.frames, state.chamber, tape, at)
+    for p in range(shape.centres.shape[0]):
+        circle_centre(tracking.seen[p], frames.points[index, p])
+        circle_centre(tracking.clean[p], frames.clean[index, p])
+    frames.centres[index] = shape.centres
+    frames.chamber[index] = state.chamber
+    return at
+
+
+@njit(cache=True)
+def follow(plant, state, commands, steps, tape, frames):
+    """One sample after each row of commands (F, m) [kPa]; False on failure."""
+    at = 0
+    for t in range(commands.shape[0]):
+        state.target[:] = commands[t]
+        at = sample(plant, state, steps, tape, at, frames, t)
+        if at < 0:
+            return False
+    return True
+
+
+@njit(cache=True)
+def settle_and_average(plant, state, commands, settle, steps, count, tape, frames):
+    """For each row of commands (P, m) [kPa]: a pause of `settle` periods, then `count` samples.
+
+    frames: room for P * count frames. False on failure.
+    """
+    at = 0
+    for point in range(commands.shape[0]):
+        state.target[:] = commands[point]
+        at = pause(plant, state, settle, tape, at)
+        for k in range(count):
+            if at < 0:
+                return False
+            at = sample(plant, state, steps, tape, at, frames, point * count + k)
+        if at < 0:
+            return False
+    return True

@@ -6,7 +6,6 @@ key points, nor the actuation explain; settled rows stand for themselves, so the
 compared with a smooth function of the actuation instead of with the row before.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,7 +102,8 @@ def _channel_froze(recording: Recording, i: int, changed: np.ndarray, stretch: s
     return int(moves.sum()) >= LEAST_FROZEN_ROWS
 
 
-def _frozen_channels(recording: Recording) -> list[Oddity]:
+def frozen_channels(recording: Recording) -> list[tuple[list[int], slice]]:
+    """Channels (counted from 0) that froze together, and the samples that repeat one reading."""
     channels = [
         _changes(recording.measured[:, i : i + 1], recording.run) for i in range(recording.chambers)
     ]
@@ -115,13 +115,17 @@ def _frozen_channels(recording: Recording) -> list[Oddity]:
             alive = any(_lives(other, stretch) for other in others)
             if alive and _channel_froze(recording, i, changed, stretch):
                 frozen.append((i, stretch))
+    return _merged(frozen)
+
+
+def _frozen_channels(recording: Recording) -> list[Oddity]:
     return [
         Oddity(
             stretch.start,
-            f"{_names(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
+            f"{', '.join(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
             f"{_duration(recording, stretch)} while other signals move; frozen?",
         )
-        for members, stretch in _merged(frozen)
+        for members, stretch in frozen_channels(recording)
     ]
 
 
@@ -137,10 +141,6 @@ def _merged(frozen: list[tuple[int, slice]]) -> list[tuple[list[int], slice]]:
         else:
             groups.append(([i], stretch))
     return [(sorted(members), stretch) for members, stretch in groups]
-
-
-def _names(names: Iterable[str]) -> str:
-    return ", ".join(names)
 
 
 def _duration(recording: Recording, stretch: slice) -> str:
@@ -178,7 +178,7 @@ def _frozen_key_points(recording: Recording) -> list[Oddity]:
     return [
         Oddity(
             stretch.start,
-            f"key point {_names(f'k{j}' for j in members)} repeats bit-equal for "
+            f"key point {', '.join(f'k{j}' for j in members)} repeats bit-equal for "
             f"{_duration(recording, stretch)} while other signals move; frozen?",
         )
         for members, stretch in _merged(frozen)

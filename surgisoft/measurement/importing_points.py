@@ -1,0 +1,227 @@
+"""Key points in the arm's base frame out of raw positions, markers and poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing_circle import circle_centres
+from surgisoft.measurement.importing_join import Joined
+from surgisoft.measurement.importing_motive import bodies, planes
+from surgisoft.measurement.importing_rotation import (
+    check_pose,
+    matrices,
+    mean_rotation,
+    turn_to_z,
+)
+from surgisoft.measurement.importing_spec import (
+    BaseMap,
+    Column,
+    FrameMap,
+    KeyPointsMap,
+    PointMap,
+)
+from surgisoft.measurement.importing_table import RawTable
+from surgisoft.measurement.recording_columns import MM_PER
+
+TILT_NOTE_DEG = 30.0
+"""Angle between z and the arm at rest from which the report asks to check the frame [deg]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Key points of one set of files."""
+
+    key_points_mm: np.ndarray
+    """(T, n, 3) arm base frame [mm], NaN where missing."""
+    gravity: np.ndarray | None
+    """(3,) unit vector along the weight, arm base frame, where the map states it."""
+    notes: list[str]
+    """What was done, in words."""
+
+
+def key_point_maps(spec: KeyPointsMap, table: RawTable) -> tuple[PointMap, ...]:
+    """The key points of the map, or all that the motion capture file has."""
+    if spec.auto == "bodies":
+        found = tuple(PointMap((name,)) for name in bodies(table))
+        expected = "rigid bodies in the file's header"
+    elif spec.auto == "planes":
+        groups = planes(table, spec.pattern)
+        found = tuple(PointMap(tuple(names)) for names in groups)
+        expected = f"markers whose names fit the pattern {spec.pattern!r}"
+        for names in groups:
+            if len(names) < 3:
+                raise InputError(
+                    f"{table.path}: plane of {', '.join(names)} has {len(names)} markers, expected "
+                    'at least 3 for a circle fit; use auto = "bodies" or another pattern'
+                )
+    else:
+        return spec.points
+    if not found:
+        raise InputError(f"{table.path}: no key point found, expected {expected}")
+    return found
+
+
+def columns_of(entry: tuple[Column, ...] | str, axes: str) -> tuple[Column, ...]:
+    """The columns of a position ("xyz") or orientation ("xyzw") given by columns or by a name."""
+    if isinstance(entry, str):
+        return tuple(f"{entry}.{'q' * (len(axes) == 4)}{axis}" for axis in axes)
+    return tuple(entry)
+
+
+def needed_columns(points: tuple[PointMap, ...], frame: FrameMap) -> list[Column]:
+    """All columns of positions and orientations."""
+    found: list[Column] = []
+    for point in points:
+        for position in point.positions:
+            found += columns_of(position, "xyz")
+        if point.quaternion:
+            found += columns_of(point.quaternion, "xyzw")
+    if frame.base:
+        found += columns_of(frame.base.position, "xyz") + columns_of(frame.base.quaternion, "xyzw")
+    return found
+
+
+def read_points(
+    joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...], frame: FrameMap, unit: str
+) -> Points:
+    """Key points in the arm's base frame; `unit` is the unit of the raw positions."""
+    scale = MM_PER[unit]
+    notes: list[str] = []
+    raw = np.stack(
+        [_raw_point(joined, spec, point, j, scale, notes) for j, point in enumerate(maps)], axis=1
+    )
+    turned, to_base = _relative_to_base(joined, spec, frame.base, raw, scale, frame.rest_rows)
+    rest = _rest(turned, frame.rest_rows)
+    origin = rest[0] if isinstance(frame.origin, str) else np.array(frame.origin) * scale
+    if np.isnan(origin).any():
+        raise InputError(f"{joined.main.path}: key point k0 is missing in every row at rest")
+    rotation = frame.rotation
+    if frame.align_z == "rest":
+        rotation = turn_to_z(_chord(joined, rotation @ (rest - origin).T, frame)) @ rotation
+    key_points = (turned - origin) @ rotation.T
+    gravity = None
+    if frame.gravity is not None:
+        gravity = rotation @ to_base @ np.array(frame.gravity)
+        gravity /= np.linalg.norm(gravity)
+    _note_tilt(key_points, frame, notes)
+    return Points(key_points, gravity, notes)
+
+
+def _raw_point(
+    joined: Joined, spec: KeyPointsMap, point: PointMap, j: int, scale: float, notes: list[str]
+) -> np.ndarray:
+    """One key point (T, 3) in the raw frame [mm]."""
+    role = spec.file
+    cells = [joined.take(role, columns_of(p, "xyz")) for p in point.positions]
+    if len(cells) == 1:
+        position = cells[0] * scale
+    else:
+        position = _circle(joined, np.stack(cells, axis=1) * scale, spec, j, notes)
+    if any(point.offset):
+        q = joined.take(role, columns_of(point.quaternion, "xyzw"))
+        arm = np.array(point.offset) * scale
+        position = position + matrices(q, spec.quaternion_order) @ arm
+    if spec.repeated == "missing":
+        stale = _stale(joined, np.concatenate(cells, axis=1))
+        if stale.any():
+            notes.append(
+                f"key point k{j}: {int(stale.sum())} of {len(stale)} rows repeat the row before "
+                "bit-equal and count as missing"
+            )
+        position = np.where(stale[:, None], np.nan, position)
+    return np.where(np.isnan(position).any(axis=1, keepdims=True), np.nan, position)
+
+
+def _circle(
+    joined: Joined, markers: np.ndarray, spec: KeyPointsMap, j: int, notes: list[str]
+) -> np.ndarray:
+    """Centre (T, 3) of the markers (T, k, 3), missing where the circle does not fit."""
+    centres, radii, residuals = circle_centres(markers)
+    if np.isnan(centres).all():
+        enough = ((~np.isnan(markers).any(axis=2)).sum(axis=1) >= 3).any()
+        came = "stand on one line" if enough else "are never seen three at a time"
+        raise InputError(
+            f"{joined.main.path}: the markers of key point k{j} {came}, "
+            "expected three that define a circle"
+        )
+    poor = residuals > spec.max_residual_mm
+    lost = int(np.isnan(centres).any(axis=1).sum())
+    text = (
+        f"key point k{j}: circle through {markers.shape[1]} markers, radius "
+        f"{np.nanmedian(radii):.3f} mm, residual {np.nanmedian(residuals):.3f} mm (medians)"
+    )
+    text += f", {lost} rows with fewer than three markers or on a line" if lost else ""
+    text += f", {int(poor.sum())} rows beyond max_residual_mm" if poor.any() else ""
+    notes.append(text)
+    return np.where(poor[:, None], np.nan, centres)
+
+
+def _stale(joined: Joined, cells: np.ndarray) -> np.ndarray:
+    """(T,) bool: cells (T, c) that equal those of the row before in the main file bit for bit."""
+    same = (cells[1:] == cells[:-1]).all(axis=1) & (np.diff(joined.rows) == 1)
+    return np.concatenate([[False], same])
+
+
+def _relative_to_base(
+    joined: Joined,
+    spec: KeyPointsMap,
+    base: BaseMap | None,
+    raw: np.ndarray,
+    scale: float,
+    rest_rows: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The positions (T, n, 3) in the base body's frame, and the (mean) rotation into it (3, 3)."""
+    if base is None:
+        return raw, np.eye(3)
+    position = joined.take(spec.file, columns_of(base.position, "xyz")) * scale
+    q = joined.take(spec.file, columns_of(base.quaternion, "xyzw"))
+    order = spec.quaternion_order
+    some = slice(0, rest_rows) if base.mode == "rest" else slice(None)
+    mean = mean_rotation(q[some], order)
+    check_pose(mean, joined.main.path)
+    if base.mode == "moving":
+        turned = np.einsum("tba,tnb->tna", matrices(q, order), raw - position[:, None])
+        return turned, mean.T
+    known = position[some][~np.isnan(position[some]).any(axis=1)]
+    if not len(known):
+        raise InputError(f"{joined.main.path}: the base body has no position in any row")
+    return (raw - known.mean(axis=0)) @ mean, mean.T
+
+
+def _rest(points: np.ndarray, rows: int) -> np.ndarray:
+    """Mean (n, 3) of each key point over the first rows (T, n, 3); NaN where it is missing."""
+    first = points[:rows]
+    known = ~np.isnan(first)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(known, first, 0).sum(axis=0) / known.sum(axis=0)
+
+
+def _chord(joined: Joined, rest: np.ndarray, frame: FrameMap) -> np.ndarray:
+    """The line (3,) from key point 0 (or the origin, for one key point) to the tip at rest."""
+    tip = rest[:, -1]
+    start = rest[:, 0] if rest.shape[1] > 1 else np.zeros(3)
+    chord = tip - start
+    if np.isnan(chord).any() or np.linalg.norm(chord) < 1e-9:
+        raise InputError(
+            f"{joined.main.path}: align_z needs the first and last key point in the first "
+            f"{frame.rest_rows} rows, but they are missing or in one place; set rest_rows or "
+            "rotation in the map"
+        )
+    return chord
+
+
+def _note_tilt(key_points: np.ndarray, frame: FrameMap, notes: list[str]) -> None:
+    """Say so where the arm at rest does not point along z."""
+    rest = _rest(key_points, frame.rest_rows)
+    start = rest[0] if len(rest) > 1 else np.zeros(3)
+    chord = rest[-1] - start
+    length = np.linalg.norm(chord)
+    if np.isnan(length) or length < 1e-9:
+        return
+    angle = np.degrees(np.arccos(np.clip(chord[2] / length, -1, 1)))
+    if angle > TILT_NOTE_DEG:
+        notes.append(
+            f"in the first {frame.rest_rows} rows the arm points {angle:.0f} degrees away from z; "
+            "expected z along the arm at rest: check [frame] in the map"
+        )

@@ -23,6 +23,7 @@ from surgisoft.measurement.importing_rows import (
     run_numbers,
     tidy,
     without_frozen,
+    without_spikes,
 )
 from surgisoft.measurement.importing_spec import (
     ActuationMap,
@@ -349,7 +350,11 @@ def _check_names(parts: list[Imported]) -> None:
 
 
 def _finished(part: Imported, spec: ImportMap) -> Imported:
-    if spec.rows.frozen == "keep":
-        return part
-    recording, notes = without_frozen(part.recording)
-    return Imported(recording, [*part.notes, *notes])
+    recording, notes = part.recording, part.notes
+    if spec.rows.frozen == "drop":
+        recording, left_out = without_frozen(recording)
+        notes = [*notes, *left_out]
+    if spec.key_points.spikes == "missing":
+        recording, marked = without_spikes(recording)
+        notes = [*notes, *marked]
+    return Imported(recording, notes)

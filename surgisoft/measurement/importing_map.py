@@ -189,6 +189,7 @@ def _key_points(top: Section, files: tuple[FileRole, ...]) -> KeyPointsMap:
         unit=section.choice("unit", "", tuple(MM_PER)),
         quaternion_order=order,
         repeated=section.choice("repeated", "keep", ("keep", "missing")),
+        spikes=section.choice("spikes", "keep", ("keep", "missing")),
         max_residual_mm=section.number("max_residual_mm", np.inf, least=0.0),
     )
     section.close()

@@ -91,6 +91,8 @@ def read_points(
     raw = np.stack(
         [_raw_point(joined, spec, point, j, scale, notes) for j, point in enumerate(maps)], axis=1
     )
+    if spec.repeated == "missing":
+        notes.append(_stale_text(joined, spec, maps))
     turned, to_base = _relative_to_base(joined, spec, frame.base, raw, scale, frame.rest_rows)
     rest = _rest(turned, frame.rest_rows)
     origin = rest[0] if isinstance(frame.origin, str) else np.array(frame.origin) * scale
@@ -124,11 +126,6 @@ def _raw_point(
         position = position + matrices(q, spec.quaternion_order) @ arm
     if spec.repeated == "missing":
         stale = _stale(joined, np.concatenate(cells, axis=1))
-        if stale.any():
-            notes.append(
-                f"key point k{j}: {int(stale.sum())} of {len(stale)} rows repeat the row before "
-                "bit-equal and count as missing"
-            )
         position = np.where(stale[:, None], np.nan, position)
     return np.where(np.isnan(position).any(axis=1, keepdims=True), np.nan, position)
 
@@ -161,6 +158,17 @@ def _stale(joined: Joined, cells: np.ndarray) -> np.ndarray:
     """(T,) bool: cells (T, c) that equal those of the row before in the main file bit for bit."""
     same = (cells[1:] == cells[:-1]).all(axis=1) & (np.diff(joined.rows) == 1)
     return np.concatenate([[False], same])
+
+
+def _stale_text(joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...]) -> str:
+    counts = []
+    for point in maps:
+        cells = [joined.take(spec.file, columns_of(p, "xyz")) for p in point.positions]
+        counts.append(int(_stale(joined, np.concatenate(cells, axis=1)).sum()))
+    each = ", ".join(f"k{j} {count}" for j, count in enumerate(counts))
+    return (
+        f"positions that repeat the row before count as missing: {each} of {len(joined.rows)} rows"
+    )
 
 
 def _relative_to_base(

@@ -9,7 +9,7 @@ import numpy as np
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing_spec import ImportMap
 from surgisoft.measurement.recording import Recording
-from surgisoft.measurement.recording_warnings import frozen_channels
+from surgisoft.measurement.recording_warnings import frozen_channels, spikes
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,3 +157,14 @@ def without_frozen(recording: Recording) -> tuple[Recording, list[str]]:
     names = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
     values = {name: getattr(recording, name) for name in names}
     return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None}), notes
+
+
+def without_spikes(recording: Recording) -> tuple[Recording, list[str]]:
+    """The recording with a key point missing where it jumps away and back within a few rows."""
+    away = spikes(recording)
+    if not away.any():
+        return recording, []
+    points = np.where(away[..., None], np.nan, recording.key_points_mm)
+    counts = ", ".join(f"k{j} {n}" for j, n in enumerate(away.sum(axis=0).tolist()) if n)
+    notes = [f"spikes of key points count as missing: {counts} of {len(away)} rows"]
+    return replace(recording, key_points_mm=points), notes

@@ -110,6 +110,8 @@ class KeyPointsMap:
     """Order of quaternions' columns: "xyzw" or "wxyz"."""
     repeated: str = "keep"
     """Positions that repeat bit-equal: "keep" them, or "missing" where mocap is slower."""
+    spikes: str = "keep"
+    """Key points that jump away and back within a few rows: "keep" or "missing"."""
     max_residual_mm: float = np.inf
     """A circle that misses its markers by more (rms) is a missing key point [mm]."""
 

@@ -218,6 +218,13 @@ def save_recording(recording: Recording, path: str | Path, force: bool = False) 
     recording_file.write(recording, Path(path), force)
 
 
+def check_writable(path: str | Path, force: bool = False) -> None:
+    """Raise where `save_recording` would refuse this path."""
+    from surgisoft.measurement import recording_file
+
+    recording_file.check_writable(Path(path), force)
+
+
 def load_recording(path: str | Path, on_warning: Callable[[str], None] | None = None) -> Recording:
     """Read one recording; what is odd but usable goes to `on_warning` (default: warnings.warn)."""
     from surgisoft.measurement import recording_file

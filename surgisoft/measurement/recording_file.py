@@ -167,16 +167,21 @@ def _check_order(path: Path, t_s: np.ndarray, run: np.ndarray, rows: np.ndarray)
         )
 
 
-def write(recording: Recording, path: Path, force: bool) -> None:
-    """Table and sidecar: both complete under temporary names first, then both put in place."""
+def check_writable(path: Path, force: bool) -> None:
+    """Raise where a recording cannot go to this path."""
     if path.suffix not in table.SUFFIXES:
         raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")
-    sidecar = sidecar_of(path)
-    for target in (path, sidecar):
+    for target in (path, sidecar_of(path)):
         if target.is_dir():
             raise InputError(f"{target}: is a folder, expected the name of a file")
         if target.exists() and not force:
             raise InputError(f"{target}: exists already; choose another name or use --force")
+
+
+def write(recording: Recording, path: Path, force: bool) -> None:
+    """Table and sidecar: both complete under temporary names first, then both put in place."""
+    check_writable(path, force)
+    sidecar = sidecar_of(path)
     part, sidecar_part = (t.with_name(f".{t.name}.{os.getpid()}.part") for t in (path, sidecar))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ key points, nor the actuation explain; settled rows stand for themselves, so the
 compared with a smooth function of the actuation instead of with the row before.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,10 @@ JUMP_SHARE = 0.02
 """The least jump, as a share of the arm's largest motion."""
 STEP_WINDOW = 12
 """Steps before and steps after that say what is usual."""
+SPIKE_ROWS = 12
+"""A key point that comes back within so many rows has made a spike."""
+SPIKE_RETURN = 0.5
+"""How near a spike ends to where it began, as a share of its size."""
 SETTLED_RATIO = 15.0
 """How many robust standard deviations a settled key point lies off before it is called a jump."""
 SETTLED_SHARE = 0.1
@@ -236,7 +241,8 @@ def _motion_mm(points: np.ndarray) -> np.ndarray:
     return motion
 
 
-def _continuous_jumps(recording: Recording) -> list[Oddity]:
+def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
+    """By key point, the samples that it jumps to and how far [mm]; for continuous recordings."""
     points = recording.key_points_mm
     least = JUMP_SHARE * _motion_mm(points).max()
     hits: dict[int, list[tuple[int, float]]] = {}
@@ -250,7 +256,24 @@ def _continuous_jumps(recording: Recording) -> list[Oddity]:
                     before = int(track.rows[at])
                     size = float(np.linalg.norm(points[row, j] - points[before, j]))
                     hits.setdefault(j, []).append((row, size))
-    return [_jump(j, found) for j, found in hits.items()]
+    return hits
+
+
+def _continuous_jumps(recording: Recording) -> list[Oddity]:
+    return [_jump(j, found) for j, found in key_point_jumps(recording).items()]
+
+
+def spikes(recording: Recording) -> np.ndarray:
+    """(T, n) bool: where a key point has jumped away and jumps back within a few samples."""
+    away = np.zeros((recording.samples, recording.key_points), bool)
+    for j, hits in key_point_jumps(recording).items():
+        points = recording.key_points_mm[:, j]
+        for (start, size), (stop, _) in itertools.pairwise(hits):
+            before = start - 1 - int(np.isnan(points[:start, 0])[::-1].argmin())
+            returns = np.linalg.norm(points[stop] - points[before]) < SPIKE_RETURN * size
+            if stop - start <= SPIKE_ROWS and returns and not away[start, j]:
+                away[start:stop, j] = True
+    return away
 
 
 def _explained(recording: Recording, others: list[_Track], run: slice, row: int) -> bool:

@@ -1,0 +1,71 @@
+"""`surgisoft import`: other people's files; `surgisoft recording`: what a recording holds."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+
+
+def _warn(text: str) -> None:
+    typer.echo(f"surgisoft: warning: {text}", err=True)
+
+
+@app.command("import")
+def import_(
+    raw: Annotated[
+        list[Path], typer.Argument(metavar="RAW", help="Raw files, or folders of them.")
+    ],
+    map_name: Annotated[
+        str, typer.Option("--map", metavar="MAP", help="Map file, or a ready map: motive.")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="New recording (.csv or .parquet), or a folder: one recording a raw file.",
+        ),
+    ],
+    force: Annotated[bool, typer.Option("--force", help="Replace existing recordings.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be written, write nothing.")
+    ] = False,
+) -> None:
+    """Import somebody else's files: columns, units and frames as a map says."""
+    from surgisoft.measurement.importing import import_files
+    from surgisoft.measurement.importing_map import load_map
+    from surgisoft.measurement.recording import check_writable, save_recording
+    from surgisoft.measurement.recording_summary import summary
+    from surgisoft.measurement.recording_warnings import find_oddities
+
+    to_file = output.suffix in (".csv", ".parquet") and not output.is_dir()
+    parts = import_files(raw, load_map(map_name), output.stem if to_file else None)
+    targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
+    for target in targets if not dry_run else []:
+        check_writable(target, force)
+    for part, target in zip(parts, targets, strict=True):
+        for note in part.notes:
+            print(f"note: {note}")
+        for oddity in find_oddities(part.recording):
+            _warn(f"{target}, row {oddity.sample + 1}: {oddity.text}")
+        if not dry_run:
+            save_recording(part.recording, target, force)
+        first, *rest = summary(part.recording)
+        about = first.partition(": ")[2]
+        print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
+
+
+@app.command("recording")
+def recording_(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
+    ],
+) -> None:
+    """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings."""
+    from surgisoft.measurement.recording import load_recordings
+    from surgisoft.measurement.recording_summary import summary
+
+    for recording in load_recordings(recordings, on_warning=_warn):
+        print(*summary(recording), sep="\n")

@@ -6,7 +6,6 @@ key points, nor the actuation explain; settled rows stand for themselves, so the
 compared with a smooth function of the actuation instead of with the row before.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -267,13 +266,32 @@ def spikes(recording: Recording) -> np.ndarray:
     """(T, n) bool: where a key point has jumped away and jumps back within a few samples."""
     away = np.zeros((recording.samples, recording.key_points), bool)
     for j, hits in key_point_jumps(recording).items():
-        points = recording.key_points_mm[:, j]
-        for (start, size), (stop, _) in itertools.pairwise(hits):
-            before = start - 1 - int(np.isnan(points[:start, 0])[::-1].argmin())
-            returns = np.linalg.norm(points[stop] - points[before]) < SPIKE_RETURN * size
-            if stop - start <= SPIKE_ROWS and returns and not away[start, j]:
-                away[start:stop, j] = True
+        known = np.flatnonzero(~np.isnan(recording.key_points_mm[:, j, 0]))
+        points = recording.key_points_mm[known, j]
+        for row, size in hits:
+            at = int(np.searchsorted(known, row))
+            if not away[row, j] and not away[known[at - 1], j]:
+                start, stop = _spike(points, at, size)
+                away[known[start:stop], j] = True
     return away
+
+
+def _spike(points: np.ndarray, at: int, size: float) -> tuple[int, int]:
+    """The known positions (K, 3) [mm], from and to, of the spike that the jump to `at` begins, or
+    else the one that it ends; empty where there is none."""
+    for end in range(at + 1, min(at + 1 + SPIKE_ROWS, len(points))):
+        if _comes_back(points[at - 1], points[end - 1], points[end], size):
+            return at, end
+    for start in range(at - 1, max(at - 1 - SPIKE_ROWS, 0), -1):
+        if _comes_back(points[at], points[start], points[start - 1], size):
+            return start, at
+    return at, at
+
+
+def _comes_back(true: np.ndarray, away: np.ndarray, next_: np.ndarray, size: float) -> bool:
+    """Whether the step from `away` to the next position leads back to the true one."""
+    near = np.linalg.norm(next_ - true) < SPIKE_RETURN * size
+    return bool(near and np.linalg.norm(next_ - away) > SPIKE_RETURN * size)
 
 
 def _explained(recording: Recording, others: list[_Track], run: slice, row: int) -> bool:

@@ -207,19 +207,34 @@ class _Track:
     steps_mm: np.ndarray
     """(F - 1,) length of the step to each fresh position from the one before, per row [mm]."""
 
-    def ratio(self, at: int) -> float:
-        """Step `at` against the usual steps before and after it, whichever is the larger."""
-        before = self.steps_mm[max(0, at - STEP_WINDOW) : at]
-        after = self.steps_mm[at + 1 : at + 1 + STEP_WINDOW]
-        if len(before) < 3 or len(after) < 3:
-            return 0.0
-        return float(self.steps_mm[at] / max(np.median(before), np.median(after), 1e-12))
+    def ratios(self, at: np.ndarray) -> np.ndarray:
+        """Steps `at` (C,) against the usual steps before and after each, whichever is the larger.
+
+        0 where fewer than three steps stand on a side.
+        """
+        usual = np.maximum(self._usual(at - STEP_WINDOW), self._usual(at + 1))
+        good = (at >= 3) & (at < len(self.steps_mm) - 3)
+        return np.where(good, self.steps_mm[at] / np.maximum(usual, 1e-12), 0.0)
+
+    def _usual(self, first: np.ndarray) -> np.ndarray:
+        """(C,) median of the steps in the window that begins at each of these, as far as known."""
+        padding = np.full(STEP_WINDOW, np.nan)
+        padded = np.concatenate([padding, self.steps_mm, padding])
+        usual = np.zeros(len(first))
+        for some in np.array_split(np.arange(len(first)), len(first) // 100_000 + 1):
+            windows = padded[first[some, None] + STEP_WINDOW + np.arange(STEP_WINDOW)]
+            whole = ~np.isnan(windows).any(axis=1)
+            usual[some[whole]] = np.median(windows[whole], axis=1)
+            for i, window in zip(some[~whole], windows[~whole], strict=True):
+                known = window[~np.isnan(window)]
+                usual[i] = np.median(known) if len(known) else 0.0
+        return usual
 
     def ratio_near(self, row: int) -> float:
         """The largest ratio of the steps that end within one fresh position of a sample."""
         at = int(np.searchsorted(self.rows[1:], row))
-        near = range(max(0, at - 1), min(len(self.steps_mm), at + 2))
-        return max((self.ratio(i) for i in near), default=0.0)
+        near = np.arange(max(0, at - 1), min(len(self.steps_mm), at + 2))
+        return float(self.ratios(near).max(initial=0.0))
 
 
 def _track(points: np.ndarray, start: int) -> _Track:
@@ -249,9 +264,10 @@ def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
         tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
         for j, track in enumerate(tracks):
             others = [*tracks[:j], *tracks[j + 1 :]]
-            for at in np.flatnonzero(track.steps_mm > least).tolist():
+            large = np.flatnonzero(track.steps_mm > least)
+            for at in large[track.ratios(large) > JUMP_RATIO].tolist():
                 row = int(track.rows[at + 1])
-                if track.ratio(at) > JUMP_RATIO and not _explained(recording, others, run, row):
+                if not _explained(recording, others, run, row):
                     before = int(track.rows[at])
                     size = float(np.linalg.norm(points[row, j] - points[before, j]))
                     hits.setdefault(j, []).append((row, size))

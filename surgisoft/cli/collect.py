@@ -1,5 +1,6 @@
 """`surgisoft collect`: a recording from the virtual rig."""
 
+import zlib
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,27 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+
+
+def _list_hidden(value: bool) -> None:
+    if value:
+        from surgisoft.measurement.rig.hidden import HIDDEN
+
+        for name, effect in HIDDEN.items():
+            print(f"{name:18s}{effect.place:10s}{effect.about}")
+        raise typer.Exit
+
+
+def _list_protocols(value: bool) -> None:
+    if value:
+        from surgisoft.measurement.protocols import PROTOCOLS
+
+        for name, entry in PROTOCOLS.items():
+            print(f"{name:12s}{entry.points:6d}  {entry.about}")
+        print(
+            "SCHEDULE.csv        columns t_s, c1_kPa ... cm_kPa and maybe run; linear between rows"
+        )
+        raise typer.Exit
 
 
 @app.command()
@@ -25,20 +47,40 @@ def collect(
     points: Annotated[
         int | None, typer.Option(help="Settled points, or frames at 20 Hz; default: protocol's.")
     ] = None,
+    hidden: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Switch on a hidden effect; may be repeated."),
+    ] = None,
+    strength: Annotated[
+        list[float] | None,
+        typer.Option(metavar="X", help="Strength of each hidden effect in turn; default 1."),
+    ] = None,
     payload_g: Annotated[
-        float, typer.Option("--payload-g", help="Known mass at the tip [g].")
+        float, typer.Option("--payload-g", help="Known mass at the tip, in g.")
     ] = 0.0,
     gravity: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Direction of weight in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
-        float, typer.Option("--roll-deg", help="Turn of the base about its axis [deg].")
+        float, typer.Option("--roll-deg", help="Turn of the base about its axis, in degrees.")
     ] = 0.0,
     noise_scale: Annotated[
         float, typer.Option(help="Factor on all sensor and camera noise.")
     ] = 1.0,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
+    list_hidden: Annotated[
+        bool,
+        typer.Option(
+            "--list-hidden", callback=_list_hidden, is_eager=True, help="List the hidden effects."
+        ),
+    ] = False,
+    list_protocols: Annotated[
+        bool,
+        typer.Option(
+            "--list-protocols", callback=_list_protocols, is_eager=True, help="List the protocols."
+        ),
+    ] = False,
 ) -> None:
     """Collect a recording on the virtual rig: the paper's arm, pumps and motion capture."""
     from surgisoft.measurement.protocols import make_protocol
@@ -47,24 +89,37 @@ def collect(
     from surgisoft.measurement.rig.virtual import MOUNT
 
     _check_output(output, force)
+    effects = _pairs(hidden or [], strength or [])
+    noise_seed = zlib.crc32(f"{protocol} {take}".encode())
     rig = VirtualRig(
         seed,
         gravity=gravity or MOUNT,
         roll_deg=roll_deg,
         payload_g=payload_g,
         noise=noise_scale,
-        take=take,
+        take=noise_seed,
+        hidden=effects,
     )
     plan = make_protocol(protocol, rig.limits, points, seed=seed + 1_000_003 * take)
     with progress(f"collect {plan.name}") as report:
         recording, _ = rig.record(plan, report)
     save_recording(recording, output, force)
     minutes = recording.t_s[-1] / 60
+    secret = "".join(f", hidden {name} {size:g}" for name, size in effects)
     print(
         f"wrote {output}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
-        f"{minutes:.0f} min on the bench, noise {recording.noise_mm:.3f} mm"
+        f"{minutes:.0f} min on the bench, noise {recording.noise_mm:.3f} mm{secret}"
     )
+
+
+def _pairs(names: list[str], strengths: list[float]) -> list[tuple[str, float]]:
+    """Each hidden effect with its strength, 1 where none is given."""
+    if len(strengths) not in (0, len(names)):
+        raise InputError(
+            f"{len(names)} --hidden and {len(strengths)} --strength, expected a strength for each"
+        )
+    return list(zip(names, strengths or [1.0] * len(names), strict=True))
 
 
 def _check_output(path: Path, force: bool) -> None:

@@ -4,6 +4,7 @@ Randomness comes from outside as a tape of standard normal numbers, so that one 
 other and a whole schedule at once read the same numbers in the same order.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +19,27 @@ from surgisoft.measurement.rig.arm import (
     new_memory,
     remember,
 )
+from surgisoft.measurement.rig.effects import (
+    Effects,
+    History,
+    add_effect_forces,
+    add_twist,
+    drifted_base,
+    effective_pressures,
+    follow_lines,
+    forget,
+    misalign,
+    new_history,
+    room_temperature,
+    shown_pressure,
+    slip_marker,
+)
 from surgisoft.measurement.rig.motion_capture import (
     Cameras,
     Tracking,
     circle_centre,
     look,
+    mark,
     new_tracking,
     normals_per_frame,
     normals_per_pause,
@@ -34,6 +51,7 @@ from surgisoft.measurement.rig.pneumatics import (
     Pumps,
     drive_piston,
     fill,
+    fill_through_line,
     read_sensor,
     vent,
     vented,
@@ -53,6 +71,8 @@ class Plant(NamedTuple):
     """Its pneumatics."""
     cameras: Cameras
     """Its motion capture."""
+    effects: Effects
+    """What is hidden in it."""
 
 
 class State(NamedTuple):
@@ -66,8 +86,14 @@ class State(NamedTuple):
     """(m,) commanded pressures [kPa]."""
     chamber: np.ndarray
     """(m,) pressures in the chambers [kPa gauge]."""
+    effective: np.ndarray
+    """(m,) pressures that push on the wall [kPa]."""
     memory: Memory
     """The wall's history."""
+    history: History
+    """The hidden effects' history."""
+    base: np.ndarray
+    """(4,) quaternion of the base section."""
     shape: Shape
     """The rod's last equilibrium."""
     tracking: Tracking
@@ -93,6 +119,8 @@ class Frames(NamedTuple):
     """(F, n, 3) the body's true centres [mm]."""
     chamber: np.ndarray
     """(F, m) true chamber pressures [kPa]."""
+    temperature: np.ndarray
+    """(F,) readings of the thermometer, in steps of 0.1 degrees Celsius."""
 
 
 def new_state(plant: Plant) -> State:
@@ -104,7 +132,10 @@ def new_state(plant: Plant) -> State:
         gas=vented(plant.pumps),
         target=np.zeros(m),
         chamber=np.zeros(m),
+        effective=np.zeros(m),
         memory=new_memory(lines),
+        history=new_history(m, lines),
+        base=rod.base.copy(),
         shape=new_shape(rod),
         tracking=new_tracking(plant.cameras),
         forces=np.zeros(lines),
@@ -122,6 +153,7 @@ def new_frames(plant: Plant, count: int) -> Frames:
         clean=np.empty((count, n, 3)),
         centres=np.empty((count, n, 3)),
         chamber=np.empty((count, m)),
+        temperature=np.empty(count),
     )
 
 
@@ -147,6 +179,8 @@ def rest(plant, state):
     vent(plant.pumps, state.gas)
     state.target[:] = 0.0
     state.chamber[:] = 0.0
+    state.effective[:] = 0.0
+    forget(state.history)
     state.memory.free[:] = 0.0
     state.memory.last[:] = 0.0
     state.memory.depth[:] = 0
@@ -157,19 +191,25 @@ def rest(plant, state):
 @njit(cache=True)
 def advance(plant, state, steps, tape, at):
     """Pumps and wall over `steps` controller periods; the tape's next index, -1 on failure."""
-    pumps = plant.pumps
+    pumps, effects = plant.pumps, plant.effects
     wall = plant.specimen.rod.wall
     for _ in range(steps):
         for i in range(state.gas.shape[0]):
             row = state.gas[i]
-            reading = read_sensor(pumps, row[PRESSURE], tape[at])
+            shown = shown_pressure(effects, state.gas, PRESSURE, i)
+            reading = read_sensor(pumps, shown, tape[at])
             at += 1
             drive_piston(pumps, row, state.target[i], reading)
             stretch = line_strain(state.memory.free, wall.chambers[i, 0], wall.chambers[i, 1])
-            fill(pumps, row, i, stretch)
+            if effects.line[0] > 0.0:
+                fill_through_line(pumps, row, i, stretch, effects.line[0], effects.line[1])
+            else:
+                fill(pumps, row, i, stretch)
             state.chamber[i] = row[CHAMBER]
-        if not remember(plant.specimen, state.chamber, state.scratch, state.memory):
+        effective_pressures(effects, pumps.step, state.chamber, state.history, state.effective)
+        if not remember(plant.specimen, state.effective, state.scratch, state.memory):
             return -1
+        follow_lines(effects, pumps.step, state.memory.last, state.history)
         state.steps[0] += 1
     return at
 
@@ -186,14 +226,17 @@ def pause(plant, state, steps, tape, at):
 @njit(cache=True)
 def take_shape(plant, state):
     """The arm's equilibrium under the present pressures and memory; False where none was found."""
-    specimen = plant.specimen
+    specimen, effects, active = plant.specimen, plant.effects, state.shape.active
     friction_forces(specimen.friction, state.memory, state.forces)
-    state.shape.active[:] = 0.0
-    add_line_forces(specimen.friction, state.forces, state.shape.active)
-    chamber_thrusts(specimen.rod, state.chamber, state.thrusts)
-    return balance(
-        specimen.rod, plant.loads, 1.0, state.thrusts, specimen.rod.base, state.shape
-    )  # fmt: skip
+    add_effect_forces(effects, state.memory.last, state.history, state.forces)
+    active[:] = 0.0
+    add_line_forces(specimen.friction, state.forces, active)
+    add_twist(effects, state.effective, active)
+    chamber_thrusts(specimen.rod, state.effective, state.thrusts)
+    time = state.steps[0] * plant.pumps.step
+    softness = 1.0 - effects.warmth * (room_temperature(effects, time) - 22.0)
+    drifted_base(effects, time, specimen.rod.base, state.base)
+    return balance(specimen.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
 
 
 @njit(cache=True)
@@ -206,15 +249,22 @@ def sample(plant, state, steps, tape, at, frames, index):
     if at < 0 or not take_shape(plant, state):
         return -1
     for i in range(state.gas.shape[0]):
-        frames.measured[index, i] = read_sensor(plant.pumps, state.gas[i, PRESSURE], tape[at])
+        shown = shown_pressure(plant.effects, state.gas, PRESSURE, i)
+        frames.measured[index, i] = read_sensor(plant.pumps, shown, tape[at])
         at += 1
     shape, tracking = state.shape, state.tracking
-    at = look(plant.cameras, tracking, shape.centres, shape.frames, state.chamber, tape, at)
+    mark(plant.cameras, tracking, shape.centres, shape.frames, state.chamber)
+    time = state.steps[0] * plant.pumps.step
+    slip_marker(plant.effects, time, shape.frames, state.history, tracking.clean)
+    misalign(plant.effects, tracking.clean)
+    at = look(plant.cameras, tracking, tape, at)
     for p in range(shape.centres.shape[0]):
         circle_centre(tracking.seen[p], frames.points[index, p])
         circle_centre(tracking.clean[p], frames.clean[index, p])
     frames.centres[index] = shape.centres
     frames.chamber[index] = state.chamber
+    warmth = room_temperature(plant.effects, time)
+    frames.temperature[index] = math.floor(10.0 * warmth + 0.5) / 10.0
     return at
 
 

@@ -41,7 +41,7 @@ class Cameras(NamedTuple):
     period: float
     """Time between frames [s]."""
     at: np.ndarray
-    """(n, k, 3) markers in their plane's frame [mm]."""
+    """(n, k, 2) markers x, y in their plane's frame [mm]."""
     swell: np.ndarray
     """(n, k, m) radial shift of a marker by the pressure in each chamber [mm/kPa]."""
     white: float
@@ -79,7 +79,7 @@ def build_cameras(
     angle = np.pi / 2 + 2 * np.pi * (np.arange(k) + 0.5) / k
     angle = angle + np.radians(rng.normal(0.0, 2.0, (planes, k)))
     radius = diameter_mm / 2 + 1.5 + rng.normal(0.0, 0.1, (planes, k))
-    at = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros((planes, k))], axis=-1)
+    at = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     centre = np.pi / 2 + 2 * np.pi * np.arange(chambers) / chambers
     near = np.clip(np.cos(angle[..., None] - centre), 0.0, None)
     swell = near * design.bulge_mm / high_kPa
@@ -142,13 +142,12 @@ def _upper_tail(z):
 
 
 @njit(cache=True)
-def look(cameras, tracking, centres, frames, pressures, tape, at):
-    """One frame of all markers into tracking.seen and tracking.clean; the tape's next index.
+def mark(cameras, tracking, centres, frames, pressures):
+    """Where the markers are, into tracking.clean.
 
     centres: (n, 3) [mm]; frames: (n, 3, 3) plane axes in columns, arm base frame; pressures: (m,)
-    chamber pressures [kPa]; tape: standard normals, read from index `at`.
+    chamber pressures [kPa].
     """
-    at = wander(cameras, tracking, cameras.period, tape, at)
     for p in range(centres.shape[0]):
         for k in range(cameras.at.shape[1]):
             x, y = cameras.at[p, k, 0], cameras.at[p, k, 1]
@@ -156,6 +155,20 @@ def look(cameras, tracking, centres, frames, pressures, tape, at):
             for i in range(pressures.shape[0]):
                 shift += cameras.swell[p, k, i] * pressures[i]
             grow = 1.0 + shift / math.sqrt(x * x + y * y)
+            for d in range(3):
+                across = frames[p, d, 0] * x + frames[p, d, 1] * y
+                tracking.clean[p, k, d] = centres[p, d] + grow * across
+
+
+@njit(cache=True)
+def look(cameras, tracking, tape, at):
+    """One frame: tracking.clean with noise and losses, into tracking.seen; the tape's next index.
+
+    tape: standard normals, read from index `at`.
+    """
+    at = wander(cameras, tracking, cameras.period, tape, at)
+    for p in range(tracking.seen.shape[0]):
+        for k in range(tracking.seen.shape[1]):
             chance = _upper_tail(tape[at])
             at += 1
             if tracking.lost[p, k] == 1.0:
@@ -163,10 +176,8 @@ def look(cameras, tracking, centres, frames, pressures, tape, at):
             elif chance < cameras.lose:
                 tracking.lost[p, k] = 1.0
             for d in range(3):
-                clean = centres[p, d] + grow * (frames[p, d, 0] * x + frames[p, d, 1] * y)
-                clean += frames[p, d, 2] * cameras.at[p, k, 2]
-                tracking.clean[p, k, d] = clean
-                noisy = clean + tracking.slow[p, k, d] + cameras.white * tape[at]
+                noise = tracking.slow[p, k, d] + cameras.white * tape[at]
+                noisy = tracking.clean[p, k, d] + noise
                 tracking.seen[p, k, d] = np.nan if tracking.lost[p, k] == 1.0 else noisy
                 at += 1
     return at

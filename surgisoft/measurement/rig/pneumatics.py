@@ -198,8 +198,11 @@ def fill_through_line(pumps, row, i, stretch, filling, emptying):
         p2 = pressure_of(row[FAR_AIR], far, pumps.bulge)
         drop = (p1 + AMBIENT_KPA) ** 2 - (p2 + AMBIENT_KPA) ** 2
         width = filling if drop > 0.0 else emptying
-        flow = width * drop / math.sqrt(abs(drop) + 30.0)
-        row[AIR] -= flow * 0.1 * pumps.step
-        row[FAR_AIR] += flow * 0.1 * pumps.step
+        moved = 0.1 * pumps.step * width * drop / math.sqrt(abs(drop) + 30.0)
+        even = (p1 - p2) * near * far / (near + far)  # would equalise the pressures
+        if abs(moved) > 0.5 * abs(even):
+            moved = 0.5 * even
+        row[AIR] -= moved
+        row[FAR_AIR] += moved
     row[PRESSURE] = pressure_of(row[AIR], near, 0.0)
     row[CHAMBER] = pressure_of(row[FAR_AIR], far, pumps.bulge)

@@ -4,7 +4,7 @@ It is the truth that arm models are judged on, so it shares nothing with them: n
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ from surgisoft.measurement.rig.collect import (
     runs_of,
     samples_in,
 )
+from surgisoft.measurement.rig.effects import no_effects
+from surgisoft.measurement.rig.hidden import Bench, switch_on
 from surgisoft.measurement.rig.interface import Sample
 from surgisoft.measurement.rig.motion_capture import CameraDesign, build_cameras
 from surgisoft.measurement.rig.pneumatics import PumpDesign, build_pumps
@@ -52,7 +54,8 @@ class VirtualRig:
 
     seed: which specimen was cast. gravity: (3,) direction of weight in the base frame; roll_deg:
     turns the base about its axis. payload_g: known mass at the tip. noise: factor on all sensor
-    and camera noise. take: another number gives other noise on the same arm.
+    and camera noise. take: another number gives other noise on the same arm. hidden: names and
+    strengths of hidden effects, see hidden.py.
     """
 
     unit = "kPa"
@@ -66,6 +69,7 @@ class VirtualRig:
         payload_g: float = 0.0,
         noise: float = 1.0,
         take: int = 0,
+        hidden: Iterable[tuple[str, float]] = (),
         design: ArmDesign | None = None,
         pumps: PumpDesign | None = None,
         cameras: CameraDesign | None = None,
@@ -79,10 +83,13 @@ class VirtualRig:
         self.gravity = _rolled(gravity, roll_deg)
         self.payload_g = float(payload_g) if payload_g else None
         loads = plain_loads(self.gravity)._replace(payload=payload_g * 1e-3 * STANDARD_GRAVITY)
+        rod = specimen.rod
+        stiffness = rod.wall.modulus * rod.wall.area / design.friction_lines
+        secret = switch_on(Bench(no_effects(design.chambers, stiffness), loads, rod), hidden, seed)
         volumes = specimen.rod.wall.areas * design.soft_mm
         self._plant = bench.Plant(
             specimen=specimen,
-            loads=loads,
+            loads=secret.loads,
             pumps=build_pumps(pumps or PumpDesign(), volumes, noise, seed),
             cameras=build_cameras(
                 cameras or CameraDesign(),
@@ -93,7 +100,9 @@ class VirtualRig:
                 noise,
                 seed,
             ),
+            effects=secret.effects,
         )
+        self._thermometer = secret.effects.warmth != 0.0
         self.period_s = self._plant.cameras.period
         self._rng = np.random.default_rng([seed, take, 0x5EED])
         self._state = bench.new_state(self._plant)
@@ -144,6 +153,7 @@ class VirtualRig:
             measured=frame.measured[0].copy(),
             commanded=self._state.target.copy(),
             key_points_mm=frame.points[0].copy(),
+            temp_C=float(frame.temperature[0]) if self._thermometer else None,
         )
 
     def record(
@@ -172,7 +182,14 @@ class VirtualRig:
         error = (frames.points - frames.clean)[np.isfinite(frames.points)]
         noise_mm = float(np.sqrt(np.mean(error**2))) if error.size else 0.0
         recording = describe(
-            self, protocol, t_s - t_s[0], frames.measured, frames.points, commanded, noise_mm
+            self,
+            protocol,
+            t_s - t_s[0],
+            frames.measured,
+            frames.points,
+            commanded,
+            noise_mm,
+            frames.temperature if self._thermometer else None,
         )
         return recording, truth
 

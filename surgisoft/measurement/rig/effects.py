@@ -1,0 +1,293 @@
+"""Hidden effects in compiled code: what a bench does beyond the plain arm, each in its own form.
+
+Every amplitude is zero where the effect is off, and then nothing of it is computed. The forms are
+those of the mechanics literature where there is one, and none is the formula of an arm model.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+CREEP_TIMES = np.array([0.6, 2.4, 9.6, 38.4, 153.6])
+"""Retardation times [s] whose sum stands for a power law over three decades (Findley 1976)."""
+SLIP_S = 150.0
+"""Time that a loose marker takes to slip, while the arm is bent [s]."""
+RATE_FILTER_S = 0.03
+"""Time constant of the strain rate [s]."""
+REFERENCE_KPA = 54.0
+"""Pressure by which amplitudes are scaled [kPa]."""
+
+
+class Effects(NamedTuple):
+    """Amplitudes of all hidden effects; m chambers, J wall lines."""
+
+    friction: float
+    """Added share of the fibres' friction [-]."""
+    line: np.ndarray
+    """(2,) conductance of a long thin tube, filling and emptying [mm^3/s]; 0: short tube."""
+    crosstalk: float
+    """Share of the channel before that a sensor channel shows [-]."""
+    leak: np.ndarray
+    """(m,) pressure lost over the tube at 54 kPa [kPa]."""
+    dead_zone: float
+    """Pressure taken up before a chamber pushes [kPa]."""
+    gain: np.ndarray
+    """(m,) relative change of a chamber's push at low pressure [-]."""
+    coupling: np.ndarray
+    """(m, m) pressure at 54 kPa in chamber j that chamber i loses [kPa]."""
+    creep: float
+    """Added push after about a minute at 54 kPa [kPa]."""
+    rate: float
+    """Viscous force of a wall line at 0.1 strain a second [N]."""
+    stick: np.ndarray
+    """(2,) stiffness [N] and break-away strain [-] of lines that stick and slip."""
+    softening: float
+    """Share of a line's stiffness that a larger load before has broken [-]."""
+    stiffening: float
+    """Force of a line at strain 0.2 beyond the plain wall's [N]."""
+    twist: float
+    """Torque of one chamber at 54 kPa [N mm]."""
+    drift: np.ndarray
+    """(3,) rotation of the base after ten minutes, arm base frame [rad]."""
+    warmth: float
+    """Stiffness lost per kelvin [-]; nonzero: the room is not air-conditioned."""
+    misalignment: np.ndarray
+    """(7,) rotation [rad] and shift [mm] of the cameras' frame, and its radial warp [1/mm]."""
+    slip: np.ndarray
+    """(4,) key plane, marker, largest slip along the arm [mm], bending that moves it [rad]."""
+    modulus: float
+    """Young's modulus of the wall times a line's share of its area [N]."""
+
+
+class History(NamedTuple):
+    """What the effects remember; updated in place."""
+
+    creep: np.ndarray
+    """(m, 5) retarded loads [-]."""
+    before: np.ndarray
+    """(J,) strain of each line one period ago [-]."""
+    rate: np.ndarray
+    """(J,) strain rate of each line [1/s]."""
+    stuck: np.ndarray
+    """(J,) strain at which each line stuck last [-]."""
+    peak: np.ndarray
+    """(J,) largest energy density that each line has seen, over the modulus [-]."""
+    slipped: np.ndarray
+    """(2,) how far the marker has slipped [mm], time of the last frame [s]; no reset undoes it."""
+
+
+def no_effects(chambers: int, line_stiffness: float) -> Effects:
+    """Everything off. line_stiffness: modulus times area of one wall line [N]."""
+    return Effects(
+        friction=0.0,
+        line=np.zeros(2),
+        crosstalk=0.0,
+        leak=np.zeros(chambers),
+        dead_zone=0.0,
+        gain=np.zeros(chambers),
+        coupling=np.zeros((chambers, chambers)),
+        creep=0.0,
+        rate=0.0,
+        stick=np.zeros(2),
+        softening=0.0,
+        stiffening=0.0,
+        twist=0.0,
+        drift=np.zeros(3),
+        warmth=0.0,
+        misalignment=np.zeros(7),
+        slip=np.zeros(4),
+        modulus=line_stiffness,
+    )
+
+
+def new_history(chambers: int, lines: int) -> History:
+    """No past."""
+    return History(
+        creep=np.zeros((chambers, len(CREEP_TIMES))),
+        before=np.zeros(lines),
+        rate=np.zeros(lines),
+        stuck=np.zeros(lines),
+        peak=np.zeros(lines),
+        slipped=np.zeros(2),
+    )
+
+
+@njit(cache=True)
+def forget(history):
+    """What venting and resting undo."""
+    history.creep[:] = 0.0
+    history.before[:] = 0.0
+    history.rate[:] = 0.0
+    history.stuck[:] = 0.0
+    history.peak[:] = 0.0
+
+
+@njit(cache=True)
+def shown_pressure(effects, gas, column, i):
+    """Pressure [kPa] at sensor i; a multiplexer that settles slowly mixes in the channel before."""
+    own = gas[i, column]
+    if effects.crosstalk == 0.0:
+        return own
+    return own + effects.crosstalk * (gas[i - 1, column] - own)
+
+
+@njit(cache=True)
+def effective_pressures(effects, step, chamber, history, effective):
+    """Pressures (m,) [kPa] that push on the wall, from those in the chambers (m,) [kPa].
+
+    Leak: a crack that opens above 5 kPa, so that the flow along the tube takes pressure away.
+    Gain: wears off towards high pressure. Coupling: a neighbour's wall bulges with its pressure
+    squared. Dead zone: folds that open smoothly. Creep: a ladder of retarded loads, nonlinear in
+    the load.
+    """
+    m = chamber.shape[0]
+    for i in range(m):
+        p = chamber[i]
+        push = p
+        if effects.leak[i] != 0.0 and p > 5.0:
+            push -= effects.leak[i] * ((p - 5.0) / (REFERENCE_KPA - 5.0)) ** 1.5
+        if effects.gain[i] != 0.0:
+            push += effects.gain[i] * p * (1.0 - 0.4 * p / REFERENCE_KPA)
+        for j in range(m):
+            if effects.coupling[i, j] != 0.0:
+                push -= effects.coupling[i, j] * chamber[j] * abs(chamber[j]) / REFERENCE_KPA**2
+        if effects.dead_zone != 0.0:
+            push -= effects.dead_zone * math.tanh(push / effects.dead_zone)
+        if effects.creep != 0.0:
+            load = p / REFERENCE_KPA * (abs(p) / REFERENCE_KPA) ** 0.3
+            for k in range(CREEP_TIMES.shape[0]):
+                keep = math.exp(-step / CREEP_TIMES[k])
+                history.creep[i, k] = load + keep * (history.creep[i, k] - load)
+                # Findley: t^n with n = 0.2; each term's share grows like its time to that power.
+                share = 0.25 * (CREEP_TIMES[k] / 38.4) ** 0.2
+                push += effects.creep * share * history.creep[i, k]
+        effective[i] = push
+
+
+@njit(cache=True)
+def follow_lines(effects, step, strains, history):
+    """Let the lines' memories follow their strains (J,) over one period [s]."""
+    for j in range(strains.shape[0]):
+        strain = strains[j]
+        if effects.rate != 0.0:
+            rate = (strain - history.before[j]) / step
+            history.rate[j] += step / (RATE_FILTER_S + step) * (rate - history.rate[j])
+            history.before[j] = strain
+        if effects.stick[0] != 0.0 and abs(strain - history.stuck[j]) > effects.stick[1]:
+            history.stuck[j] = strain
+        if effects.softening != 0.0:
+            history.peak[j] = max(history.peak[j], 0.5 * strain * strain)
+
+
+@njit(cache=True)
+def add_effect_forces(effects, strains, history, forces):
+    """Add the effects' tension of each line [N] to forces (J,); strains: (J,) [-].
+
+    Rate: a shear-thinning fluid's power law. Stick-slip: springs that let go all at once.
+    Softening: Ogden & Roxburgh (1999, eq. 40), the share erf((W_max - W) / (m + b W_max)) of the
+    damage. Stiffening: exponential, as Fung's (1967) tissue.
+    """
+    for j in range(strains.shape[0]):
+        strain = strains[j]
+        forces[j] *= 1.0 + effects.friction
+        if effects.rate != 0.0:
+            rate = history.rate[j]
+            forces[j] += math.copysign(effects.rate * math.sqrt(abs(rate) / 0.1), rate)
+        if effects.stick[0] != 0.0:
+            forces[j] += effects.stick[0] * (strain - history.stuck[j])
+        if effects.softening != 0.0:
+            peak = history.peak[j]
+            broken = math.erf((peak - 0.5 * strain * strain) / (2e-3 + 0.2 * peak))
+            forces[j] -= effects.softening * broken * effects.modulus * strain
+        if effects.stiffening != 0.0:
+            size = abs(strain) / 0.2
+            curve = (math.expm1(2.0 * size) - 2.0 * size) / (math.expm1(2.0) - 2.0)
+            forces[j] += math.copysign(effects.stiffening * curve, strain)
+
+
+@njit(cache=True)
+def add_twist(effects, effective, active):
+    """Torque of fibres wound unequally, growing faster than pressure, into active (K, 4) [N mm]."""
+    torque = 0.0
+    for i in range(effective.shape[0]):
+        p = effective[i] / REFERENCE_KPA
+        torque += effects.twist * p * (1.0 + 0.5 * p) / 1.5
+    for k in range(active.shape[0]):
+        active[k, 3] += torque
+
+
+@njit(cache=True)
+def room_temperature(effects, time):
+    """Temperature [degrees Celsius] at a time [s]: the bench warms up, the heating cycles."""
+    if effects.warmth == 0.0:
+        return 22.0
+    warm = 5.0 * (1.0 - math.exp(-time / 500.0))
+    return 22.0 + warm + 1.0 * math.sin(2.0 * math.pi * time / 1300.0)
+
+
+@njit(cache=True)
+def drifted_base(effects, time, base, out):
+    """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law."""
+    out[:] = base
+    grown = (time / 600.0) ** 0.6
+    share = 1.3 * grown / (1.0 + 0.3 * grown)
+    rx, ry, rz = effects.drift[0] * share, effects.drift[1] * share, effects.drift[2] * share
+    angle = math.sqrt(rx * rx + ry * ry + rz * rz)
+    if angle == 0.0:
+        return
+    s = math.sin(0.5 * angle) / angle
+    w, x, y, z = math.cos(0.5 * angle), s * rx, s * ry, s * rz
+    a, b, c, d = base[0], base[1], base[2], base[3]
+    out[0] = w * a - x * b - y * c - z * d
+    out[1] = w * b + x * a + y * d - z * c
+    out[2] = w * c - x * d + y * a + z * b
+    out[3] = w * d + x * c - y * b + z * a
+
+
+@njit(cache=True)
+def slip_marker(effects, time, frames, history, markers):
+    """Shift the loose marker of (n, k, 3) [mm] along the arm: it creeps on while the arm is bent.
+
+    time: [s]; frames: (n, 3, 3) rotations of the key planes; what the arm does between two frames
+    counts as what it does at the second.
+    """
+    limit = effects.slip[2]
+    if limit == 0.0:
+        return
+    plane = int(effects.slip[0])
+    if frames[plane, 2, 2] < math.cos(effects.slip[3]):
+        share = -math.expm1((history.slipped[1] - time) / SLIP_S)
+        history.slipped[0] += share * (limit - history.slipped[0])
+    history.slipped[1] = time
+    marker = markers[plane, int(effects.slip[1])]
+    for d in range(3):
+        marker[d] += history.slipped[0] * frames[plane, d, 2]
+
+
+@njit(cache=True)
+def misalign(effects, points):
+    """Points (n, k, 3) [mm] as cameras with a wrong calibration place them; in place.
+
+    Rodrigues' rotation, a shift, and a radial warp about the arm's middle.
+    """
+    v = effects.misalignment
+    angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    if angle == 0.0 and v[3] == 0.0 and v[4] == 0.0 and v[5] == 0.0 and v[6] == 0.0:
+        return
+    axis = np.zeros(3)
+    if angle > 0.0:
+        axis[:] = v[:3] / angle
+    c, s = math.cos(angle), math.sin(angle)
+    for p in range(points.shape[0]):
+        for k in range(points.shape[1]):
+            x, y, z = points[p, k, 0], points[p, k, 1], points[p, k, 2]
+            along = (1.0 - c) * (axis[0] * x + axis[1] * y + axis[2] * z)
+            rx = c * x + s * (axis[1] * z - axis[2] * y) + along * axis[0]
+            ry = c * y + s * (axis[2] * x - axis[0] * z) + along * axis[1]
+            rz = c * z + s * (axis[0] * y - axis[1] * x) + along * axis[2]
+            far = v[6] * math.sqrt(rx * rx + ry * ry + (rz - 35.0) ** 2)
+            points[p, k, 0] = rx * (1.0 + far) + v[3]
+            points[p, k, 1] = ry * (1.0 + far) + v[4]
+            points[p, k, 2] = 35.0 + (rz - 35.0) * (1.0 + far) + v[5]

@@ -1,0 +1,206 @@
+"""Hidden effects by name: what `--hidden NAME --strength X` switches on.
+
+At strength 1 an effect changes the tip by about a millimetre (root mean square over the `mixed`
+protocol); benchmarks/collect.py measures it. Signs and places vary with the arm's seed.
+"""
+
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.rig.arm import STANDARD_GRAVITY
+from surgisoft.measurement.rig.effects import Effects
+from surgisoft.measurement.rig.rod import Loads, Rod
+
+
+@dataclass
+class Bench:
+    """What an effect may change, and the arm that it changes."""
+
+    effects: Effects
+    """Amplitudes."""
+    loads: Loads
+    """Outside loads."""
+    rod: Rod
+    """The arm's statics."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One hidden effect."""
+
+    place: str
+    """Where in the chain it acts: line, material, body or sensor."""
+    about: str
+    """One line."""
+    switch_on: Callable[[Bench, float, np.random.Generator], None]
+    """Change the bench by a strength, with the arm's own random numbers."""
+
+
+def _set(bench: Bench, **amplitudes) -> None:
+    bench.effects = bench.effects._replace(**amplitudes)
+
+
+def _pattern(rng: np.random.Generator, m: int) -> np.ndarray:
+    """(m,) numbers of mean 0 and root mean square 1 (m > 1)."""
+    values = rng.permutation(np.linspace(-1.0, 1.0, m)) + rng.normal(0.0, 0.2, m)
+    values -= values.mean() if m > 1 else 0.0
+    return values / np.sqrt(np.mean(values**2))
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    """(3,) random unit vector."""
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def _hysteresis(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, friction=1.0 * strength)
+
+
+def _rate_dependence(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, rate=0.026 * strength)
+
+
+def _line_lag(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, line=np.array([1700.0, 950.0]) / strength)
+
+
+def _creep(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, creep=7.5 * strength)
+
+
+def _softening(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, softening=0.08 * strength)
+
+
+def _stiffening(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, stiffening=0.03 * strength)
+
+
+def _dead_zone(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, dead_zone=1.2 * strength)
+
+
+def _gain_mismatch(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, gain=0.05 * strength * _pattern(rng, len(bench.effects.gain)))
+
+
+def _coupling(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    m = len(bench.effects.gain)
+    matrix = 3.0 * strength * rng.uniform(0.6, 1.4, (m, m))
+    np.fill_diagonal(matrix, 0.0)
+    _set(bench, coupling=matrix)
+
+
+def _payload(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0, 2 * np.pi)
+    weight = bench.loads.payload + 0.7e-3 * strength * STANDARD_GRAVITY
+    at = np.array([2.0 * np.cos(angle), 2.0 * np.sin(angle), 2.0])
+    bench.loads = bench.loads._replace(payload=weight, payload_at=at)
+
+
+def _contact(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0, 2 * np.pi)
+    bench.loads = bench.loads._replace(
+        support=round(0.6 * len(bench.rod.steps)),
+        support_normal=np.array([np.cos(angle), np.sin(angle), 0.0]),
+        support_gap=-6.0,
+        support_stiffness=0.03 * strength,
+    )
+
+
+def _misalignment(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    turn = np.radians(0.8) * strength * _direction(rng)
+    shift = 0.4 * strength * _direction(rng)
+    warp = 1e-4 * strength * rng.choice([-1.0, 1.0])
+    _set(bench, misalignment=np.concatenate([turn, shift, [warp]]))
+
+
+def _drift(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.radians(1.2) * strength
+    _set(bench, drift=turn * np.array([np.cos(angle), np.sin(angle), 0.0]))
+
+
+def _thermal_drift(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, warmth=0.022 * strength)
+
+
+def _stick_slip(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, stick=np.array([0.5 * strength, 0.04]))
+
+
+def _leak(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    leak = np.zeros(len(bench.effects.leak))
+    leak[rng.integers(len(leak))] = 5.0 * strength
+    _set(bench, leak=leak)
+
+
+def _twist(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, twist=0.5 * strength * rng.choice([-1.0, 1.0]))
+
+
+def _sensor_crosstalk(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    _set(bench, crosstalk=0.03 * strength)
+
+
+def _marker_slip(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    marker = rng.integers(3)
+    slip = np.array([len(bench.rod.planes) - 1, marker, 4.0 * strength, np.radians(30.0)])
+    _set(bench, slip=slip)
+
+
+HIDDEN: dict[str, Hidden] = {
+    "hysteresis": Hidden("material", "more friction of the fibres (Preisach)", _hysteresis),
+    "rate_dependence": Hidden(
+        "material", "viscous wall, force with the root of strain rate", _rate_dependence
+    ),
+    "line_lag": Hidden(
+        "line", "long thin tube: quadratic flow, slower in emptying than in filling", _line_lag
+    ),
+    "creep": Hidden("material", "power-law creep over three decades of time", _creep),
+    "softening": Hidden("material", "Mullins damage by the largest load so far", _softening),
+    "stiffening": Hidden("material", "wall stiffens exponentially with strain", _stiffening),
+    "dead_zone": Hidden("material", "folds that open smoothly before a chamber pushes", _dead_zone),
+    "gain_mismatch": Hidden(
+        "material", "chambers push unequally, less so at high pressure", _gain_mismatch
+    ),
+    "coupling": Hidden("material", "a bulging chamber takes push from the others", _coupling),
+    "payload": Hidden("body", "unweighed mass at the tip, off its centre", _payload),
+    "contact": Hidden("body", "yielding one-sided support at mid-body", _contact),
+    "misalignment": Hidden(
+        "sensor", "camera frame turned, shifted and slightly warped", _misalignment
+    ),
+    "drift": Hidden("body", "the bracket tilts with elapsed time, saturating", _drift),
+    "thermal_drift": Hidden(
+        "material", "the wall softens as the room warms; temp_C", _thermal_drift
+    ),
+    "stick_slip": Hidden("material", "wall lines that stick and let go at once", _stick_slip),
+    "leak": Hidden("line", "a crack in one chamber that opens with pressure", _leak),
+    "twist": Hidden("body", "fibres wound unequally: pressure twists the arm", _twist),
+    "sensor_crosstalk": Hidden(
+        "sensor", "pressure channels mix in the multiplexer", _sensor_crosstalk
+    ),
+    "marker_slip": Hidden("sensor", "a tip marker that slips while the arm is bent", _marker_slip),
+}
+
+
+def switch_on(bench: Bench, names: Iterable[tuple[str, float]], seed: int) -> Bench:
+    """The bench with the named effects, each with its strength (0: off)."""
+    seen: set[str] = set()
+    for name, strength in names:
+        if name not in HIDDEN:
+            raise unknown_name("hidden effect", name, HIDDEN)
+        if name in seen:
+            raise InputError(f"hidden effect '{name}' is given twice, expected once")
+        if not (np.isfinite(strength) and 0.0 <= strength <= 10.0):
+            raise InputError(f"strength of '{name}' is {strength}, expected 0 to 10")
+        seen.add(name)
+        if strength > 0:
+            rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+            HIDDEN[name].switch_on(bench, float(strength), rng)
+    return bench

@@ -14,6 +14,9 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.scene.frames import dot, norm, normalise
 
+HORIZON_MM = 60.0
+"""Clearances saturate here in both engines: farther is reported as this far (mm)."""
+
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:

@@ -17,6 +17,7 @@ import numpy as np
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import (
+    HORIZON_MM,
     ArmShape,
     chain_normal,
     folding_pairs,
@@ -27,8 +28,6 @@ from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import RayHit, Struck, struck_of
 from surgisoft.scene.winding import winding_numbers
 
-HORIZON_MM = 60.0
-"""Clearances saturate here: farther is reported as this far (mm)."""
 PROBE_WIDTH_MM = 1e-3
 """Width of the sliver that stands for a ray; without width FCL misses one hit in six (mm)."""
 MOST_CONTACTS = 100_000
@@ -229,11 +228,16 @@ class Referee:
 
     def _body_clearance(self, chain: _Chain, index: int) -> float:
         centre = _distance(chain.line(), self._objects[index])
-        inside = self.inside(index, chain.shape.centreline_mm)
-        for point in chain.shape.centreline_mm[inside]:
+        for point in self._points_within(chain.shape.centreline_mm, index, centre > 0.0):
             ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
             centre = min(centre, -_distance(ball, self._objects[index]))
         return self._saturated(centre - chain.shape.radius_mm)
+
+    def _points_within(self, points: np.ndarray, index: int, uncut: bool) -> np.ndarray:
+        """The centreline points inside a body; one tells for all if the surface cuts none off."""
+        if uncut:
+            return points if self.inside(index, points[:1])[0] else points[:0]
+        return points[self.inside(index, points)]
 
     def _self_clearance(self, chain: _Chain) -> float:
         allowed = folding_pairs(chain.shape.centreline_mm, chain.shape.radius_mm)

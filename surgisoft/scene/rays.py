@@ -1,15 +1,23 @@
 """Rays against the scene: what a beam or a line of sight meets first.
 
-`RayHit` is the answer of both engines (the referee in `collision`, the batched caster here).
+`RayHit` is the answer of both engines: the referee in `collision`, the batched one in `batched`.
+Here are the parts of the latter that run on the CPU: Embree names the face, float64 arithmetic
+says where on it, and a compiled closed form meets the arms.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from surgisoft.scene.mesh import Body
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from surgisoft.scene.kernels import compiled
+from surgisoft.scene.mesh import Body, Mesh
 
 
 class Struck(IntEnum):
@@ -71,3 +79,143 @@ class RayHit:
     def blocked(self):
         """(...) bool: something that is not the organ stands first on the ray."""
         return self.struck > int(Struck.ORGAN)
+
+
+class EmbreeSurface:
+    """First hits of many rays on one mesh, in the mesh's own frame."""
+
+    def __init__(self, mesh: Mesh):
+        self._triangles = mesh.triangles_mm
+        self._middle = mesh.bounds_mm.mean(axis=0)
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, (mesh.vertices_mm - self._middle).astype(np.float32), mesh.faces)
+
+    def first_hit(self, origins_mm, directions, range_mm) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (N,) mm and faces (N,) of unit rays (N, 3) float64; the range and -1 to miss.
+
+        Embree works in float32; the distance is taken again in float64 in the plane of the face it
+        names. Rays that are not finite miss.
+        """
+        finite = np.isfinite(origins_mm).all(axis=1) & np.isfinite(directions).all(axis=1)
+        origins = np.where(finite[:, None], origins_mm - self._middle, 1e6)
+        aims = np.where(finite[:, None], directions, [0.0, 0.0, 1.0])
+        found = self._scene.run(
+            origins.astype(np.float32), aims.astype(np.float32), output=True, query="INTERSECT"
+        )
+        face = found["primID"].astype(np.int64)
+        struck = np.flatnonzero(face >= 0)
+        distance = np.full(len(origins), float(range_mm))
+        distance[struck] = _plane_hits(
+            origins_mm, directions, self._triangles, struck, face, found["tfar"]
+        )
+        beyond = ~(distance < range_mm)
+        face[beyond], distance[beyond] = -1, range_mm
+        return distance, face
+
+
+@compiled
+def _plane_hits(origins, directions, triangles, rays, faces, coarse):
+    """Distances (M,) along the rays named to the planes of their faces, mm.
+
+    A face seen edge on keeps Embree's own distance.
+    """
+    out = np.empty(len(rays))
+    for m in range(len(rays)):
+        n, f = rays[m], faces[rays[m]]
+        ax, ay, az = triangles[f, 0, 0], triangles[f, 0, 1], triangles[f, 0, 2]
+        ux, uy, uz = triangles[f, 1, 0] - ax, triangles[f, 1, 1] - ay, triangles[f, 1, 2] - az
+        vx, vy, vz = triangles[f, 2, 0] - ax, triangles[f, 2, 1] - ay, triangles[f, 2, 2] - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        ox, oy, oz = ax - origins[n, 0], ay - origins[n, 1], az - origins[n, 2]
+        along = directions[n, 0] * nx + directions[n, 1] * ny + directions[n, 2] * nz
+        if abs(along) > 1e-6 * math.sqrt(nx * nx + ny * ny + nz * nz):
+            out[m] = max(0.0, (ox * nx + oy * ny + oz * nz) / along)
+        else:
+            out[m] = coarse[n]
+    return out
+
+
+@compiled
+def _capsule_entry(origin, d, a, b, radius):
+    """Distance along the ray to capsule a b, inf for a miss; see `capsules.ray_capsule`."""
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    if length > 0.0:
+        ux, uy, uz = ux / length, uy / length, uz / length
+    wx, wy, wz = origin[0] - a[0], origin[1] - a[1], origin[2] - a[2]
+    height = wx * ux + wy * uy + wz * uz
+    along = d[0] * ux + d[1] * uy + d[2] * uz
+    fx, fy, fz = wx - height * ux, wy - height * uy, wz - height * uz
+    gx, gy, gz = d[0] - along * ux, d[1] - along * uy, d[2] - along * uz
+    held = min(max(height, 0.0), length)
+    px, py, pz = wx - held * ux, wy - held * uy, wz - held * uz
+    if px * px + py * py + pz * pz <= radius * radius:
+        return 0.0
+    best = math.inf
+    slope = gx * gx + gy * gy + gz * gz
+    if slope > 1e-24:
+        t = -(fx * gx + fy * gy + fz * gz) / slope
+        mx, my, mz = fx + t * gx, fy + t * gy, fz + t * gz
+        half = radius * radius - (mx * mx + my * my + mz * mz)
+        if half >= 0.0:
+            t -= math.sqrt(half / slope)
+            if t >= 0.0 and 0.0 <= height + t * along <= length:
+                best = t
+    for end in range(2):
+        cx, cy, cz = wx - end * length * ux, wy - end * length * uy, wz - end * length * uz
+        t = -(cx * d[0] + cy * d[1] + cz * d[2])
+        mx, my, mz = cx + t * d[0], cy + t * d[1], cz + t * d[2]
+        half = radius * radius - (mx * mx + my * my + mz * mz)
+        if half >= 0.0:
+            t -= math.sqrt(half)
+            if 0.0 <= t < best:
+                best = t
+    return best
+
+
+@compiled
+def rays_to_chains(origins, directions, lines, radius, gap, distance, segment):
+    """First hits of rays (B, R, 3) on arms (B, K, 3), mm, into distance, segment (B, R).
+
+    Only hits nearer than what `distance` holds count; segments with less than `gap` mm of arm
+    between them and the tip are left out (a negative gap keeps all).
+    """
+    segments = lines.shape[1] - 1
+    from_tip = np.empty(segments)
+    for n in range(len(lines)):
+        arc = 0.0
+        for k in range(segments - 1, -1, -1):
+            from_tip[k] = arc
+            dx = np.float64(lines[n, k + 1, 0]) - lines[n, k, 0]
+            dy = np.float64(lines[n, k + 1, 1]) - lines[n, k, 1]
+            dz = np.float64(lines[n, k + 1, 2]) - lines[n, k, 2]
+            arc += math.sqrt(dx * dx + dy * dy + dz * dz)
+        for r in range(origins.shape[1]):
+            o = (origins[n, r, 0], origins[n, r, 1], origins[n, r, 2])
+            d = (directions[n, r, 0], directions[n, r, 1], directions[n, r, 2])
+            for k in range(segments):
+                if from_tip[k] < gap:
+                    break
+                a = (
+                    np.float64(lines[n, k, 0]),
+                    np.float64(lines[n, k, 1]),
+                    np.float64(lines[n, k, 2]),
+                )
+                b = (
+                    np.float64(lines[n, k + 1, 0]),
+                    np.float64(lines[n, k + 1, 1]),
+                    np.float64(lines[n, k + 1, 2]),
+                )
+                half = 0.5 * (from_tip[k - 1] - from_tip[k] if k > 0 else arc - from_tip[0])
+                mx, my, mz = (
+                    0.5 * (a[0] + b[0]) - o[0],
+                    0.5 * (a[1] + b[1]) - o[1],
+                    0.5 * (a[2] + b[2]) - o[2],
+                )
+                t = max(0.0, mx * d[0] + my * d[1] + mz * d[2])
+                x, y, z = mx - t * d[0], my - t * d[1], mz - t * d[2]
+                reach = radius + half + 1e-9
+                if x * x + y * y + z * z <= reach * reach:
+                    hit = _capsule_entry(o, d, a, b, radius)
+                    if hit < distance[n, r]:
+                        distance[n, r], segment[n, r] = hit, k

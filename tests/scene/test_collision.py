@@ -90,7 +90,7 @@ def test_every_overlapping_pair_is_found():
     bodies = [Body(f"b{i}", "keep-out", box((8, 8, 8)), pose) for i, pose in enumerate(poses)]
     arms = {
         "a": ArmShape(arc_points(110.0, 0.0, 30), 3.0),
-        "b": ArmShape(arc_points(110.0, 0.0, 30) + [1, 0, 0], 3.0),
+        "b": ArmShape(np.add(arc_points(110.0, 0.0, 30), [1, 0, 0]), 3.0),
     }
     found = {(c.arm, c.other) for c in Referee(bodies).collisions(arms)}
     assert found == {(arm, f"b{i}") for arm in "ab" for i in range(6)} | {("a", "b")}
@@ -124,8 +124,8 @@ def test_an_arm_meets_itself_only_where_it_folds():
 
 
 def test_self_clearance_of_a_hairpin_is_the_gap_between_its_legs():
-    legs = np.concatenate((arc_points(50, 0, 26), arc_points(50, 0, 26)[::-1] + [14, 0, 0]))
-    arm = ArmShape(legs, 4.0)
+    leg = arc_points(50, 0, 26)
+    arm = ArmShape(np.concatenate((leg, np.add(leg[::-1], [14, 0, 0]))), 4.0)
     assert Referee([]).clearance({"a": arm}).self_mm["a"] == pytest.approx(6.0, abs=1e-9)
 
 

@@ -1,0 +1,260 @@
+"""Geometry of many environments at once: what training asks, in the referee's own terms.
+
+`BatchedScene` answers what `collision.Referee` answers, for batches of arms: on the CPU with
+Embree and compiled queries, on an accelerator with torch. Both agree with the referee to the
+tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.scene import frames
+from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.capsules import HORIZON_MM, chain_normal, self_contact_gap_mm
+from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
+from surgisoft.scene.field import MOST_NODES, load_field
+from surgisoft.scene.mesh import Body
+from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
+from surgisoft.scene.torch_distance import (
+    TorchSurface,
+    chains_apart_torch,
+    chains_folded_torch,
+    rays_to_chains_torch,
+)
+
+EXACT_WITHIN_MM = 5.0
+"""Nearer than this, clearances are exact; farther, off by the field's interpolation (mm)."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchClearance:
+    """Signed clearances (mm) of a batch, as `collision.Clearance` defines them, saturating."""
+
+    bodies_mm: torch.Tensor
+    """(B, A, N) arm by body, in the order of the scene's arms and bodies."""
+    arms_mm: torch.Tensor
+    """(B, A (A - 1) / 2) each pair of arms once, in the order of itertools.combinations."""
+    self_mm: torch.Tensor
+    """(B, A) each arm against itself."""
+
+    @property
+    def least_mm(self) -> torch.Tensor:
+        """(B,) the smallest against bodies and other arms, mm."""
+        return torch.cat((self.bodies_mm.flatten(1), self.arms_mm), 1).amin(1)
+
+    @property
+    def collides(self) -> torch.Tensor:
+        """(B,) bool: any arm overlaps a body, the other arm or itself."""
+        parts = (self.bodies_mm.flatten(1), self.arms_mm, self.self_mm)
+        return (torch.cat(parts, 1) < 0.0).any(1)
+
+
+class BatchedScene:
+    """The bodies of a scene and the arms' radii; built once, asked every step.
+
+    `arms` maps an arm's name to its centrelines (B, K, 3), mm, world frame; any dtype and K. A body
+    moves with `poses`, a mapping from its name to (B, 4, 4) body to world; the others stand where
+    the scene puts them. An environment whose arm is not finite gets nan clearances and misses; the
+    others do not notice.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        radii_mm: Mapping[str, float],
+        device: str | torch.device = "cpu",
+        horizon_mm: float = HORIZON_MM,
+        exact_within_mm: float = EXACT_WITHIN_MM,
+        most_nodes: int = MOST_NODES,
+        cache: Path | None = None,
+    ):
+        for name, radius in radii_mm.items():
+            if not (math.isfinite(radius) and radius > 0.0):
+                raise InputError(f"radius of arm '{name}' is {radius} mm: expected more than 0")
+        self.bodies, self.radii_mm = tuple(bodies), dict(radii_mm)
+        self.device = torch.device(device)
+        self.horizon_mm, self.exact_within_mm = float(horizon_mm), float(exact_within_mm)
+        thickest = max(self.radii_mm.values(), default=1.0)
+        kind = CompiledSurface if self.device.type == "cpu" else TorchSurface
+        self._surfaces = []
+        for body in self.bodies:
+            tree = build_tree(body.mesh)
+            margin = 5.0 * math.ceil((self.horizon_mm + thickest) / 5.0)
+            band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
+            field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
+            self._surfaces.append(kind(tree, field, self.device))
+
+    def radius_mm(self, arm: str) -> float:
+        """Radius of an arm by name (mm)."""
+        if arm not in self.radii_mm:
+            raise unknown_name("arm", arm, self.radii_mm)
+        return self.radii_mm[arm]
+
+    def clearance(self, arms, poses=None) -> BatchClearance:
+        """Signed clearances of every pair; arms name -> (B, K, 3) mm."""
+        names = list(arms)
+        lines = [_held(arms[name]) for name in names]
+        radii = [self.radius_mm(name) for name in names]
+        dtype, count = lines[0].dtype, len(lines[0])
+        bodies = torch.empty((count, len(names), len(self.bodies)), dtype=dtype, device=self.device)
+        for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            turn, shift = self._inward(body, poses)
+            for a, (line, radius) in enumerate(zip(lines, radii, strict=True)):
+                bodies[:, a, n] = surface.clearance(
+                    line, turn, shift, radius, self.exact_within_mm, self.horizon_mm
+                )
+        pairs = [
+            self._apart(lines[i], lines[j], radii[i] + radii[j])
+            for i, j in combinations(range(len(names)), 2)
+        ]
+        own = [self._folded(line, radius) for line, radius in zip(lines, radii, strict=True)]
+        nothing = torch.empty((count, 0), dtype=dtype, device=self.device)
+        return BatchClearance(
+            bodies, torch.stack(pairs, 1) if pairs else nothing, torch.stack(own, 1)
+        )
+
+    def cast(
+        self, origins_mm, directions, range_mm: float, arms=None, own: str | None = None, poses=None
+    ) -> RayHit:
+        """First hits of rays (B, ..., 3), world frame; arms name -> (B, K, 3) stand in the way.
+
+        `own` names the arm that carries the beam: its segments near the tip do not block it.
+        """
+        shape = origins_mm.shape[:-1]
+        count = shape[0]
+        origins = _held(origins_mm).double().reshape(count, -1, 3)
+        aims = frames.normalise(_held(directions).double()).reshape(count, -1, 3)
+        best = torch.full(origins.shape[:-1], float(range_mm), dtype=torch.float64)
+        best = best.to(self.device)
+        struck = torch.zeros_like(best, dtype=torch.int8)
+        which = torch.full_like(best, -1, dtype=torch.int32)
+        face = torch.full_like(best, -1, dtype=torch.int64)
+        normal = -aims
+        for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            turn, shift = self._inward(body, poses)
+            o = origins @ turn.mT + shift[:, None]
+            d = aims @ turn.mT
+            t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
+            t, f = t.view_as(best), f.view_as(best)
+            nearer = (f >= 0) & (t < best)
+            best = torch.where(nearer, t, best)
+            which = torch.where(nearer, n, which)
+            face = torch.where(nearer, f, face)
+            struck = torch.where(nearer, int(struck_of(body)), struck)
+            outward = surface.normals[f.clamp(min=0)] @ turn
+            normal = torch.where(nearer[..., None], outward, normal)
+        for name, line in (arms or {}).items():
+            radius, line = self.radius_mm(name), _held(line)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            t, segment = self._chain_hits(origins, aims, line, radius, gap, best)
+            nearer = t < best
+            point = origins + t[..., None] * aims
+            outward = chain_normal(point, line.double()[:, None], segment)
+            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
+            best = torch.where(nearer, t, best)
+            which, face = torch.where(nearer, -1, which), torch.where(nearer, -1, face)
+            struck = torch.where(nearer, kind, struck)
+            normal = torch.where(nearer[..., None], outward, normal)
+        point = origins + best[..., None] * aims
+        sine, cosine = frames.norm(frames.cross(normal, aims)), frames.dot(normal, aims).abs()
+        dtype = origins_mm.dtype
+        return RayHit(
+            struck=struck.reshape(shape),
+            body=which.reshape(shape),
+            face=face.int().reshape(shape),
+            distance_mm=best.to(dtype).reshape(shape),
+            point_mm=point.to(dtype).reshape(*shape, 3),
+            normal=normal.to(dtype).reshape(*shape, 3),
+            incidence_rad=torch.atan2(sine, cosine).to(dtype).reshape(shape),
+        )
+
+    def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
+        """World to body: rotations (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
+        pose = (poses or {}).get(body.name)
+        pose = torch.tensor(np.array(body.pose))[None] if pose is None else pose.detach()
+        inward = frames.invert(pose.to(self.device, torch.float64))
+        return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
+
+    def _apart(self, first, second, radii: float) -> torch.Tensor:
+        if self.device.type != "cpu":
+            return chains_apart_torch(first, second, radii, self.horizon_mm)
+        out = torch.empty(len(first), dtype=first.dtype)
+        chains_apart(first.numpy(), second.numpy(), radii, self.horizon_mm, out.numpy())
+        return out
+
+    def _folded(self, line, radius: float) -> torch.Tensor:
+        gap = self_contact_gap_mm(radius)
+        if self.device.type != "cpu":
+            return chains_folded_torch(line, radius, gap, self.horizon_mm)
+        out = torch.empty(len(line), dtype=line.dtype)
+        chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
+        return out
+
+    def _chain_hits(self, origins, aims, line, radius, gap, best):
+        if self.device.type != "cpu":
+            return rays_to_chains_torch(origins, aims, line, radius, gap, best)
+        distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
+        rays_to_chains(
+            origins.numpy(),
+            aims.numpy(),
+            line.numpy(),
+            radius,
+            gap,
+            distance.numpy(),
+            segment.numpy(),
+        )
+        return distance, segment
+
+
+class CompiledSurface:
+    """One body's surface on the CPU: compiled clearance, Embree's rays."""
+
+    def __init__(self, tree, field, device):
+        self._tree, self._field = tree, field
+        self._closed = tree.mesh.is_watertight
+        self._embree = EmbreeSurface(tree.mesh)
+        self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
+
+    def clearance(self, lines, turn, shift, radius, within, horizon) -> torch.Tensor:
+        """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface."""
+        out = torch.empty(len(lines), dtype=lines.dtype)
+        field = self._field
+        chains_to_surface(
+            lines.numpy(),
+            turn.numpy(),
+            shift.numpy(),
+            radius,
+            within,
+            horizon,
+            self._closed,
+            field.values_mm,
+            field.origin_mm,
+            field.cell_mm,
+            field.band_mm,
+            field.slack_mm,
+            self._tree.arrays,
+            out.numpy(),
+        )
+        return out
+
+    def first_hit(self, origins, directions, range_mm) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
+        distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
+        return torch.from_numpy(distance), torch.from_numpy(face)
+
+
+def _held(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensor without gradient, in one piece of memory, single or double precision."""
+    tensor = tensor.detach()
+    if tensor.dtype not in (torch.float32, torch.float64):
+        tensor = tensor.float()
+    return tensor.contiguous()

@@ -22,7 +22,7 @@ UNIT_TOLERANCE = 0.01
 """How far the length of gravity's direction may be from 1 before it is taken for an error."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ArmInfo:
     """The arm's size, where the lab stated it."""
 

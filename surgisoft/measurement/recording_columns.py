@@ -92,11 +92,11 @@ def _got(names: list[str]) -> str:
 
 
 def _hint(name: str) -> str:
-    first = name.strip()[:1].lower()
-    if first == "k":
+    numbered = re.match(r"\s*([pck])[_ ]?[0-9]", name.lower())
+    if numbered and numbered[1] == "k":
         return "expected a key point such as 'k0_x_mm'"
-    if first in "pc":
-        return f"expected an actuation with its unit such as '{first}1_kPa'"
+    if numbered:
+        return f"expected an actuation with its unit such as '{numbered[1]}1_kPa'"
     return f"expected one of {', '.join(_CONTEXT)}"
 
 

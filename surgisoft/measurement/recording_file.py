@@ -124,9 +124,7 @@ def _assemble(
     t_s = column(layout.time)
     run = _run_ids(path, column(layout.run), rows)
     _check_order(path, t_s, run, rows)
-    if np.isnan(points).all():
-        raise InputError(f"{path}: every key point is missing in every row, expected positions")
-    return Recording(
+    recording = Recording(
         name=path.stem,
         t_s=t_s,
         measured=columns(layout.measured),
@@ -139,6 +137,9 @@ def _assemble(
         source=path,
         **read_sidecar(sidecar_of(path)),
     )
+    if np.isnan(recording.key_points_mm).all():
+        raise InputError(f"{path}: every key point is missing in every row, expected positions")
+    return recording
 
 
 def _run_ids(path: Path, values: np.ndarray | None, rows: np.ndarray) -> np.ndarray:

@@ -45,7 +45,8 @@ class Oddity:
 def find_oddities(recording: Recording) -> list[Oddity]:
     """The findings, in the order of their samples."""
     jumps = _settled_jumps if recording.kind == "settled" else _continuous_jumps
-    found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
+    with np.errstate(over="ignore", invalid="ignore"):  # finite numbers of any size are read
+        found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
     return sorted(found, key=lambda oddity: oddity.sample)
 
 

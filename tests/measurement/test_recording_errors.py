@@ -1,0 +1,198 @@
+"""Every bad recording gets one line: the file, the place, what came, what was expected."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.recording import load_recording, load_recordings
+
+HEAD = "t_s,p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm"
+ROW = "0,1,2,3,4"
+
+HEADERS = [
+    ("p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm", "no column 't_s', expected the time in seconds"),
+    ("t_s,k0_x_mm,k0_y_mm,k0_z_mm", "no measured actuation, expected 'p1_kPa'"),
+    ("t_s,c1_kPa,k0_x_mm,k0_y_mm,k0_z_mm", "no measured actuation, expected 'p1_kPa'"),
+    ("t_s,p1_kPa", "no key point, expected 'k0_x_mm'"),
+    (f"{HEAD},p1_kPa", "column 6: 'p1_kPa' is repeated, it is column 2 already"),
+    ("t_s,p1_kPa,k0_x_mm,k0_y_mm", "key point k0 has only x and y, expected 'k0_z_mm' too"),
+    ("t_s,p1_kPa,k0_y_mm", "key point k0 has only y, expected 'k0_x_mm' too"),
+    (f"{HEAD},p2_psi", "column 'p2_psi': unit 'psi', expected 'kPa' as in 'p1_kPa'"),
+    (f"{HEAD},p1_psi", "column 'p1_psi': repeats 'p1_kPa' in another unit"),
+    (f"{HEAD},c1_psi", "column 'c1_psi': unit 'psi', expected 'kPa'"),
+    (f"{HEAD},p2_kPa,p4_kpa,p3_kPa", "column 'p4_kpa': unit 'kpa', expected 'kPa'"),
+    (f"{HEAD},k1_x_m,k1_y_m,k1_z_m", "column 'k1_x_m': unit 'm', expected 'mm'"),
+    (f"{HEAD},k0_x_m", "column 'k0_x_m': repeats 'k0_x_mm' in another unit"),
+    ("t_s,p1_kPa,k0_x_ft,k0_y_ft,k0_z_ft", "column 'k0_x_ft': unit 'ft', expected one of mm, cm"),
+    (f"{HEAD},p3_kPa", "'p3_kPa' without 'p2_kPa', expected numbers from 1 without gaps"),
+    ("t_s,p0_kPa,k0_x_mm,k0_y_mm,k0_z_mm", "column 'p0_kPa': not a column's name"),
+    (f"{HEAD},p2_kPa,c2_kPa", "'c2_kPa' without 'c1_kPa'"),
+    (f"{HEAD},p2_kPa,c1_kPa", "1 commanded and 2 measured channels"),
+    (f"{HEAD},k2_x_mm,k2_y_mm,k2_z_mm", "key point k2 without k1, expected numbers from 0"),
+    (f"{HEAD},P2_kPa", "column 'P2_kPa': not a column's name; expected an actuation"),
+    (f"{HEAD},p2", "column 'p2': not a column's name; expected an actuation with its unit"),
+    (f"{HEAD},k1_x", "column 'k1_x': not a column's name; expected a key point such as 'k0_x_mm'"),
+    (f"{HEAD},temp", "column 'temp': not a column's name; expected one of t_s, run, temp_C"),
+    (f"{HEAD},payload_kg", "column 'payload_kg': not a column's name; expected one of t_s"),
+    ("time,p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm", "column 'time': not a column's name"),
+    ("t_s;p1_kPa;k0_x_mm;k0_y_mm;k0_z_mm", "separated by semicolons, expected commas"),
+    ("t_s\tp1_kPa\tk0_x_mm\tk0_y_mm\tk0_z_mm", "separated by tabs, expected commas"),
+    ("", "is blank, expected the names of the columns"),
+]
+
+ROWS = [
+    ("0,1,2,3,4\n2,1,2,3,4\n\n1,1,2,3,4\n", "line 5, column 't_s': 1.0 s after 2.0 s, expected"),
+    ("0,1,2,3,4\n0,1,2,3,4\n", "line 3, column 't_s': 0.0 s after 0.0 s"),
+    ("0,1,2,3,4\n,1,2,3,4\n", "line 3, column 't_s': got a missing value, expected a finite"),
+    ("0,1,2,3,4\n1,inf,2,3,4\n", "line 3, column 'p1_kPa': got inf, expected a finite number"),
+    ("0,1,2,3,4\n1,1,2,-Inf,4\n", "line 3, column 'k0_y_mm': got -inf, expected a finite number"),
+    ("0,1,2,3,4\n1,1,1e999,3,4\n", "line 3, column 'k0_x_mm': got inf"),
+    ("0,1,2,3,4\n1,1,2,lost,4\n", "line 3, column 'k0_y_mm': got 'lost', expected a number"),
+    ("0,1,2,3,4\n1,1_0,2,3,4\n", "line 3, column 'p1_kPa': got '1_0', expected a number"),
+    ("0,1,2,3,4\n1,0x10,2,3,4\n", "line 3, column 'p1_kPa': got '0x10', expected a number"),
+    ("0,1,2,3,4\n1,1,2,3\n", "line 3: 4 cells, expected 5 as in line 1"),
+    ('0,1,2,3,4\n1,"1,5",2,3,4\n', "line 3, column 'p1_kPa': got '1,5', expected a number"),
+    ("# a comment\n0,1,2,3,4\n", "line 2: 1 cells, expected 5 as in line 1"),
+    ("0,,2,3,4\n1,,2,3,4\n", "line 2, column 'p1_kPa': the actuation is missing in every row"),
+    ("0,1,,,\n1,1,,3,\n", "every key point is missing in every row"),
+    ("", "the table is empty, expected at least one row of numbers"),
+    ("\n\n", "the table is empty, expected at least one row of numbers"),
+]
+
+RUNS = [
+    ("0,1,2,3,4,0\n1,1,2,3,4,0.5\n", "line 3, column 'run': got 0.5, expected an integer"),
+    ("0,1,2,3,4,0\n1,1,2,3,4,\n", "line 3, column 'run': got a missing value"),
+    ("0,1,2,3,4,0\n1,1,2,3,4,1\n2,1,2,3,4,0\n", "line 4, column 'run': run 0 comes back after"),
+    ("0,1,2,3,4,0\n0,1,2,3,4,1\n0,1,2,3,4,1\n", "line 4, column 't_s': 0.0 s after 0.0 s"),
+]
+
+SIDECARS = [
+    ("[arm]\nlenght_mm = 70", "[arm]: unknown field 'lenght_mm', expected one of length_mm"),
+    ("[robot]\nlength_mm = 70", "unknown section 'robot', expected one of arm, gravity, recording"),
+    ("arm = 70", "arm is 70, expected a section [arm]"),
+    ("[arm]\nlength_mm = -70", "[arm] length_mm: got -70, expected a positive number"),
+    ("[arm]\nlength_mm = '70'", "[arm] length_mm: got '70', expected a positive number"),
+    ("[gravity]\ndirection = [0, 0, 9.81]", "[gravity] direction: length 9.81, expected a unit"),
+    ("[gravity]\ndirection = [0, 1]", "[gravity] direction: got [0, 1], expected three numbers"),
+    ("[recording]\nkind = 'static'", "kind: got 'static', expected one of continuous, settled"),
+    ("[recording]\nnoise_mm = nan", "noise_mm: got nan, expected a number >= 0"),
+    ("[recording]\nnote = 3", "note: got 3, expected a text"),
+    ("[recording\n", "not valid TOML"),
+]
+
+
+def error_of(path):
+    with pytest.raises(InputError) as error:
+        load_recordings([path], on_warning=lambda _: None)
+    message = str(error.value)
+    assert message.startswith(str(path.with_suffix("")))
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(("header", "expected"), HEADERS)
+def test_bad_header(tmp_path, header, expected):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{header}\n{ROW}\n")
+    message = error_of(path)
+    assert message.startswith(f"{path}, line 1")
+    assert expected in message
+
+
+@pytest.mark.parametrize(("header", "expected"), HEADERS[:20])
+def test_bad_names_in_parquet(tmp_path, header, expected):
+    path = tmp_path / "bad.parquet"
+    names = header.split(",")
+    pq.write_table(pa.table([pa.array([1.0])] * len(names), names=names), path)
+    message = error_of(path)
+    assert expected in message
+
+
+@pytest.mark.parametrize(("rows", "expected"), ROWS)
+def test_bad_row(tmp_path, rows, expected):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{HEAD}\n{rows}")
+    assert expected in error_of(path)
+
+
+@pytest.mark.parametrize(("rows", "expected"), RUNS)
+def test_bad_runs(tmp_path, rows, expected):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{HEAD},run\n{rows}")
+    assert expected in error_of(path)
+
+
+@pytest.mark.parametrize(("sidecar", "expected"), SIDECARS)
+def test_bad_sidecar(tmp_path, sidecar, expected):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{HEAD}\n{ROW}\n")
+    path.with_suffix(".toml").write_text(sidecar)
+    message = error_of(path)
+    assert message.startswith(str(path.with_suffix(".toml")))
+    assert expected in message
+
+
+def test_line_is_found_far_down_and_after_blank_lines(tmp_path):
+    path = tmp_path / "bad.csv"
+    lines = [HEAD, *(f"{i},1,2,3,4" for i in range(20_000))]
+    lines[15_000] = ""
+    lines[18_765] = "18764,1,2,x,4"
+    path.write_text("\n".join(lines))
+    assert "bad.csv, line 18766, column 'k0_y_mm': got 'x'" in error_of(path)
+    lines[18_765] = "17000,1,2,3,4"
+    path.write_text("\n".join(lines))
+    assert "line 18766, column 't_s': 17000.0 s after 18763.0 s" in error_of(path)
+
+
+def test_parquet_rows_are_counted_from_one(tmp_path):
+    path = tmp_path / "bad.parquet"
+    columns = {name: np.arange(5.0) for name in HEAD.split(",")}
+    columns["t_s"][3] = 1.5
+    pq.write_table(pa.table(columns), path)
+    assert "bad.parquet, row 4, column 't_s': 1.5 s after 2.0 s" in error_of(path)
+
+
+def test_parquet_column_of_texts(tmp_path):
+    path = tmp_path / "bad.parquet"
+    columns = {name: pa.array([1.0]) for name in HEAD.split(",")}
+    columns["k0_y_mm"] = pa.array(["far"])
+    pq.write_table(pa.table(columns), path)
+    assert "bad.parquet, column 'k0_y_mm': holds string, expected numbers" in error_of(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("bad.csv", b"", "the file is empty"),
+        ("bad.csv", b"\x89PNG\r\n\x1a\n\0\0\0", "not text in UTF-8"),
+        ("bad.csv", b"\xff\xfet\0_\0s\0", "not a text file"),
+        ("bad.csv", b"\xe9t\xe9,p1\n", "not text in UTF-8"),
+        ("bad.parquet", b"", "not a readable Parquet file"),
+        ("bad.parquet", b"t_s,p1_kPa\n0,1\n", "not a readable Parquet file"),
+        ("bad.parquet", b"PAR1" + b"x" * 100 + b"PAR1", "not a readable Parquet file"),
+        ("bad.txt", b"t_s,p1_kPa\n", "suffix '.txt', expected .csv or .parquet"),
+        ("bad.CSV", b"t_s,p1_kPa\n", "suffix '.CSV', expected .csv or .parquet"),
+        ("bad", b"t_s,p1_kPa\n", "suffix '', expected .csv or .parquet"),
+    ],
+)
+def test_what_is_no_table(tmp_path, name, content, expected):
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert expected in error_of(path)
+
+
+def test_binary_rubbish_below_a_good_header(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_bytes(f"{HEAD}\n{ROW}\n".encode() + bytes(range(128, 256)) + b",\x00,,,\n")
+    assert "bad.csv, line 3" in error_of(path)
+
+
+def test_what_is_no_file(tmp_path):
+    assert "no such file" in error_of(tmp_path / "none.csv")
+    assert "no .csv or .parquet in this folder" in error_of(tmp_path)
+    with pytest.raises(InputError, match="is a folder, expected a file"):
+        load_recording(tmp_path)
+    with pytest.raises(InputError, match="no recording given"):
+        load_recordings([])

@@ -1,8 +1,8 @@
 """Build the phantom's meshes from an implicit liver: `python scenes/phantom_liver/build.py [DIR]`.
 
-Everything is made of formulas in this file; the same file gives the same meshes. Frame of the
-phantom, mm: x from the right lobe (-) to the left lobe (+), y from the lower margin (-) to the
-diaphragm (+), z up from the tray; the liver lies on its visceral (under) side.
+Everything is made of formulas in this file; the same file gives the same meshes. The liver is drawn
+in its anatomical frame (mm; x from the right lobe to the left, y upwards to the diaphragm, z to
+the front) and then laid on a tray on its under side (world frame, mm, z up).
 """
 
 import sys
@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.scene.isosurface import settle, surface_nets
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.meshio import write_ply
 
-SPACING_MM = 2.3
 VISCERAL = np.array([0.16, -0.66, -0.74]) / np.linalg.norm([0.16, -0.66, -0.74])
 VISCERAL_POINT = np.array([0.0, -8.0, -6.0])
-BOUNDS_MM = np.array([[-112.0, -112.0, -80.0], [122.0, 92.0, 90.0]])
 
 
 def ellipsoid(points, centre, radii, turn_z_deg=0.0, turn_y_deg=0.0):
@@ -112,22 +112,41 @@ def gallbladder(points):
     )
 
 
-def tray(points):
-    """A flat plate with rounded edges under the organs (top at z = 0)."""
-    half = np.array([115.0, 95.0, 3.0])
-    q = np.abs(points - np.array([0.0, 0.0, -4.0])) - half
-    outside = np.linalg.norm(np.maximum(q, 0.0), axis=-1)
-    return outside + np.minimum(q.max(axis=-1), 0.0) - 1.0
+def tray():
+    """A flat plate with its top at z = 0 (mesh, mm)."""
+    corners = np.array([[x, y, z] for x in (-115, 123) for y in (-99, 99) for z in (-8, 0)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Mesh(corners, [face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
 
 
-def mesh_of(field, spacing_mm=SPACING_MM, bounds_mm=BOUNDS_MM, rounds=40):
+def mesh_of(field, spacing_mm, bounds_mm, rounds=40):
     """Vertices (V, 3) mm and faces (F, 3) of the field's zero level, evened out."""
-    axes = [np.arange(low, high + spacing_mm, spacing_mm) for low, high in bounds_mm.T]
+    low, high = np.asarray(bounds_mm, dtype=float)
+    axes = [np.arange(a, b + spacing_mm, spacing_mm) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = np.concatenate([field(slab[None]) for slab in grid])
-    vertices, faces = surface_nets(values, bounds_mm[0], spacing_mm)
+    vertices, faces = surface_nets(values, low, spacing_mm)
     return settle(vertices, faces, field, rounds, 0.05 * spacing_mm), faces
 
 
+def bodies(fineness=1.0):
+    """The phantom's meshes by name, standing on the tray (world frame, mm); finer below 1."""
+    raw = {
+        "liver": mesh_of(liver, 2.6 * fineness, [[-105, -85, -65], [110, 80, 70]]),
+        "gallbladder": mesh_of(gallbladder, 2.2 * fineness, [[-60, -100, -30], [20, 10, 60]]),
+    }
+    standing = {name: (resting(vertices), faces) for name, (vertices, faces) in raw.items()}
+    lowest = min(vertices[:, 2].min() for vertices, _ in standing.values())
+    lift = np.array([0.0, 0.0, -lowest])
+    meshes = {name: Mesh(vertices + lift, faces) for name, (vertices, faces) in standing.items()}
+    return meshes | {"tray": tray()}
+
+
+def main(folder):
+    """Write every mesh into the folder."""
+    for name, mesh in bodies().items():
+        write_ply(mesh, folder / f"{name}.ply")
+
+
 if __name__ == "__main__":
-    pass
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)

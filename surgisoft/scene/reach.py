@@ -1,0 +1,192 @@
+"""What an arm can reach, as a table of sampled shapes, and how it aims at points.
+
+Geometry only: the table comes from any arm model, sampled over a grid of its commands.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+
+ROUNDS = 12
+"""Newton steps when aiming; a smooth arm needs three or four."""
+AIMED_MM = 0.02
+"""The beam counts as on its target when it passes this near (mm)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmReach:
+    """Shapes of one arm over a regular grid of commands, base frame (z along the arm at rest)."""
+
+    axes: tuple[np.ndarray, ...]
+    """P rising arrays: the commands along each axis of the grid, any unit."""
+    centreline_mm: np.ndarray
+    """(N, K, 3) mm, base to tip; N = product of the axes' lengths, last axis running fastest."""
+    tip_direction: np.ndarray
+    """(N, 3) unit vectors in which the tool looks."""
+    rest: np.ndarray
+    """(P,) commands at rest."""
+    radius_mm: float
+    """Radius of the body (mm)."""
+
+    def __post_init__(self):
+        axes = tuple(np.asarray(axis, dtype=np.float64) for axis in self.axes)
+        count = int(np.prod([len(axis) for axis in axes]))
+        if any(len(axis) < 2 or np.any(np.diff(axis) <= 0) for axis in axes) or not axes:
+            raise InputError("reach table: each axis needs at least 2 rising commands")
+        line = np.asarray(self.centreline_mm, dtype=np.float64)
+        tip = np.asarray(self.tip_direction, dtype=np.float64)
+        if line.ndim != 3 or line.shape[0] != count or line.shape[2] != 3 or line.shape[1] < 2:
+            raise InputError(
+                f"reach table: centrelines have shape {line.shape}; expected ({count}, K, 3)"
+            )
+        if tip.shape != (count, 3):
+            raise InputError(
+                f"reach table: tip directions have shape {tip.shape}; expected ({count}, 3)"
+            )
+        if not (np.isfinite(line).all() and np.isfinite(tip).all()):
+            raise InputError("reach table: holds NaN or infinite shapes; expected finite ones")
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "centreline_mm", line)
+        object.__setattr__(self, "tip_direction", frames.normalise(tip))
+        object.__setattr__(self, "rest", np.asarray(self.rest, dtype=np.float64))
+
+    @cached_property
+    def commands(self) -> np.ndarray:
+        """(N, P): the command of each sampled shape."""
+        return np.stack([g.reshape(-1) for g in np.meshgrid(*self.axes, indexing="ij")], axis=1)
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """(2, P): lowest and highest command."""
+        return np.array([[axis[0] for axis in self.axes], [axis[-1] for axis in self.axes]])
+
+    @cached_property
+    def span(self) -> np.ndarray:
+        """(P,): range of each command."""
+        return self.bounds[1] - self.bounds[0]
+
+    @cached_property
+    def _tip_table(self) -> np.ndarray:
+        """(N, 6): tip position (mm) and direction of each sampled shape."""
+        return np.concatenate((self.centreline_mm[:, -1], self.tip_direction), axis=1)
+
+    @cached_property
+    def _line_table(self) -> np.ndarray:
+        """(N, 3 K + 3): the centreline (mm) and tip direction of each sampled shape."""
+        flat = self.centreline_mm.reshape(len(self.centreline_mm), -1)
+        return np.concatenate((flat, self.tip_direction), axis=1)
+
+    def _blend(self, table: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Multilinear interpolation of table rows at commands (M, P), held within the grid."""
+        low, part = [], []
+        for axis, value in zip(self.axes, commands.T, strict=True):
+            cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
+            low.append(cell)
+            part.append(np.clip((value - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0))
+        shape = tuple(len(axis) for axis in self.axes)
+        result = np.zeros((len(commands), table.shape[1]))
+        for corner in product((0, 1), repeat=len(self.axes)):
+            weight = np.prod([p if c else 1.0 - p for p, c in zip(part, corner, strict=True)], 0)
+            row = np.ravel_multi_index([i + c for i, c in zip(low, corner, strict=True)], shape)
+            result += weight[:, None] * table[row]
+        return result
+
+    def tips(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tip positions (M, 3) mm and directions (M, 3), base frame, at commands (M, P)."""
+        row = self._blend(self._tip_table, commands)
+        return row[:, :3], frames.normalise(row[:, 3:])
+
+    def shapes(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centrelines (M, K, 3) mm and tip directions (M, 3), base frame, at commands (M, P)."""
+        row = self._blend(self._line_table, commands)
+        return row[:, :-3].reshape(len(commands), -1, 3), frames.normalise(row[:, -3:])
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Commands that bring the tool's axis onto points."""
+
+    commands: np.ndarray
+    """(M, P) commands within the arm's range."""
+    miss_mm: np.ndarray
+    """(M,) distance from the target to the tool's axis (mm)."""
+    ahead_mm: np.ndarray
+    """(M,) distance from the tip to the target along the axis (mm); negative is behind."""
+
+    @property
+    def on_target(self) -> np.ndarray:
+        """(M,) bool."""
+        return (self.miss_mm <= AIMED_MM) & (self.ahead_mm > 0.0)
+
+
+def _miss(reach: ArmReach, commands: np.ndarray, targets_mm: np.ndarray):
+    """Vector (M, 3) from the tool's axis to the targets, and how far ahead (M,)."""
+    tip, direction = reach.tips(commands)
+    away = targets_mm - tip
+    ahead = frames.dot(away, direction)
+    return away - ahead[:, None] * direction, ahead
+
+
+def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
+    """Bend the arm until its axis runs through targets (M, 3) mm, base frame.
+
+    Damped Gauss-Newton from commands `start` (M, P), smallest change of commands first (Nocedal &
+    Wright, 2006, section 10.3), held within the arm's range. M arms are solved at once.
+    """
+    commands = np.clip(start, *reach.bounds)
+    count = commands.shape[1]
+    step = 1e-3 * reach.span
+    miss, ahead = _miss(reach, commands, targets_mm)
+    for _ in range(ROUNDS):
+        todo = np.flatnonzero(np.linalg.norm(miss, axis=1) > 0.1 * AIMED_MM)
+        if not len(todo):
+            break
+        here = commands[todo]
+        jacobian = np.empty((len(todo), 3, count))
+        for p in range(count):
+            inward = np.where(here[:, p] + step[p] > reach.bounds[1, p], -step[p], step[p])
+            moved = here.copy()
+            moved[:, p] += inward
+            shifted, _ = _miss(reach, moved, targets_mm[todo])
+            jacobian[:, :, p] = (shifted - miss[todo]) / inward[:, None] * reach.span[p]
+        change = _smallest_change(jacobian, miss[todo])
+        stuck = ((here <= reach.bounds[0]) & (change < 0)) | (
+            (here >= reach.bounds[1]) & (change > 0)
+        )
+        if stuck.any():
+            change = _smallest_change(jacobian * ~stuck[:, None, :], miss[todo])
+        length = np.linalg.norm(change, axis=1, keepdims=True)
+        change = change * np.minimum(1.0, 0.25 / np.maximum(length, 1e-12))
+        commands[todo] = np.clip(here + change * reach.span, *reach.bounds)
+        miss[todo], ahead[todo] = _miss(reach, commands[todo], targets_mm[todo])
+    return Aim(commands, np.linalg.norm(miss, axis=1), ahead)
+
+
+def _smallest_change(jacobian: np.ndarray, miss: np.ndarray) -> np.ndarray:
+    """(M, P) least change that undoes misses (M, 3), by damped normal equations."""
+    gram = jacobian @ np.swapaxes(jacobian, 1, 2) + 1e-3 * np.eye(3)
+    return -(np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(gram, miss[:, :, None]))[:, :, 0]
+
+
+def nearest_commands(reach: ArmReach, targets_mm: np.ndarray, range_mm) -> np.ndarray:
+    """Commands (M, P) of the sampled shapes whose axes pass nearest to targets (M, 3), base frame.
+
+    Among those within 2 mm more of the nearest, the one closest to rest; the target must lie
+    within `range_mm` (nearest, farthest) ahead of the tip, if any shape manages that.
+    """
+    tip, direction = reach.centreline_mm[:, -1], reach.tip_direction
+    from_rest = np.linalg.norm((reach.commands - reach.rest) / reach.span, axis=1)
+    chosen = np.empty(len(targets_mm), dtype=np.int64)
+    for i, target in enumerate(targets_mm):
+        away = target - tip
+        ahead = frames.dot(away, direction)
+        miss = np.sqrt(np.maximum(frames.dot(away, away) - ahead**2, 0.0))
+        miss = miss + np.maximum(range_mm[0] - ahead, 0.0) + np.maximum(ahead - range_mm[1], 0.0)
+        near = np.flatnonzero(miss <= miss.min() + 2.0)
+        chosen[i] = near[np.argmin(from_rest[near])]
+    return reach.commands[chosen].copy()

@@ -33,6 +33,17 @@ PROBE_WIDTH_MM = 1e-3
 MOST_CONTACTS = 100_000
 """Upper limit of contacts asked of one FCL query; never reached by a ray or a capsule."""
 
+_HIT_COLUMNS = (
+    (np.int8, ()),
+    (np.int32, ()),
+    (np.int32, ()),
+    (np.float64, ()),
+    (np.float64, (3,)),
+    (np.float64, (3,)),
+    (np.float64, ()),
+)
+"""Kind and shape of a `RayHit`'s fields for one ray, in order."""
+
 
 @dataclass(frozen=True)
 class Collision:
@@ -261,16 +272,12 @@ class Referee:
         """
         origins = np.asarray(origins_mm, dtype=np.float64)
         directions = frames.normalise(np.asarray(directions, dtype=np.float64))
-        hits = [
-            self._cast_one(o, d, range_mm, arms or {}, own)
-            for o, d in zip(origins.reshape(-1, 3), directions.reshape(-1, 3), strict=True)
-        ]
         shape = origins.shape[:-1]
-        kinds = (np.int8, np.int32, np.int32, float, float, float, float)
-        columns = [
-            np.array(c, dtype=k).reshape(shape + np.shape(c[0]))
-            for c, k in zip(zip(*hits, strict=True), kinds, strict=True)
-        ]
+        columns = [np.empty(shape + tail, kind) for kind, tail in _HIT_COLUMNS]
+        for index in np.ndindex(shape):
+            hit = self._cast_one(origins[index], directions[index], range_mm, arms or {}, own)
+            for column, value in zip(columns, hit, strict=True):
+                column[index] = value
         return RayHit(*columns)
 
     def _cast_one(self, origin, direction, range_mm, arms, own) -> tuple:

@@ -104,11 +104,12 @@ def test_arms_keep_the_distance_of_their_centrelines(a, b, c, d):
     brute = np.linalg.norm(first[:, None] - second[None], axis=-1).min()
     slack = (math.dist(a, b) + math.dist(c, d)) / 600
     exact = segment_distance(*(np.array(p, dtype=float) for p in (a, b, c, d)))
-    assert brute - slack <= exact <= brute + 1e-9
+    parallel = 1e-7 * math.dist(a, b)  # lines closer to parallel than this are taken as parallel
+    assert brute - slack <= exact <= brute + parallel
     arms = {"one": ArmShape([a, b], 1.5), "two": ArmShape([c, d], 2.5)}
     referee = Referee([], horizon_mm=1000.0)
-    assert referee.clearance(arms).arms_mm["one", "two"] == pytest.approx(exact - 4, abs=1e-8)
-    if abs(exact - 4) > 1e-5:
+    assert referee.clearance(arms).arms_mm["one", "two"] == pytest.approx(exact - 4, abs=1e-5)
+    if abs(exact - 4) > 1e-4:
         assert bool(referee.collisions(arms)) == (exact < 4)
 
 

@@ -160,13 +160,22 @@ class _Chain:
 
     def folds(self) -> list[int]:
         """Segments that overlap a stretch of the same arm far enough away along it."""
-        allowed = folding_pairs(self.shape.centreline_mm, self.shape.radius_mm)
-        if not allowed.any():
+        least = self.fold_bounds()
+        allowed = np.isfinite(least)
+        if least.min() > 2.0 * self.shape.radius_mm:
             return []
         pairs: list[tuple[int, int]] = []
         self.manager.collide(pairs, collect_all)
         found = [sorted((self.segment_of[a], self.segment_of[b])) for a, b in pairs]
         return sorted(i for i, j in found if allowed[i, j])
+
+    def fold_bounds(self) -> np.ndarray:
+        """(K-1, K-1) mm no segment pair is nearer than, inf where the two cannot touch."""
+        line = self.shape.centreline_mm
+        middles, halves = 0.5 * (line[1:] + line[:-1]), 0.5 * frames.norm(line[1:] - line[:-1])
+        apart = frames.norm(middles[:, None] - middles[None])
+        allowed = folding_pairs(line, self.shape.radius_mm)
+        return np.where(allowed, apart - halves[:, None] - halves, np.inf)
 
 
 def _distance(first: fcl.CollisionObject, second: fcl.CollisionObject) -> float:
@@ -251,11 +260,11 @@ class Referee:
         return points[self.inside(index, points)]
 
     def _self_clearance(self, chain: _Chain) -> float:
-        allowed = folding_pairs(chain.shape.centreline_mm, chain.shape.radius_mm)
-        least = np.inf
-        for i in np.flatnonzero(allowed.any(axis=1)):
-            first = int(np.argmax(allowed[i]))
-            least = min(least, _distance(chain.line(i, i + 1), chain.line(first)))
+        bounds, least = chain.fold_bounds(), np.inf
+        for i in np.argsort(bounds.min(axis=1)):
+            if bounds[i].min() < least:
+                first = int(np.argmax(np.isfinite(bounds[i])))
+                least = min(least, _distance(chain.line(i, i + 1), chain.line(first)))
         return self._saturated(least - 2.0 * chain.shape.radius_mm)
 
     def cast(

@@ -74,16 +74,16 @@ def test_ten_thousand_poses_agree_with_the_referee(organ_scene):
     """Within 0.1 mm near contact, and not one collision missed or made up."""
     bodies, scene = organ_scene
     referee = Referee(bodies)
-    arms = random_arms(10_000, seed=1)
+    arms = random_arms(10_000, seed=1, points=13)
     found = scene.clearance({"a": arms}).bodies_mm[:, 0, 0].double().numpy()
     shapes = [{"a": ArmShape(line, RADIUS)} for line in arms.double().numpy()]
     hits = np.array([any(c.kind == "body" for c in referee.collisions(s)) for s in shapes])
-    asked = np.flatnonzero((np.abs(found) < 8.0) | (np.arange(len(arms)) % 10 == 0))
+    asked = np.flatnonzero((np.abs(found) < 4.0) | (np.arange(len(arms)) % 10 == 0))
     truth = {i: referee.clearance(shapes[i]).bodies_mm["a", "organ"] for i in asked}
     error = {i: abs(found[i] - value) for i, value in truth.items()}
     near = [e for i, e in error.items() if truth[i] < batched.EXACT_WITHIN_MM - 0.1]
     far = [e for i, e in error.items() if truth[i] >= batched.EXACT_WITHIN_MM - 0.1]
-    assert len(near) > 2000
+    assert len(near) > 1500
     assert max(near) < 1e-4
     assert len(far) > 300
     assert max(far) < 1.0

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import brentq
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.rig.compiled import compiled
 from surgisoft.measurement.rig.friction import lag, move, rested
 from surgisoft.measurement.rig.rod import Loads, Rod, Shape, balance, new_shape
 from surgisoft.measurement.rig.wall import Wall, line_strain, strain_under
@@ -118,7 +118,7 @@ def new_memory(lines: int) -> Memory:
     return Memory(np.zeros(3), *rested(lines))
 
 
-@njit(cache=True)
+@compiled
 def remember(specimen, pressures, thrusts, memory):
     """Take the wall's lines to the strains of a free section under the chamber pressures.
 
@@ -136,7 +136,7 @@ def remember(specimen, pressures, thrusts, memory):
     return taken < 50
 
 
-@njit(cache=True)
+@compiled
 def friction_forces(friction, memory, forces):
     """(J,) friction force of each line [N], into `forces`; positive while its strain rises."""
     for j in range(forces.shape[0]):
@@ -146,7 +146,7 @@ def friction_forces(friction, memory, forces):
         )  # fmt: skip
 
 
-@njit(cache=True)
+@compiled
 def add_line_forces(friction, forces, active):
     """Put the lines' tension (J,) [N] into what the wall makes by itself (K, 4) [N, N mm].
 
@@ -160,7 +160,7 @@ def add_line_forces(friction, forces, active):
             active[k, 2] += pull * friction.at[j, 0]
 
 
-@njit(cache=True)
+@compiled
 def chamber_thrusts(rod, pressures, thrusts):
     """(K, m) thrust p_i A_i [N] of each chamber at each station, from (m,) pressures [kPa]."""
     for k in range(thrusts.shape[0]):
@@ -168,7 +168,7 @@ def chamber_thrusts(rod, pressures, thrusts):
             thrusts[k, i] = pressures[i] * 1e-3 * rod.wall.areas[i] * rod.taper[k, i]
 
 
-@njit(cache=True)
+@compiled
 def settle_path(specimen, loads, path, memory, shape, tips):
     """Quasi-static tips (T, 3) [mm] along chamber pressures (T, m) [kPa]; False: failed."""
     forces = np.empty(specimen.friction.force.shape[0])
@@ -224,11 +224,16 @@ def tips_along(specimen: Specimen, loads: Loads, path: np.ndarray) -> np.ndarray
     tips = np.empty((len(path), 3))
     shape: Shape = new_shape(specimen.rod)
     if not settle_path(specimen, loads, np.asarray(path, np.float64), memory, shape, tips):
-        raise InputError(
-            "the arm found no equilibrium: its loads are beyond what it can carry; "
-            "use a lighter payload or a weaker effect"
-        )
+        raise no_equilibrium()
     return tips
+
+
+def no_equilibrium() -> InputError:
+    """The answer to loads that the rod cannot balance."""
+    return InputError(
+        "the virtual arm found no equilibrium: its loads are beyond what it can carry; "
+        "use a lighter payload or a weaker effect"
+    )
 
 
 def calibrated(specimen: Specimen, design: ArmDesign, gravity: np.ndarray) -> Specimen:

@@ -8,7 +8,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from surgisoft.measurement.rig.arm import (
     Memory,
@@ -19,6 +18,7 @@ from surgisoft.measurement.rig.arm import (
     new_memory,
     remember,
 )
+from surgisoft.measurement.rig.compiled import compiled
 from surgisoft.measurement.rig.effects import (
     Effects,
     History,
@@ -164,6 +164,8 @@ def steps_in(plant: Plant, seconds: float) -> int:
 
 def tape_of_pause(plant: Plant, steps: int) -> int:
     """Normal numbers that a pause of so many controller periods takes."""
+    if steps == 0:
+        return 0
     return steps * len(plant.pumps.tube) + normals_per_pause(plant.cameras)
 
 
@@ -173,22 +175,17 @@ def tape_of_sample(plant: Plant) -> int:
     return (steps_in(plant, plant.cameras.period) + 1) * m + normals_per_frame(plant.cameras)
 
 
-@njit(cache=True)
-def rest(plant, state):
+def rest(plant: Plant, state: State) -> None:
     """Vent the arm and let it forget."""
     vent(plant.pumps, state.gas)
-    state.target[:] = 0.0
-    state.chamber[:] = 0.0
-    state.effective[:] = 0.0
     forget(state.history)
-    state.memory.free[:] = 0.0
-    state.memory.last[:] = 0.0
-    state.memory.depth[:] = 0
+    for memory in (state.target, state.chamber, state.effective, *state.memory[:3]):
+        memory[:] = 0
     state.shape.unknown[:] = 0.0
     state.shape.status[:] = 0.0
 
 
-@njit(cache=True)
+@compiled
 def advance(plant, state, steps, tape, at):
     """Pumps and wall over `steps` controller periods; the tape's next index, -1 on failure."""
     pumps, effects = plant.pumps, plant.effects
@@ -214,16 +211,7 @@ def advance(plant, state, steps, tape, at):
     return at
 
 
-@njit(cache=True)
-def pause(plant, state, steps, tape, at):
-    """Let controller periods pass unseen; the tape's next index, -1 on failure."""
-    at = advance(plant, state, steps, tape, at)
-    if at < 0:
-        return at
-    return wander(plant.cameras, state.tracking, steps * plant.pumps.step, tape, at)
-
-
-@njit(cache=True)
+@compiled
 def take_shape(plant, state):
     """The arm's equilibrium under the present pressures and memory; False where none was found."""
     specimen, effects, active = plant.specimen, plant.effects, state.shape.active
@@ -239,61 +227,47 @@ def take_shape(plant, state):
     return balance(specimen.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
 
 
-@njit(cache=True)
-def sample(plant, state, steps, tape, at, frames, index):
-    """One period of `steps` controller periods and the frame at its end, into frames[index].
-
-    Returns the tape's next index, -1 on failure.
-    """
-    at = advance(plant, state, steps, tape, at)
-    if at < 0 or not take_shape(plant, state):
-        return -1
+@compiled
+def look_at(plant, state, tape, at, frames, index):
+    """What sensors and cameras show of the present state, into frames[index]; next tape index."""
+    effects, shape, tracking = plant.effects, state.shape, state.tracking
+    time = state.steps[0] * plant.pumps.step
     for i in range(state.gas.shape[0]):
-        shown = shown_pressure(plant.effects, state.gas, PRESSURE, i)
+        shown = shown_pressure(effects, state.gas, PRESSURE, i)
         frames.measured[index, i] = read_sensor(plant.pumps, shown, tape[at])
         at += 1
-    shape, tracking = state.shape, state.tracking
     mark(plant.cameras, tracking, shape.centres, shape.frames, state.chamber)
-    time = state.steps[0] * plant.pumps.step
-    slip_marker(plant.effects, time, shape.frames, state.history, tracking.clean)
-    misalign(plant.effects, tracking.clean)
+    slip_marker(effects, time, shape.frames, state.history, tracking.clean)
+    misalign(effects, tracking.clean)
     at = look(plant.cameras, tracking, tape, at)
     for p in range(shape.centres.shape[0]):
         circle_centre(tracking.seen[p], frames.points[index, p])
         circle_centre(tracking.clean[p], frames.clean[index, p])
     frames.centres[index] = shape.centres
     frames.chamber[index] = state.chamber
-    warmth = room_temperature(plant.effects, time)
-    frames.temperature[index] = math.floor(10.0 * warmth + 0.5) / 10.0
+    frames.temperature[index] = math.floor(10.0 * room_temperature(effects, time) + 0.5) / 10.0
     return at
 
 
-@njit(cache=True)
-def follow(plant, state, commands, steps, tape, frames):
-    """One sample after each row of commands (F, m) [kPa]; False on failure."""
-    at = 0
-    for t in range(commands.shape[0]):
-        state.target[:] = commands[t]
-        at = sample(plant, state, steps, tape, at, frames, t)
-        if at < 0:
-            return False
-    return True
+@compiled
+def play(plant, state, commands, pause, steps, count, tape, frames):
+    """After each row of commands (P, m) [kPa] a pause, then `count` samples; False on failure.
 
-
-@njit(cache=True)
-def settle_and_average(plant, state, commands, settle, steps, count, tape, frames):
-    """For each row of commands (P, m) [kPa]: a pause of `settle` periods, then `count` samples.
-
-    frames: room for P * count frames. False on failure.
+    pause: controller periods without samples (0: none); steps: controller periods from sample to
+    sample; tape: standard normals (tape_of_pause + count * tape_of_sample for each row); frames:
+    room for P * count frames.
     """
     at = 0
     for point in range(commands.shape[0]):
         state.target[:] = commands[point]
-        at = pause(plant, state, settle, tape, at)
-        for k in range(count):
+        for k in range(-1 if pause > 0 else 0, count):
+            at = advance(plant, state, pause if k < 0 else steps, tape, at)
             if at < 0:
                 return False
-            at = sample(plant, state, steps, tape, at, frames, point * count + k)
-        if at < 0:
-            return False
+            if k < 0:
+                at = wander(plant.cameras, state.tracking, pause * plant.pumps.step, tape, at)
+            elif not take_shape(plant, state):
+                return False
+            else:
+                at = look_at(plant, state, tape, at, frames, point * count + k)
     return True

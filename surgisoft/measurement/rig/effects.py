@@ -8,7 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from surgisoft.measurement.rig.compiled import compiled
 
 CREEP_TIMES = np.array([0.6, 2.4, 9.6, 38.4, 153.6])
 """Retardation times [s] whose sum stands for a power law over three decades (Findley 1976)."""
@@ -114,7 +115,6 @@ def new_history(chambers: int, lines: int) -> History:
     )
 
 
-@njit(cache=True)
 def forget(history):
     """What venting and resting undo."""
     history.creep[:] = 0.0
@@ -124,7 +124,7 @@ def forget(history):
     history.peak[:] = 0.0
 
 
-@njit(cache=True)
+@compiled
 def shown_pressure(effects, gas, column, i):
     """Pressure [kPa] at sensor i; a multiplexer that settles slowly mixes in the channel before."""
     own = gas[i, column]
@@ -133,7 +133,7 @@ def shown_pressure(effects, gas, column, i):
     return own + effects.crosstalk * (gas[i - 1, column] - own)
 
 
-@njit(cache=True)
+@compiled
 def effective_pressures(effects, step, chamber, history, effective):
     """Pressures (m,) [kPa] that push on the wall, from those in the chambers (m,) [kPa].
 
@@ -166,7 +166,7 @@ def effective_pressures(effects, step, chamber, history, effective):
         effective[i] = push
 
 
-@njit(cache=True)
+@compiled
 def follow_lines(effects, step, strains, history):
     """Let the lines' memories follow their strains (J,) over one period [s]."""
     for j in range(strains.shape[0]):
@@ -181,7 +181,7 @@ def follow_lines(effects, step, strains, history):
             history.peak[j] = max(history.peak[j], 0.5 * strain * strain)
 
 
-@njit(cache=True)
+@compiled
 def add_effect_forces(effects, strains, history, forces):
     """Add the effects' tension of each line [N] to forces (J,); strains: (J,) [-].
 
@@ -207,7 +207,7 @@ def add_effect_forces(effects, strains, history, forces):
             forces[j] += math.copysign(effects.stiffening * curve, strain)
 
 
-@njit(cache=True)
+@compiled
 def add_twist(effects, effective, active):
     """Torque of fibres wound unequally, growing faster than pressure, into active (K, 4) [N mm]."""
     torque = 0.0
@@ -218,7 +218,7 @@ def add_twist(effects, effective, active):
         active[k, 3] += torque
 
 
-@njit(cache=True)
+@compiled
 def room_temperature(effects, time):
     """Temperature [degrees Celsius] at a time [s]: the bench warms up, the heating cycles."""
     if effects.warmth == 0.0:
@@ -227,7 +227,7 @@ def room_temperature(effects, time):
     return 22.0 + warm + 1.0 * math.sin(2.0 * math.pi * time / 1300.0)
 
 
-@njit(cache=True)
+@compiled
 def drifted_base(effects, time, base, out):
     """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law."""
     out[:] = base
@@ -246,7 +246,7 @@ def drifted_base(effects, time, base, out):
     out[3] = w * d + x * c - y * b + z * a
 
 
-@njit(cache=True)
+@compiled
 def slip_marker(effects, time, frames, history, markers):
     """Shift the loose marker of (n, k, 3) [mm] along the arm: it creeps on while the arm is bent.
 
@@ -266,7 +266,7 @@ def slip_marker(effects, time, frames, history, markers):
         marker[d] += history.slipped[0] * frames[plane, d, 2]
 
 
-@njit(cache=True)
+@compiled
 def misalign(effects, points):
     """Points (n, k, 3) [mm] as cameras with a wrong calibration place them; in place.
 

@@ -15,13 +15,14 @@ are kept (Mayergoyz 1986): the closed forms below integrate the density over tri
 import math
 
 import numpy as np
-from numba import njit
+
+from surgisoft.measurement.rig.compiled import compiled
 
 DEPTH = 64
 """Turning points that a line can remember; a deeper history loses its smallest loop."""
 
 
-@njit(cache=True, inline="always")
+@compiled
 def _weighted_powers(width, slip):
     """Integrals over h from 0 to `width` of q(h) (width - h)^n for n = 1, 2, 3."""
     if width <= 0.0:
@@ -33,7 +34,7 @@ def _weighted_powers(width, slip):
     return first, second, third
 
 
-@njit(cache=True)
+@compiled
 def everett(upper, lower, slip, slope, bow):
     """Everett (1955) integral: the density over the triangle lower <= b <= a <= upper.
 
@@ -44,7 +45,7 @@ def everett(upper, lower, slip, slope, bow):
     return 4.0 * (1.0 + slope * centre + bow * centre**2) * first + 4.0 / 3.0 * bow * third
 
 
-@njit(cache=True)
+@compiled
 def virgin(strain, slip, slope, bow):
     """Output on the first loading of a rested wall, whose relays are up where c < 0.
 
@@ -56,7 +57,7 @@ def virgin(strain, slip, slope, bow):
     return odd + even if strain >= 0.0 else even - odd
 
 
-@njit(cache=True)
+@compiled
 def move(line, strain, last, depth, stack):
     """Take the strain of one line to a new value: turning points come and are wiped out.
 
@@ -78,7 +79,7 @@ def move(line, strain, last, depth, stack):
     last[line] = strain
 
 
-@njit(cache=True, inline="always")
+@compiled
 def _wipe_out(line, strain, count, stack):
     """Drop the turning points that the new strain has passed; the number that remain."""
     while count >= 2:
@@ -92,7 +93,7 @@ def _wipe_out(line, strain, count, stack):
     return count
 
 
-@njit(cache=True)
+@compiled
 def lag(line, last, depth, stack, slip, slope, bow):
     """How far the output of one line lags behind its frictionless value [-]: the friction.
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from surgisoft.measurement.rig.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def normals_per_pause(cameras: Cameras) -> int:
     return planes * k * 3
 
 
-@njit(cache=True)
+@compiled
 def wander(cameras, tracking, time, tape, at):
     """The slow noise after a time [s] without frames (exact for the AR(1) process).
 
@@ -136,12 +137,12 @@ def wander(cameras, tracking, time, tape, at):
     return at
 
 
-@njit(cache=True)
+@compiled
 def _upper_tail(z):
     return 0.5 * math.erfc(z / math.sqrt(2.0))
 
 
-@njit(cache=True)
+@compiled
 def mark(cameras, tracking, centres, frames, pressures):
     """Where the markers are, into tracking.clean.
 
@@ -160,7 +161,7 @@ def mark(cameras, tracking, centres, frames, pressures):
                 tracking.clean[p, k, d] = centres[p, d] + grow * across
 
 
-@njit(cache=True)
+@compiled
 def look(cameras, tracking, tape, at):
     """One frame: tracking.clean with noise and losses, into tracking.seen; the tape's next index.
 
@@ -183,7 +184,7 @@ def look(cameras, tracking, tape, at):
     return at
 
 
-@njit(cache=True)
+@compiled
 def circle_centre(points, out):
     """Centre (3,) [mm] of the circle through markers (k, 3) [mm] on one plane, into `out`.
 
@@ -241,7 +242,7 @@ def circle_centre(points, out):
         out[d] = mean[d] + cu * first[d] + cv * second[d]
 
 
-@njit(cache=True)
+@compiled
 def _plane_normal(count, spread, normal):
     """Unit normal of the plane through `count` markers: of three exactly, of more by least squares.
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from surgisoft.measurement.rig.compiled import compiled
 
 AMBIENT_KPA = 101.325
 """Standard atmosphere [kPa] (ISO 2533)."""
@@ -117,7 +118,6 @@ def vented(pumps: Pumps) -> np.ndarray:
     return state
 
 
-@njit(cache=True)
 def vent(pumps, state):
     """Open every circuit to the room with the pistons at rest, and close it again."""
     state[:] = 0.0
@@ -127,7 +127,7 @@ def vent(pumps, state):
         state[i, FAR_AIR] = AMBIENT_KPA * pumps.chamber[i]
 
 
-@njit(cache=True)
+@compiled
 def read_sensor(pumps, pressure, normal):
     """One reading [kPa] of a gauge pressure [kPa]; normal: a standard normal number."""
     reading = pressure + pumps.noise * normal
@@ -136,7 +136,7 @@ def read_sensor(pumps, pressure, normal):
     return reading
 
 
-@njit(cache=True)
+@compiled
 def drive_piston(pumps, row, target, reading):
     """PID and motor for one controller period: row (COLUMNS,) of one pump, updated in place.
 
@@ -161,7 +161,7 @@ def drive_piston(pumps, row, target, reading):
     row[X] = x
 
 
-@njit(cache=True, inline="always")
+@compiled
 def pressure_of(air, volume, bulge):
     """Gauge pressure [kPa] of an amount of air [kPa mm^3] in a space that yields to it.
 
@@ -175,7 +175,7 @@ def pressure_of(air, volume, bulge):
     return -2.0 * excess / (linear + math.sqrt(linear * linear - 4.0 * bulge * excess))
 
 
-@njit(cache=True)
+@compiled
 def fill(pumps, row, i, stretch):
     """Pressures of circuit i after its piston moved; stretch: axial strain of the chamber [-]."""
     volume = row[X] * pumps.bore + pumps.tube[i] + pumps.chamber[i] * (1.0 + stretch)
@@ -183,7 +183,7 @@ def fill(pumps, row, i, stretch):
     row[CHAMBER] = row[PRESSURE]
 
 
-@njit(cache=True)
+@compiled
 def fill_through_line(pumps, row, i, stretch, filling, emptying):
     """The same with a long thin tube between the sensor and the chamber, over one period.
 

@@ -15,8 +15,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from surgisoft.measurement.rig.compiled import compiled
 from surgisoft.measurement.rig.wall import NOT_CONVERGED, Wall, strain_under
 
 TOLERANCE = 1e-7
@@ -104,7 +104,7 @@ def new_shape(rod: Rod) -> Shape:
     )
 
 
-@njit(cache=True, inline="always")
+@compiled
 def _axes(w, x, y, z):
     """Rotation matrix of a quaternion, by rows."""
     return (
@@ -120,7 +120,7 @@ def _axes(w, x, y, z):
     )
 
 
-@njit(cache=True)
+@compiled
 def _slope(rod, softness, thrusts, active, strain, k, nx, ny, nz, y, out):
     """Derivative of y = (r, q, m) at station k under the internal force n; False: no strain."""
     w, x, yy, z = y[3], y[4], y[5], y[6]
@@ -152,7 +152,7 @@ def _slope(rod, softness, thrusts, active, strain, k, nx, ny, nz, y, out):
     return found != NOT_CONVERGED
 
 
-@njit(cache=True)
+@compiled
 def _keep_plane(shape, plane, y):
     a, b, c, d, e, f, g, h, i = _axes(y[3], y[4], y[5], y[6])
     shape.centres[plane, 0], shape.centres[plane, 1], shape.centres[plane, 2] = y[0], y[1], y[2]
@@ -162,7 +162,7 @@ def _keep_plane(shape, plane, y):
     frame[2, 0], frame[2, 1], frame[2, 2] = g, h, i
 
 
-@njit(cache=True)
+@compiled
 def shoot(rod, loads, softness, thrusts, base, unknown, shape, residual):
     """Integrate from the base with guessed unknowns (Runge-Kutta 4); the residual at the tip.
 
@@ -235,7 +235,7 @@ def shoot(rod, loads, softness, thrusts, base, unknown, shape, residual):
     return True
 
 
-@njit(cache=True)
+@compiled
 def _support_force(loads, y):
     """Penalty force [N] of the support: zero when free, smooth over 0.02 mm at the touch."""
     normal = loads.support_normal
@@ -243,7 +243,7 @@ def _support_force(loads, y):
     return loads.support_stiffness * 0.5 * (depth + math.sqrt(depth * depth + 4e-4))
 
 
-@njit(cache=True)
+@compiled
 def _close_at_tip(rod, loads, y, residual):
     """Moment left over at the tip cap [N mm]; y moves on to the tip plane."""
     a, b, c, d, e, f, g, h, i = _axes(y[3], y[4], y[5], y[6])
@@ -264,7 +264,7 @@ def _close_at_tip(rod, loads, y, residual):
     y[2] += i * rod.tip_cap
 
 
-@njit(cache=True)
+@compiled
 def _jacobian(rod, loads, softness, thrusts, base, shape, residual):
     """Inverse of the residual's Jacobian by forward differences, into shape.inverse."""
     size = 4 if loads.support > 0 else 3
@@ -282,12 +282,12 @@ def _jacobian(rod, loads, softness, thrusts, base, shape, residual):
     return True
 
 
-@njit(cache=True)
+@compiled
 def _error(residual):
     return max(max(abs(residual[0]), abs(residual[1])), max(abs(residual[2]), abs(residual[3])))
 
 
-@njit(cache=True)
+@compiled
 def balance(rod, loads, softness, thrusts, base, shape):
     """Solve for the equilibrium; False where none was found. shape.status reports the residual.
 
@@ -345,7 +345,7 @@ def balance(rod, loads, softness, thrusts, base, shape):
     return False
 
 
-@njit(cache=True)
+@compiled
 def _broyden(shape, step, scale, residual, after, size):
     """Broyden (1965): inverse += (dx - B dF) dx^T B / (dx^T B dF)."""
     product = np.zeros(4)

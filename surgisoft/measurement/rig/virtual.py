@@ -6,6 +6,7 @@ It is the truth that arm models are judged on, so it shares nothing with them: n
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,13 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recording import ArmInfo, Recording
 from surgisoft.measurement.rig import bench
-from surgisoft.measurement.rig.arm import STANDARD_GRAVITY, ArmDesign, fabricate, plain_loads
+from surgisoft.measurement.rig.arm import (
+    STANDARD_GRAVITY,
+    ArmDesign,
+    fabricate,
+    no_equilibrium,
+    plain_loads,
+)
 from surgisoft.measurement.rig.collect import (
     average,
     check_fits,
@@ -47,6 +54,17 @@ class Truth:
     """(T, n, 3) what the cameras would measure without noise, arm base frame [mm]."""
     pressures_kPa: np.ndarray
     """(T, m) pressures in the chambers [kPa]."""
+
+
+class Part(NamedTuple):
+    """Consecutive samples of a recording."""
+
+    t_s: np.ndarray
+    """(P,) times since the bench was switched on [s]."""
+    commanded: np.ndarray
+    """(P, m) [kPa]."""
+    frames: bench.Frames
+    """P averaged frames."""
 
 
 class VirtualRig:
@@ -106,9 +124,7 @@ class VirtualRig:
         self.period_s = self._plant.cameras.period
         self._rng = np.random.default_rng([seed, take, 0x5EED])
         self._state = bench.new_state(self._plant)
-        self._frame = bench.new_frames(self._plant, 1)
         self._steps = bench.steps_in(self._plant, self.period_s)
-        self._tape = bench.tape_of_sample(self._plant)
 
     @property
     def time_s(self) -> float:
@@ -138,21 +154,16 @@ class VirtualRig:
 
     def wait(self, seconds: float) -> None:
         """Let time [s] pass without reading."""
-        steps = bench.steps_in(self._plant, seconds)
-        tape = self._rng.standard_normal(bench.tape_of_pause(self._plant, steps))
-        _check_found(bench.pause(self._plant, self._state, steps, tape, 0) >= 0)
+        self._play(self._state.target[None].copy(), bench.steps_in(self._plant, seconds), 0)
 
     def read(self) -> Sample:
         """Let one period pass and read sensors and cameras."""
-        tape = self._rng.standard_normal(self._tape)
-        frame = self._frame
-        at = bench.sample(self._plant, self._state, self._steps, tape, 0, frame, 0)
-        _check_found(at >= 0)
+        frame = self._play(self._state.target[None].copy(), 0, 1)
         return Sample(
             t_s=self.time_s,
-            measured=frame.measured[0].copy(),
+            measured=frame.measured[0],
             commanded=self._state.target.copy(),
-            key_points_mm=frame.points[0].copy(),
+            key_points_mm=frame.points[0],
             temp_C=float(frame.temperature[0]) if self._thermometer else None,
         )
 
@@ -167,17 +178,17 @@ class VirtualRig:
         report = progress or (lambda done, total: None)
         runs = [commands for _, commands in runs_of(protocol, self.period_s)]
         total, done = sum(map(len, runs)), 0
-        parts: list[tuple] = []
+        parts: list[Part] = []
         for rows in runs:
             self.reset()
             size = CHUNK if protocol.kind == "settled" else 10 * CHUNK
             for first in range(0, len(rows), size):
-                part = rows[first : first + size]
-                play = self._settled if protocol.kind == "settled" else self._continuous
-                parts.append(play(part, protocol))
-                done += len(part)
+                parts.append(self._part(protocol, rows[first : first + size]))
+                done += len(parts[-1].t_s)
                 report(done, total)
-        t_s, commanded, frames = parts_joined(parts)
+        t_s, commanded = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        columns = zip(*(part.frames for part in parts), strict=True)
+        frames = bench.Frames(*(np.concatenate(column) for column in columns))
         truth = Truth(frames.centres, frames.clean, frames.chamber)
         error = (frames.points - frames.clean)[np.isfinite(frames.points)]
         noise_mm = float(np.sqrt(np.mean(error**2))) if error.size else 0.0
@@ -193,41 +204,28 @@ class VirtualRig:
         )
         return recording, truth
 
-    def _continuous(self, commands: np.ndarray, protocol: Protocol):
-        """Times (F,), commands (F, m) and frames of one sample a command."""
-        plant, state, count = self._plant, self._state, len(commands)
-        tape = self._rng.standard_normal(count * self._tape)
-        frames = bench.new_frames(plant, count)
-        steps = state.steps[0] + self._steps * np.arange(1, count + 1)
-        _check_found(bench.follow(plant, state, commands, self._steps, tape, frames))
-        return steps * plant.pumps.step, commands, frames
-
-    def _settled(self, commands: np.ndarray, protocol: Protocol):
-        """Times (P,), commands (P, m) and averaged frames of settled points."""
-        plant, state = self._plant, self._state
-        pause = bench.steps_in(plant, protocol.settle_s)
-        count = samples_in(protocol.average_s, self.period_s)
-        need = bench.tape_of_pause(plant, pause) + count * self._tape
+    def _play(self, commands: np.ndarray, pause: int, count: int) -> bench.Frames:
+        """Frames (P * count) of `count` samples after each command (P, m) and pause."""
+        plant = self._plant
+        need = bench.tape_of_pause(plant, pause) + count * bench.tape_of_sample(plant)
         tape = self._rng.standard_normal(len(commands) * need)
         frames = bench.new_frames(plant, len(commands) * count)
-        each = pause + count * self._steps
-        first = state.steps[0] + each * np.arange(len(commands)) + pause
-        steps = first[:, None] + self._steps * np.arange(1, count + 1)
-        _check_found(
-            bench.settle_and_average(
-                plant, state, commands, pause, self._steps, count, tape, frames
-            )
-        )
+        found = bench.play(plant, self._state, commands, pause, self._steps, count, tape, frames)
+        if not found:
+            raise no_equilibrium()
+        return frames
+
+    def _part(self, protocol: Protocol, commands: np.ndarray) -> Part:
+        """One recorded sample for each of the commands (P, m) [kPa]."""
+        settled = protocol.kind == "settled"
+        pause = bench.steps_in(self._plant, protocol.settle_s) if settled else 0
+        count = samples_in(protocol.average_s, self.period_s) if settled else 1
+        first = self._state.steps[0] + (pause + count * self._steps) * np.arange(len(commands))
+        steps = first[:, None] + pause + self._steps * np.arange(1, count + 1)
+        frames = self._play(commands, pause, count)
         shaped = (a.reshape(len(commands), count, *a.shape[1:]) for a in frames)
         mean = bench.Frames(*(average(a) for a in shaped))
-        return average(steps * plant.pumps.step), commands, mean
-
-
-def parts_joined(parts: list[tuple]) -> tuple[np.ndarray, np.ndarray, bench.Frames]:
-    """Times, commands and frames of consecutive parts in one."""
-    times, commands, frames = zip(*parts, strict=True)
-    joined = bench.Frames(*(np.concatenate(column) for column in zip(*frames, strict=True)))
-    return np.concatenate(times), np.concatenate(commands), joined
+        return Part(average(steps * self._plant.pumps.step), commands, mean)
 
 
 def check_options(seed: int, gravity, payload_g: float, noise: float) -> None:
@@ -248,11 +246,3 @@ def _rolled(gravity, roll_deg: float) -> np.ndarray:
     x, y, z = np.asarray(gravity, np.float64) / np.linalg.norm(gravity)
     c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
     return np.array([c * x + s * y, -s * x + c * y, z])
-
-
-def _check_found(found: bool) -> None:
-    if not found:
-        raise InputError(
-            "the virtual arm found no equilibrium: its loads are beyond what it can carry; "
-            "use a lighter payload or a weaker effect"
-        )

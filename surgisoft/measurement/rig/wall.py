@@ -16,7 +16,8 @@ c = cos(angle) and L = 1 + e(x_i, y_i).
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from surgisoft.measurement.rig.compiled import compiled
 
 LAST_STEP = 3e-6
 """Newton's method ends after a step in strain [-] below this; the error left is of its square."""
@@ -53,7 +54,7 @@ class Wall(NamedTuple):
     """(m,) c^2 = cos(fibre angle)^2 [-]."""
 
 
-@njit(cache=True)
+@compiled
 def strain_under(wall, factor, thrusts, force, moment_x, moment_y, strain):
     """Strains of a section that carries a load; Newton's method from the values in `strain`.
 
@@ -122,7 +123,7 @@ def strain_under(wall, factor, thrusts, force, moment_x, moment_y, strain):
     return NOT_CONVERGED
 
 
-@njit(cache=True)
+@compiled
 def line_strain(strain, x, y):
     """Strain [-] of the wall at (x, y) [mm] in a section with strains (3,) eps, u_x, u_y."""
     return strain[0] + strain[1] * y - strain[2] * x

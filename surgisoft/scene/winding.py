@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from surgisoft.scene.kernels import compiled
 from surgisoft.scene.mesh import Mesh
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _solid_angles(points, triangles, out):
     """Sum over triangles of their signed solid angle at each point, in full spheres.
 

@@ -1,0 +1,92 @@
+"""What the endoscope sees of the lesion: in the field of view, in focus, hidden by nothing.
+
+A camera looks along its pose's z axis, x to the right and y down in the picture (`frames.look_at`
+makes such poses). The same code serves the referee (numpy) and the batched engine (torch).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+
+LIFT_MM = 0.05
+"""Points are looked at this far above their surface, so that it does not hide them (mm)."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with a round field of view."""
+
+    fov_rad: float = math.radians(70.0)
+    """Full cone angle of the field of view (rad)."""
+    range_mm: tuple[float, float] = (10.0, 100.0)
+    """Least and greatest distance at which the picture is sharp (mm)."""
+
+    def __post_init__(self):
+        if not 0.0 < self.fov_rad < math.pi:
+            raise InputError(f"camera field of view is {self.fov_rad} rad: expected 0 to pi")
+        if not 0.0 <= self.range_mm[0] < self.range_mm[1] < math.inf:
+            raise InputError(f"camera range is {self.range_mm} mm: expected two rising distances")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees of M points; numpy or torch arrays of one leading shape (...)."""
+
+    visible: Any
+    """(..., M) bool: inside the cone, in range, and nothing in between."""
+    hidden: Any
+    """(..., M) bool: inside the cone and in range, but something is in between."""
+    fraction: Any
+    """(...) 0..1: share of the points that are visible."""
+    axis_error_rad: Any
+    """(...) rad between the optical axis and the points' middle."""
+    axis_error_mm: Any
+    """(...) mm from the points' middle to the optical axis."""
+    distance_mm: Any
+    """(...) mm from the camera to the points' middle."""
+
+
+def view(caster, camera: Camera, pose, points_mm, normals, arms=None, own=None, **where) -> View:
+    """What a camera at pose (..., 4, 4) sees of points (M, 3) or (..., M, 3) mm, world frame.
+
+    `caster` is a `collision.Referee` (numpy) or a `batched.BatchedScene` (torch, poses (B, 4, 4));
+    normals as the points; `arms` stand in the way as for its `cast`, `own` carries the camera;
+    further keywords go to `cast`.
+    """
+    points, normals = _like(pose, points_mm), _like(pose, normals)
+    lib = torch if isinstance(pose, torch.Tensor) else np
+    eye, axis = pose[..., None, :3, 3], pose[..., None, :3, 2]
+    rays = points + LIFT_MM * normals - eye
+    distance = frames.norm(rays)
+    near, far = camera.range_mm
+    in_view = frames.angle_between(axis + 0.0 * rays, rays) <= 0.5 * camera.fov_rad
+    in_view = in_view & (distance >= near) & (distance <= far)
+    hit = caster.cast(eye + 0.0 * rays, rays, 1.01 * far, arms, own, **where)
+    clear = hit.distance_mm >= distance - 0.1 * LIFT_MM
+    visible = in_view & clear
+    to_middle = points.mean(-2) - eye[..., 0, :]
+    error = frames.angle_between(axis[..., 0, :] + 0.0 * to_middle, to_middle)
+    reach = frames.norm(to_middle)
+    return View(
+        visible=visible,
+        hidden=in_view & ~clear,
+        fraction=visible.mean(-1) if lib is np else visible.to(reach.dtype).mean(-1),
+        axis_error_rad=error,
+        axis_error_mm=reach * lib.sin(error.clip(0.0, 0.5 * math.pi)),
+        distance_mm=reach,
+    )
+
+
+def _like(pose, array):
+    """The array in the pose's kind, precision and place."""
+    if isinstance(pose, torch.Tensor):
+        return torch.as_tensor(np.array(array) if isinstance(array, np.ndarray) else array).to(pose)
+    return np.asarray(array, dtype=np.float64)

@@ -1,0 +1,201 @@
+"""The endoscope's picture by ray casting: shaded bodies, arms, the beam and what it has burnt.
+
+One ray a pixel: Embree meets the bodies, closed forms meet the arms; then everything is lit by a
+lamp beside the lens. The picture is round, as wide as the field of view; its corners are black.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from surgisoft.scene import frames
+from surgisoft.scene.camera import Camera
+from surgisoft.scene.capsules import ArmShape, self_contact_gap_mm
+from surgisoft.scene.kernels import compiled
+from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.rays import EmbreeSurface, rays_to_chains
+
+BODY_COLOURS = {
+    "organ": (0.55, 0.16, 0.13),
+    "keep-out": (0.25, 0.33, 0.62),
+    "support": (0.36, 0.42, 0.40),
+}
+"""Linear colour of a body by its role."""
+ARM_COLOUR = (0.72, 0.70, 0.66)
+"""Linear colour of the arms: light silicone."""
+BEAM_COLOUR = (0.15, 1.0, 0.35)
+"""Linear colour of the aiming beam."""
+BEAM_RADIUS_MM = 0.4
+"""Half-width of the beam's glow in the picture (mm)."""
+BACKGROUND = (0.020, 0.008, 0.007)
+"""Linear colour where no ray meets anything: the dark of the body's cavity."""
+SHARP_COSINE = 0.8
+"""Corners whose vertex normal is farther from the face's than this stay sharp (37 degrees)."""
+LAMP_HALF_MM = 70.0
+"""Distance at which the lamp's light has fallen to a half (mm)."""
+
+
+class Renderer:
+    """Pictures of a fixed set of bodies; built once, a picture a call."""
+
+    def __init__(self, bodies: Sequence[Body], camera: Camera, width: int = 160, height: int = 120):
+        meshes = [body.world_mesh for body in bodies]
+        starts = np.cumsum([0, *(len(m.vertices_mm) for m in meshes)])
+        vertices = np.concatenate([m.vertices_mm for m in meshes])
+        faces = [m.faces + start for m, start in zip(meshes, starts, strict=False)]
+        self._mesh = Mesh(vertices, np.concatenate(faces))
+        self._corner_normals = corner_normals(self._mesh)
+        colours = [
+            np.full((len(m.faces), 3), BODY_COLOURS[b.role])
+            for b, m in zip(bodies, meshes, strict=True)
+        ]
+        self._face_colours = np.concatenate(colours)
+        self._first_face = np.cumsum([0, *(len(m.faces) for m in meshes)])
+        self._names = [body.name for body in bodies]
+        self._surface = EmbreeSurface(self._mesh)
+        self._camera, self.width, self.height = camera, width, height
+        self._rays, self._inside = pixel_rays(camera, width, height)
+
+    def image(
+        self,
+        pose: np.ndarray,
+        arms: Mapping[str, ArmShape] | None = None,
+        own: str | None = None,
+        beam_mm: np.ndarray | None = None,
+        paint: Mapping[str, Callable] | None = None,
+    ) -> np.ndarray:
+        """(height, width, 3) uint8 picture from pose (4, 4).
+
+        `own` carries the camera; beam_mm (2, 3) mm is the visible beam's ends; `paint` maps a
+        body's name to a function of (faces (N,), points (N, 3) mm world, colours (N, 3)) that
+        returns new linear colours.
+        """
+        pose = np.asarray(pose, dtype=np.float64)
+        origin = pose[:3, 3]
+        rays = self._rays @ pose[:3, :3].T
+        origins = np.broadcast_to(origin, rays.shape)
+        farthest = 4.0 * self._camera.range_mm[1]
+        distance, face = self._surface.first_hit(origins, rays, farthest)
+        points = origin + distance[:, None] * rays
+        colour = np.zeros_like(rays)
+        normal = np.zeros_like(rays)
+        met = np.flatnonzero(face >= 0)
+        colour[met] = self._face_colours[face[met]]
+        _smooth_normals(met, face, points, self._mesh.triangles_mm, self._corner_normals, normal)
+        for name, recolour in (paint or {}).items():
+            self._paint(name, recolour, face, points, colour)
+        for name, shape in (arms or {}).items():
+            gap = self_contact_gap_mm(shape.radius_mm) if name == own else -1.0
+            self._draw_arm(shape, gap, origins, rays, distance, colour, normal)
+        beam = (
+            np.zeros(len(rays))
+            if beam_mm is None
+            else _glow(
+                origin, rays, distance, np.asarray(beam_mm, dtype=np.float64), BEAM_RADIUS_MM
+            )
+        )
+        return self._developed(rays, distance, normal, colour, beam)
+
+    def _paint(self, name: str, recolour: Callable, face, points, colour) -> None:
+        body = self._names.index(name)
+        first, last = self._first_face[body], self._first_face[body + 1]
+        seen = np.flatnonzero((face >= first) & (face < last))
+        colour[seen] = recolour(face[seen] - first, points[seen], colour[seen])
+
+    def _draw_arm(self, shape: ArmShape, gap, origins, rays, distance, colour, normal) -> None:
+        before, segment = distance.copy(), np.zeros((1, len(rays)), np.int64)
+        rays_to_chains(
+            np.ascontiguousarray(origins)[None],
+            rays[None],
+            shape.centreline_mm[None],
+            shape.radius_mm,
+            gap,
+            distance[None],
+            segment,
+        )
+        drawn = np.flatnonzero(distance < before)
+        points = origins[drawn] + distance[drawn, None] * rays[drawn]
+        a = shape.centreline_mm[segment[0, drawn]]
+        axis = shape.centreline_mm[segment[0, drawn] + 1] - a
+        share = frames.dot(points - a, axis) / np.maximum(frames.dot(axis, axis), 1e-30)
+        normal[drawn] = frames.normalise(points - a - share.clip(0, 1)[:, None] * axis)
+        colour[drawn] = ARM_COLOUR
+
+    def _developed(self, rays, distance, normal, colour, beam) -> np.ndarray:
+        """Light, gloss and the film's response: linear colours to (H, W, 3) uint8."""
+        facing = np.abs(frames.dot(normal, rays))
+        lamp = 1.0 / (1.0 + (distance / LAMP_HALF_MM) ** 2)
+        gloss = 0.35 * facing**40
+        light = (colour * (0.06 + 0.94 * facing[:, None]) + gloss[:, None]) * lamp[:, None]
+        met = np.any(normal != 0.0, axis=1)[:, None]
+        light = np.where(met, 1.7 * light, BACKGROUND)
+        light += beam[:, None] * np.array(BEAM_COLOUR)
+        film = np.clip(light, 0.0, 1.0) ** (1.0 / 2.2) * self._inside[:, None]
+        return (255.0 * film + 0.5).astype(np.uint8).reshape(self.height, self.width, 3)
+
+
+def pixel_rays(camera: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit rays (H W, 3) of a picture's pixels in the camera's frame, and which lie in the cone.
+
+    The shorter side spans the field of view.
+    """
+    focal = 0.5 * min(width, height) / math.tan(0.5 * camera.fov_rad)
+    x = np.arange(width) + 0.5 - 0.5 * width
+    y = np.arange(height) + 0.5 - 0.5 * height
+    grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], focal), axis=-1).reshape(-1, 3)
+    rays = frames.normalise(grid)
+    return rays, rays[:, 2] >= math.cos(0.5 * camera.fov_rad)
+
+
+def corner_normals(mesh: Mesh) -> np.ndarray:
+    """(F, 3, 3) unit normals to shade by: the vertex's own, the face's where the edge is sharp."""
+    smooth = mesh.vertex_normals[mesh.faces]
+    flat = np.broadcast_to(mesh.face_normals[:, None], smooth.shape)
+    return np.where(frames.dot(smooth, flat)[..., None] > SHARP_COSINE, smooth, flat)
+
+
+@compiled
+def _smooth_normals(pixels, face, points, triangles, normals, out):
+    """Normals (F, 3, 3) of the corners blended at the points met."""
+    for n in pixels:
+        f = face[n]
+        e1 = triangles[f, 1] - triangles[f, 0]
+        e2 = triangles[f, 2] - triangles[f, 0]
+        s = points[n] - triangles[f, 0]
+        a, b, c = (e1 * e1).sum(), (e1 * e2).sum(), (e2 * e2).sum()
+        d, e = (s * e1).sum(), (s * e2).sum()
+        area = a * c - b * b
+        v, w = 0.0, 0.0
+        if area > 0.0:
+            v, w = (c * d - b * e) / area, (a * e - b * d) / area
+        blend = (1.0 - v - w) * normals[f, 0] + v * normals[f, 1] + w * normals[f, 2]
+        length = math.sqrt((blend * blend).sum())
+        if length > 0.0:
+            out[n] = blend / length
+
+
+@compiled
+def _glow(origin, rays, distance, beam, radius):
+    """(N,) 0..1: how brightly the beam (2, 3) shows on each ray, before what the ray meets.
+
+    By the nearest approach of the ray to the beam (Ericson 2005, section 5.1.8), as a Gaussian.
+    """
+    out = np.zeros(len(rays))
+    d2 = beam[1] - beam[0]
+    r = origin - beam[0]
+    e, f = (d2 * d2).sum(), (d2 * r).sum()
+    if e == 0.0:
+        return out
+    for n in range(len(rays)):
+        b, c = (rays[n] * d2).sum(), (rays[n] * r).sum()
+        denominator = e - b * b
+        s = (b * f - c * e) / denominator if denominator > 1e-12 * e else 0.0
+        s = min(max(s, 0.0), distance[n] + radius)
+        t = min(max((b * s + f) / e, 0.0), 1.0)
+        s = min(max(b * t - c, 0.0), distance[n] + radius)
+        gap = r + s * rays[n] - t * d2
+        out[n] = math.exp(-2.0 * (gap * gap).sum() / (radius * radius))
+    return out

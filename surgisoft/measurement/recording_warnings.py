@@ -20,6 +20,8 @@ JUMP_RATIO = 6.0
 """How many times larger than the usual steps before and after it a jump is."""
 JUMP_SHARE = 0.02
 """The least jump, as a share of the arm's largest motion."""
+ACTUATION_SHARE = 0.25
+"""The least move of the actuation that explains a step, each as a share of its whole motion."""
 STEP_WINDOW = 12
 """Steps before and steps after that say what is usual."""
 SPIKE_ROWS = 12
@@ -66,7 +68,8 @@ def _long_repeats(changed: np.ndarray) -> list[slice]:
     """The stretches that repeat one value for much longer than the signal usually does."""
     starts = np.flatnonzero(changed)
     lengths = np.diff(np.append(starts, len(changed)))
-    usual = np.quantile(lengths, 0.99, method="lower")
+    others = np.sort(lengths)[:-1]
+    usual = np.quantile(others, 0.99, method="lower") if len(others) else 0
     least = max(LEAST_FROZEN_ROWS, FROZEN_RATIO * usual)
     return [
         slice(int(start), int(start + length))
@@ -88,10 +91,13 @@ def _outside(stretch: slice, rows: int) -> np.ndarray:
 
 
 def _flickers(channel: np.ndarray, changed: np.ndarray) -> bool:
-    """Whether a reading (T,) goes up and down like noise over the rows (T,) where it changes."""
-    steps = np.diff(channel[changed])
-    turns = np.sign(steps[1:]) * np.sign(steps[:-1]) < 0
-    return len(turns) > 10 and turns.mean() > 0.25
+    """Whether a reading (T,) zigzags like noise over the rows (T,) where it changes.
+
+    Two turns on end: 5 in 12 of white noise, none of a smooth signal.
+    """
+    steps = np.sign(np.diff(channel[changed]))
+    zigzags = (steps[1:-1] * steps[:-2] < 0) & (steps[1:-1] * steps[2:] < 0)
+    return len(zigzags) > 10 and zigzags.mean() > 0.05
 
 
 def _channel_froze(recording: Recording, i: int, changed: np.ndarray, stretch: slice) -> bool:
@@ -259,18 +265,17 @@ def _motion_mm(points: np.ndarray) -> np.ndarray:
 def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
     """By key point, the samples that it jumps to and how far [mm]; for continuous recordings."""
     points = recording.key_points_mm
-    least = JUMP_SHARE * _motion_mm(points).max()
+    motion_mm = _motion_mm(points).max()
     hits: dict[int, list[tuple[int, float]]] = {}
     for run in recording.runs:
         tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
         for j, track in enumerate(tracks):
             others = [*tracks[:j], *tracks[j + 1 :]]
-            large = np.flatnonzero(track.steps_mm > least)
+            large = np.flatnonzero(track.steps_mm > JUMP_SHARE * motion_mm)
             for at in large[track.ratios(large) > JUMP_RATIO].tolist():
                 row = int(track.rows[at + 1])
-                if not _explained(recording, others, run, row):
-                    before = int(track.rows[at])
-                    size = float(np.linalg.norm(points[row, j] - points[before, j]))
+                size = float(np.linalg.norm(points[row, j] - points[int(track.rows[at]), j]))
+                if not _explained(recording, others, run, row, size / motion_mm):
                     hits.setdefault(j, []).append((row, size))
     return hits
 
@@ -311,13 +316,16 @@ def _comes_back(true: np.ndarray, away: np.ndarray, next_: np.ndarray, size: flo
     return bool(near and np.linalg.norm(next_ - away) > SPIKE_RETURN * size)
 
 
-def _explained(recording: Recording, others: list[_Track], run: slice, row: int) -> bool:
-    """Whether the actuation moves and the other key points, where there are any, move too."""
+def _explained(
+    recording: Recording, others: list[_Track], run: slice, row: int, share: float
+) -> bool:
+    """Whether a step of this share of the motion comes with a move of the actuation in the second
+    before, and with steps of the other key points where there are any."""
     if others and max(other.ratio_near(row) for other in others) <= JUMP_RATIO / 2:
         return False
     early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
     rows = slice(int(max(run.start, min(early, row - 5))), row + 1)
-    return _actuation_moves(recording, rows, 0.02)
+    return _actuation_moves(recording, rows, ACTUATION_SHARE * share)
 
 
 def _jump(j: int, found: list[tuple[int, float]]) -> Oddity:

@@ -1,0 +1,210 @@
+"""Frozen channels and marker jumps: found where they were put, and nowhere else."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.measurement.recording import Recording, load_recordings, save_recording
+from surgisoft.measurement.recording_warnings import find_oddities, key_point_jumps, spikes
+
+RATE_HZ = 20.0
+
+
+def body(p):
+    """Three key points (T, 3, 3) [mm] that bend with two actuations (T, 2): a smooth static arm."""
+    share = np.array([0.3, 0.7, 1.0])
+    x = 30 * np.tanh(p[:, :1] / 50) * share**2
+    y = 25 * np.sin(p[:, 1:] / 60) * share**2
+    z = 70 * share - (x**2 + y**2) / (100 * share)
+    return np.stack([x, y, z], axis=2)
+
+
+def slow_and_noisy(seed, samples=1200, noise=0.05, hz=0.3):
+    """Two chambers on smooth paths with rests, measured with noise at 20 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) / RATE_HZ
+    rates = rng.uniform(0.2, 1.0, 2) * hz
+    wave = np.sin(2 * np.pi * rates * t[:, None] + rng.uniform(0, 6, 2))
+    command = 40 + 40 * np.clip(1.5 * wave, -1, 1)
+    reading = command + rng.normal(0, 0.1, command.shape)
+    points = body(command) + rng.normal(0, noise, (samples, 3, 3))
+    return Recording("x", t, reading, points, commanded=command)
+
+
+def steps(seed, samples=1200):
+    """Steps of the command that the arm follows within one row: slow sampling, large motion."""
+    rng = np.random.default_rng(seed)
+    command = np.repeat(rng.uniform(0, 80, (samples // 25, 2)), 25, axis=0)
+    t = np.arange(samples) * 1.0
+    points = body(command) + rng.normal(0, 0.03, (samples, 3, 3))
+    return Recording("x", t, command + rng.normal(0, 0.1, command.shape), points)
+
+
+def settled(seed, samples=600):
+    """Settled points in random order: large motion from row to row."""
+    rng = np.random.default_rng(seed)
+    p = rng.uniform(0, 80, (samples, 2))
+    points = body(p) + rng.normal(0, 0.02, (samples, 3, 3))
+    return Recording("x", np.arange(samples) * 4.0, p, points, kind="settled")
+
+
+def without_noise(seed, samples=1200):
+    """A simulation: exact readings that rest bit-equal for long while the other chamber moves."""
+    rng = np.random.default_rng(seed)
+    levels = np.cumsum(rng.uniform(0, 8, (samples // 60, 2)), axis=0) % 80
+    p = np.repeat(levels, 60, axis=0)
+    p[:, 1] = 40 + 40 * np.sin(np.arange(samples) / 30)
+    return Recording("x", np.arange(samples) / RATE_HZ, p, body(p), commanded=p.copy())
+
+
+CLEAN = {
+    "slow and noisy": slow_and_noisy,
+    "fast": lambda seed: slow_and_noisy(seed, hz=3.0),
+    "noise only": lambda seed: slow_and_noisy(seed, noise=3.0),
+    "steps": steps,
+    "settled": settled,
+    "without noise": without_noise,
+    "without noise or command": lambda seed: dataclasses.replace(
+        without_noise(seed), commanded=None
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CLEAN)
+@given(seed=st.integers(0, 2**32))
+def test_no_false_alarm(kind, seed):
+    assert find_oddities(CLEAN[kind](seed)) == []
+
+
+@pytest.mark.parametrize("with_command", [True, False])
+@given(seed=st.integers(0, 2**32), start=st.integers(100, 900), length=st.integers(60, 250))
+def test_frozen_channel_is_found_with_its_place(with_command, seed, start, length):
+    clean = slow_and_noisy(seed)
+    reading = clean.measured.copy()
+    reading[start : start + length, 1] = reading[start, 1]
+    found = find_oddities(
+        dataclasses.replace(
+            clean, measured=reading, commanded=clean.commanded if with_command else None
+        )
+    )
+    assert [oddity.sample for oddity in found] == [start]
+    seconds = clean.t_s[start + length - 1] - clean.t_s[start]
+    assert found[0].text == (
+        f"p2_kPa repeat bit-equal for {length} rows ({seconds:.3g} s) while other signals move; "
+        "frozen?"
+    )
+
+
+def test_channels_that_freeze_together_are_one_finding():
+    clean = slow_and_noisy(1)
+    reading = clean.measured.copy()
+    reading[400:600] = reading[400]
+    found = find_oddities(dataclasses.replace(clean, measured=reading))
+    assert [oddity.sample for oddity in found] == [400]
+    assert found[0].text.startswith("p1_kPa, p2_kPa repeat bit-equal for 200 rows")
+
+
+def test_reading_that_ignores_its_command_is_frozen():
+    clean = without_noise(3)
+    reading = clean.measured.copy()
+    reading[:, 1] = reading[0, 1]
+    assert "p2_kPa" in find_oddities(dataclasses.replace(clean, measured=reading))[0].text
+
+
+@given(seed=st.integers(0, 2**32), start=st.integers(100, 900), length=st.integers(60, 250))
+def test_frozen_key_point_is_found(seed, start, length):
+    clean = slow_and_noisy(seed)
+    points = clean.key_points_mm.copy()
+    points[start : start + length, 2] = points[start, 2]
+    found = find_oddities(dataclasses.replace(clean, key_points_mm=points))
+    frozen = [oddity for oddity in found if "frozen" in oddity.text]
+    assert [oddity.sample for oddity in frozen] == [start]
+    assert frozen[0].text.startswith(f"key point k2 repeats bit-equal for {length} rows")
+
+
+def test_fixed_base_and_slow_motion_capture_are_not_frozen():
+    clean = slow_and_noisy(5)
+    points = clean.key_points_mm[np.arange(1200) // 6 * 6]  # a new frame every sixth row
+    points[:, 0] = 0.0
+    assert find_oddities(dataclasses.replace(clean, key_points_mm=points)) == []
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    row=st.integers(50, 1150),
+    j=st.integers(0, 2),
+    size=st.floats(8, 60),
+)
+def test_lasting_jump_is_found_at_its_row(seed, row, j, size):
+    clean = slow_and_noisy(seed, hz=0.05)
+    points = clean.key_points_mm.copy()
+    points[row:, j] += size * np.array([0.6, 0.0, 0.8])
+    hits = key_point_jumps(dataclasses.replace(clean, key_points_mm=points))
+    assert {k: [at for at, _ in found] for k, found in hits.items()} == {j: [row]}
+    assert hits[j][0][1] == pytest.approx(size, abs=3)
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    row=st.integers(50, 1100),
+    length=st.integers(1, 8),
+    size=st.floats(10, 60),
+)
+def test_spike_is_marked_row_by_row(seed, row, length, size):
+    clean = slow_and_noisy(seed, hz=0.05)
+    points = clean.key_points_mm.copy()
+    points[row : row + length, 1] += size * np.array([0.6, -0.8, 0.0])
+    away = spikes(dataclasses.replace(clean, key_points_mm=points))
+    expected = np.zeros((1200, 3), bool)
+    expected[row : row + length, 1] = True
+    np.testing.assert_array_equal(away, expected)
+
+
+@given(seed=st.integers(0, 2**32), row=st.integers(0, 599))
+def test_jump_of_a_settled_point_is_found(seed, row):
+    clean = settled(seed)
+    points = clean.key_points_mm.copy()
+    points[row, 2] += [0, 45, 0]
+    found = find_oddities(dataclasses.replace(clean, key_points_mm=points))
+    assert [oddity.sample for oddity in found] == [row]
+    assert "key point k2 jumps" in found[0].text
+
+
+def test_lost_key_points_are_no_jump():
+    clean = slow_and_noisy(2)
+    points = clean.key_points_mm.copy()
+    points[300:420, 1] = np.nan
+    points[::7, 2] = np.nan
+    assert find_oddities(dataclasses.replace(clean, key_points_mm=points)) == []
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 5])
+def test_few_samples_are_no_trouble(samples):
+    t = np.arange(samples) * 1.0
+    points = np.random.default_rng(0).normal(size=(samples, 2, 3))
+    for kind in ("continuous", "settled"):
+        assert find_oddities(Recording("x", t, np.ones((samples, 1)), points, kind=kind)) == []
+
+
+def test_loader_names_line_and_channel(tmp_path):
+    clean = slow_and_noisy(1)
+    reading, points = clean.measured.copy(), clean.key_points_mm.copy()
+    reading[400:600, 0] = reading[400, 0]
+    points[800:, 2] += 30
+    path = tmp_path / "a.csv"
+    save_recording(dataclasses.replace(clean, measured=reading, key_points_mm=points), path)
+    said = []
+    load_recordings(path, on_warning=said.append)
+    assert len(said) == 2
+    assert said[0].startswith(f"{path}, line 402: p1_kPa repeat bit-equal for 200 rows")
+    assert said[1].startswith(f"{path}, line 802: key point k2 jumps by 5")
+    said.clear()
+    save_recording(
+        dataclasses.replace(clean, measured=reading, key_points_mm=points),
+        tmp_path / "b.parquet",
+    )
+    load_recordings(tmp_path / "b.parquet", on_warning=said.append)
+    assert said[0].startswith(f"{tmp_path}/b.parquet, row 401: p1_kPa")

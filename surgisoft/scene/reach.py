@@ -125,11 +125,11 @@ class Aim:
 
 
 def _miss(reach: ArmReach, commands: np.ndarray, targets_mm: np.ndarray):
-    """Vector (M, 3) from the tool's axis to the targets, and how far ahead (M,)."""
+    """Vector (M, 3) from the tool's axis to the targets, how far ahead (M,), the axis (M, 3)."""
     tip, direction = reach.tips(commands)
     away = targets_mm - tip
     ahead = frames.dot(away, direction)
-    return away - ahead[:, None] * direction, ahead
+    return away - ahead[:, None] * direction, ahead, direction
 
 
 def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
@@ -141,7 +141,7 @@ def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
     commands = np.clip(start, *reach.bounds)
     count = commands.shape[1]
     step = 1e-3 * reach.span
-    miss, ahead = _miss(reach, commands, targets_mm)
+    miss, ahead, axis = _miss(reach, commands, targets_mm)
     for _ in range(ROUNDS):
         todo = np.flatnonzero(np.linalg.norm(miss, axis=1) > 0.1 * AIMED_MM)
         if not len(todo):
@@ -152,8 +152,11 @@ def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
             inward = np.where(here[:, p] + step[p] > reach.bounds[1, p], -step[p], step[p])
             moved = here.copy()
             moved[:, p] += inward
-            shifted, _ = _miss(reach, moved, targets_mm[todo])
+            shifted, _, _ = _miss(reach, moved, targets_mm[todo])
             jacobian[:, :, p] = (shifted - miss[todo]) / inward[:, None] * reach.span[p]
+        # along the axis nothing can be missed: only what moves the axis sideways counts
+        along = np.einsum("mi,mip->mp", axis[todo], jacobian)
+        jacobian -= axis[todo][:, :, None] * along[:, None, :]
         change = _smallest_change(jacobian, miss[todo])
         stuck = ((here <= reach.bounds[0]) & (change < 0)) | (
             (here >= reach.bounds[1]) & (change > 0)
@@ -163,7 +166,7 @@ def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
         length = np.linalg.norm(change, axis=1, keepdims=True)
         change = change * np.minimum(1.0, 0.25 / np.maximum(length, 1e-12))
         commands[todo] = np.clip(here + change * reach.span, *reach.bounds)
-        miss[todo], ahead[todo] = _miss(reach, commands[todo], targets_mm[todo])
+        miss[todo], ahead[todo], axis[todo] = _miss(reach, commands[todo], targets_mm[todo])
     return Aim(commands, np.linalg.norm(miss, axis=1), ahead)
 
 

@@ -1,0 +1,188 @@
+"""`surgisoft scene new`, `check` and `show`: author, judge and look at a scene."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.progress import progress
+
+commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
+app.add_typer(commands, name="scene")
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a scene (or scene.toml).")]
+Vector = tuple[float, float, float]
+
+
+@commands.command("new")
+def new(
+    meshes: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="MESH...",
+            help="Mesh files (stl, obj, ply, off, glb), the organ first. FILE:keep-out or "
+            "FILE:support gives a role; further files are keep-out by themselves.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="New scene folder.")],
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of the files: mm, cm or m; default: recognised.")
+    ] = None,
+    lesion: Annotated[
+        Vector | None,
+        typer.Option(help="Lesion near this point, in the first file's frame and unit."),
+    ] = None,
+    lesion_direction: Annotated[
+        Vector | None, typer.Option(help="Lesion on this side of the organ.")
+    ] = None,
+    diameter: Annotated[float, typer.Option(help="Diameter of the ring, in mm.")] = 20.0,
+    clearance: Annotated[
+        float, typer.Option(help="Least distance between an arm and anything else, in mm.")
+    ] = 1.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing scene.")] = False,
+) -> int:
+    """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
+    from surgisoft.cli.arms import reach_of
+    from surgisoft.scene.author import NoMounts, author, write_scene
+    from surgisoft.scene.spec import TOOLS, MountSpec
+
+    request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
+    _check_target(output, force)
+    blank = {tool: MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in TOOLS}
+    reaches = {tool: reach_of(mount) for tool, mount in blank.items()}
+    try:
+        with progress("scene new") as report:
+            made = author(request, reaches, blank, _name(output), report)
+    except NoMounts as error:
+        print(f"No scene was written: {error}.")
+        return 1
+    write_scene(made.scene, output, force)
+    for note in made.notes:
+        print(note)
+    _print_check(made.check)
+    print(f"wrote {output}: look at it with 'surgisoft scene show {output}'")
+    return 0
+
+
+@commands.command("check")
+def check(
+    folder: Folder,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--map", help="Reachability map to write, .png."),
+    ] = None,
+) -> int:
+    """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
+    from surgisoft.cli.arms import reaches_of
+    from surgisoft.scene.check import check_scene, reach_patch
+    from surgisoft.scene.folder import open_scene
+
+    scene = open_scene(folder)
+    scene.ring  # noqa: B018  (a lesion that does not lie on the organ is an error at once)
+    reaches = reaches_of(scene.spec)
+    with progress("scene check") as report:
+        verdict = check_scene(scene, reaches, report)
+    _print_check(verdict)
+    if picture is not None:
+        from surgisoft.replay.reach_map import draw_reach_map
+
+        draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)
+        print(f"wrote {picture}")
+    return 0 if verdict.good else 1
+
+
+@commands.command("show")
+def show(
+    folder: Folder,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve it to a browser on this machine only.")
+    ] = False,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Write a picture (.png) without a display and leave.")
+    ] = None,
+    save: Annotated[Path | None, typer.Option(help="Write a recording (.rrd) and leave.")] = None,
+) -> None:
+    """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
+    from surgisoft.cli.arms import reaches_of
+    from surgisoft.replay.scene_view import save_scene_view
+    from surgisoft.replay.screenshot import take_screenshot
+    from surgisoft.replay.viewer import open_viewer, serve_viewer, temporary_recording
+    from surgisoft.scene.folder import open_scene
+
+    scene = open_scene(folder)
+    reaches = reaches_of(scene.spec)
+    if save is not None:
+        save_scene_view(scene, reaches, save)
+        print(f"wrote {save}")
+        return
+    with temporary_recording() as recording:
+        save_scene_view(scene, reaches, recording)
+        if screenshot is not None:
+            take_screenshot(recording, screenshot)
+            print(f"wrote {screenshot}")
+        elif web:
+            serve_viewer(recording, lambda url: print(f"open {url} (Ctrl-C ends it)", flush=True))
+        else:
+            open_viewer(recording)
+
+
+def _request(meshes, unit, lesion, direction, diameter, clearance):
+    """The user's wish; contradictions are one line."""
+    import numpy as np
+
+    from surgisoft.errors import InputError
+    from surgisoft.scene.author import Request
+    from surgisoft.scene.mesh import ROLES
+    from surgisoft.scene.spec import LimitsSpec
+
+    if lesion is not None and direction is not None:
+        raise InputError("both --lesion and --lesion-direction are given; expected one of them")
+    if direction is not None and not 1e-9 < float(np.linalg.norm(direction)) < np.inf:
+        raise InputError(f"--lesion-direction is {direction}; expected a vector that is not zero")
+    if lesion is not None and not np.isfinite(lesion).all():
+        raise InputError(f"--lesion is {lesion}; expected finite coordinates")
+    if not 0.5 <= diameter <= 500.0:
+        raise InputError(f"--diameter is {diameter:g}; expected 0.5 to 500 mm")
+    if not 0.0 <= clearance <= 100.0:
+        raise InputError(f"--clearance is {clearance:g}; expected 0 to 100 mm")
+    paths, roles = [], []
+    for i, text in enumerate(meshes):
+        path, colon, role = text.rpartition(":")
+        if not colon or Path(text).exists() or "/" in role:
+            path, role = text, "organ" if i == 0 else "keep-out"
+        elif role not in ROLES:
+            raise InputError(f"{text}: role '{role}'; expected one of {', '.join(ROLES)}")
+        paths.append(Path(path))
+        roles.append(role)
+    return Request(
+        tuple(paths),
+        tuple(roles),
+        unit,
+        lesion,
+        direction,
+        diameter,
+        limits=LimitsSpec(clearance_mm=clearance),
+    )
+
+
+def _check_target(folder: Path, force: bool) -> None:
+    """Say before the work what would stop it after."""
+    from surgisoft.errors import InputError
+
+    if folder.exists() and not force:
+        raise InputError(f"{folder}: exists already; choose another name or use --force")
+
+
+def _name(folder: Path) -> str:
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in folder.name)
+    return plain[:64] or "scene"
+
+
+def _print_check(verdict) -> None:
+    print(verdict.sentence)
+    wide = max(len(finding.what) for finding in verdict.findings)
+    value = max(len(finding.value) for finding in verdict.findings)
+    for finding in verdict.findings:
+        mark = "ok  " if finding.good else "BAD "
+        print(f"  {mark}{finding.what:{wide}}  {finding.value:{value}}  needs {finding.wanted}")

@@ -1,0 +1,321 @@
+"""Make a scene from mesh files: read, repair, place the lesion, find mounts, write the folder."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene
+from surgisoft.scene.folder import Scene, rounded_mount
+from surgisoft.scene.mesh import ROLES, Body, Mesh
+from surgisoft.scene.meshio import MM_PER_UNIT, read_parts, recognise_unit, write_ply
+from surgisoft.scene.placement import Pair, find_mounts
+from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.repair import repair
+from surgisoft.scene.site import Site, directed_site, good_sites, pointed_site
+from surgisoft.scene.spec import (
+    FILE,
+    BodySpec,
+    CameraSpec,
+    LaserSpec,
+    LesionSpec,
+    LimitsSpec,
+    MountSpec,
+    SceneSpec,
+    save_spec,
+)
+from surgisoft.scene.sweep import LANDED_MM
+
+FAR_OFF = 20.0
+"""A mesh whose middle lies this many times its size from the origin is moved there."""
+COARSE_RING = 36
+"""Ring points while mounts are searched."""
+
+Report = Callable[[float, float, str], None]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for."""
+
+    meshes: tuple[Path, ...]
+    """Mesh files; the first holds the organ."""
+    roles: tuple[str, ...]
+    """Role of each file's bodies: organ, keep-out or support."""
+    unit: str | None = None
+    """Unit of every file; None: recognised."""
+    lesion: tuple[float, float, float] | None = None
+    """Point near which the lesion goes, in the first file's own frame and unit."""
+    lesion_direction: tuple[float, float, float] | None = None
+    """Side of the organ on which the lesion goes."""
+    diameter_mm: float = 20.0
+    """Diameter of the ring (mm)."""
+    laser: LaserSpec = field(default_factory=LaserSpec)
+    """The laser."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """The camera."""
+    limits: LimitsSpec = field(default_factory=LimitsSpec)
+    """The limits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Closed bodies in mm, and what was done to the files."""
+
+    names: tuple[str, ...]
+    """Names of the bodies; the first file's come first, largest first."""
+    roles: tuple[str, ...]
+    """Role of each."""
+    meshes: tuple[Mesh, ...]
+    """Closed meshes, world frame, mm."""
+    mm_per_unit: float
+    """Of the first file."""
+    shift_mm: np.ndarray
+    """(3,) by which everything was moved (mm)."""
+    notes: tuple[str, ...]
+    """What was recognised and repaired, one line each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Authored:
+    """A scene that was made, not yet written."""
+
+    scene: Scene
+    """The scene; its folder is not yet there."""
+    check: SceneCheck
+    """The referee's verdict on it."""
+    notes: tuple[str, ...]
+    """What was recognised, repaired and chosen, one line each."""
+
+
+class NoMounts(InputError):
+    """No pair of mounts exists for the lesion; the message says how close it came."""
+
+
+def prepare(request: Request) -> Prepared:
+    """Read and repair every file; an InputError says why one cannot be used."""
+    for role in request.roles:
+        if role not in ROLES:
+            raise unknown_name("role", role, ROLES)
+    if request.roles[0] != "organ":
+        raise InputError(
+            f"the first mesh has the role '{request.roles[0]}'; expected the organ first"
+        )
+    if request.unit is not None and request.unit not in MM_PER_UNIT:
+        raise unknown_name("unit", request.unit, MM_PER_UNIT)
+    notes: list[str] = []
+    names, roles, meshes, scales = [], [], [], []
+    for path, role in zip(request.meshes, request.roles, strict=True):
+        parts = read_parts(path)
+        corners = np.concatenate([part.vertices[np.unique(part.faces)] for part in parts])
+        size = float(np.ptp(corners, axis=0).max())
+        if size == 0.0:
+            raise InputError(f"{path}: all vertices are one point; expected a surface")
+        unit, why = request.unit, "as told"
+        if unit is None:
+            guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
+            unit, why = guess.unit, guess.sentence
+        scales.append(MM_PER_UNIT[unit])
+        notes.append(f"{path.name}: unit {why if request.unit is None else f'{unit}, {why}'}")
+        found = _closed_bodies(path, parts, scales[-1], notes)
+        for i, (name, mesh) in enumerate(sorted(found, key=lambda pair: -_area(pair[1]))):
+            names.append(_free_name(name, names))
+            roles.append(role if i == 0 or role != "organ" else "keep-out")
+            meshes.append(mesh)
+    bounds = meshes[0].bounds_mm
+    middle, size = bounds.mean(axis=0), np.ptp(bounds, axis=0).max()
+    shift = np.zeros(3)
+    if np.linalg.norm(middle) > FAR_OFF * size:
+        shift = -middle
+        meshes = [Mesh(mesh.vertices_mm + shift, mesh.faces) for mesh in meshes]
+        notes.append(f"moved by {tuple(shift.round(3).tolist())} mm to the origin")
+    if len(meshes) > 1:
+        listed = ", ".join(f"{name} ({role})" for name, role in zip(names, roles, strict=True))
+        notes.append(f"{len(meshes)} bodies: {listed}")
+    return Prepared(tuple(names), tuple(roles), tuple(meshes), scales[0], shift, tuple(notes))
+
+
+def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
+    """Every part repaired; a part beyond repair is left out if another one is a body."""
+    found, failures = [], []
+    done: dict[str, int] = {}
+    for part in parts:
+        what = str(path) if len(parts) == 1 else f"{path} ({part.name})"
+        try:
+            repaired = repair(part.vertices * scale, part.faces, what)
+        except InputError as error:
+            failures.append(error)
+            continue
+        for fix in repaired.repairs:
+            done[fix.done] = done.get(fix.done, 0) + fix.count
+        name = path.stem if len(parts) == 1 else Path(part.name).stem
+        found += [(name, mesh) for mesh in repaired.bodies]
+    if not found:
+        raise failures[0]
+    notes += [f"{path.name}: {count} {what}" for what, count in done.items()]
+    notes += [f"left out: {error}" for error in failures]
+    return found
+
+
+def _area(mesh: Mesh) -> float:
+    return float(mesh.face_areas_mm2.sum())
+
+
+def _free_name(name: str, taken: Sequence[str]) -> str:
+    """A legal body name that is not taken."""
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
+    plain = plain.strip("_")[:50] or "body"
+    numbers = iter(range(2, len(taken) + 3))
+    result = plain
+    while result in taken:
+        result = f"{plain}_{next(numbers)}"
+    return result
+
+
+def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
+    """Places for the lesion: the one pointed at, else several good ones."""
+    meshes = list(prepared.meshes)
+    operable = [m for m, role in zip(meshes, prepared.roles, strict=True) if role != "support"]
+    if request.lesion is not None:
+        point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
+        return [pointed_site(operable, point, request.diameter_mm)]
+    if request.lesion_direction is not None:
+        return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
+    return good_sites(meshes, request.diameter_mm)
+
+
+def author(
+    request: Request,
+    reaches: dict[str, ArmReach],
+    mounts: dict[str, MountSpec],
+    name: str,
+    report: Report = lambda done, total, note: None,
+) -> Authored:
+    """The whole way from mesh files to a checked scene; nothing is written.
+
+    `mounts` gives each tool's arm (name, length, diameter, shaft); its place is found here.
+    """
+    prepared = prepare(request)
+    report(5, 100, "meshes read")
+    sites = choose_sites(request, prepared)
+    report(10, 100, "lesion placed")
+    lacks: list[tuple[float, str]] = []
+    for number, site in enumerate(sites):
+        bodies = _bodies(prepared, site)
+        engine = BatchedScene(
+            bodies,
+            {tool: reach.radius_mm for tool, reach in reaches.items()},
+            most_nodes=PLANNING_NODES,
+        )
+        span = (10 + 80 * number / len(sites), 80 / len(sites))
+        pairs, lack = find_mounts(
+            engine,
+            reaches,
+            _coarse(site.ring),
+            request.laser,
+            request.camera,
+            request.limits,
+            {tool: mount.shaft_mm for tool, mount in mounts.items()},
+            lambda done, total, note, span=span: report(
+                span[0] + span[1] * done / total / 2, 100, note
+            ),
+        )
+        for pair in pairs:
+            scene = _scene(request, prepared, site, bodies, pair, mounts, name)
+            check = check_scene(scene, reaches)
+            if check.good:
+                return Authored(scene, check, (*prepared.notes, *_chosen(scene, check)))
+            lacks.append((check.covered, check.sentence))
+        if lack is not None:
+            lacks.append((lack.covered, lack.sentence))
+    best = max(lacks, key=lambda lack: lack[0])[1]
+    where = "the lesion" if len(sites) == 1 else f"any of {len(sites)} places for the lesion"
+    raise NoMounts(f"no mounts exist for {where}: {best}")
+
+
+def _coarse(ring):
+    """Every second point of the ring, for the search."""
+    step = max(1, len(ring.points_mm) // COARSE_RING)
+    return replace(
+        ring,
+        points_mm=ring.points_mm[::step],
+        normals=ring.normals[::step],
+        faces=ring.faces[::step],
+    )
+
+
+def _bodies(prepared: Prepared, site: Site) -> tuple[Body, ...]:
+    """The scene's bodies, the one with the lesion as an organ."""
+    operable = [i for i, role in enumerate(prepared.roles) if role != "support"]
+    organ = operable[site.body]
+    return tuple(
+        Body(name, "organ" if i == organ else role, mesh)
+        for i, (name, role, mesh) in enumerate(
+            zip(prepared.names, prepared.roles, prepared.meshes, strict=True)
+        )
+    )
+
+
+def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> Scene:
+    operable = [i for i, role in enumerate(prepared.roles) if role != "support"]
+    arms = {"laser": pair.laser.arm, "endoscope": pair.look.arm}
+    spec = SceneSpec(
+        name=name,
+        bodies=tuple(BodySpec(body.name, f"{body.name}.ply", body.role) for body in bodies),
+        lesion=LesionSpec(
+            prepared.names[operable[site.body]],
+            tuple(site.point_mm.round(4).tolist()),
+            float(request.diameter_mm),
+        ),
+        mounts=tuple(
+            replace(mounts[tool], **rounded_mount(arm.pose[:3, 3], arm.pose[:3, :3]))
+            for tool, arm in arms.items()
+        ),
+        laser=request.laser,
+        camera=request.camera,
+        limits=request.limits,
+        note="Made by 'surgisoft scene new' from "
+        + ", ".join(path.name for path in request.meshes),
+    )
+    return Scene(spec, Path(), bodies)
+
+
+def _chosen(scene: Scene, check: SceneCheck) -> list[str]:
+    centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
+    return [
+        f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
+        f"[{centre}] mm",
+        f"beam {check.cut.standoff_mm.min():.0f} to {check.cut.standoff_mm.max():.0f} mm long, "
+        f"incidence up to {np.degrees(check.cut.incidence_rad.max()):.0f} degrees, lands within "
+        f"{LANDED_MM} mm",
+    ]
+
+
+def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:
+    """Write meshes and scene.toml: first into a folder beside, then moved there as a whole."""
+    if folder.exists() and not force:
+        raise InputError(f"{folder}: exists already; choose another name or use --force")
+    if folder.exists() and not (folder / FILE).exists() and any(folder.iterdir()):
+        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        for body, entry in zip(scene.bodies, scene.spec.bodies, strict=True):
+            write_ply(body.mesh, fresh / entry.mesh)
+        save_spec(scene.spec, fresh / FILE)
+        os.chmod(fresh, 0o755)
+        if folder.exists():
+            for item in fresh.iterdir():
+                os.replace(item, folder / item.name)
+            fresh.rmdir()
+        else:
+            os.replace(fresh, folder)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise

@@ -1,0 +1,279 @@
+"""Judge a whole scene with the referee: meshes, lesion, both arms at rest and at work, the view."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from surgisoft.scene import frames
+from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.capsules import ArmShape, ray_chain
+from surgisoft.scene.collision import Referee
+from surgisoft.scene.folder import Scene
+from surgisoft.scene.lesion import circle_on, nearest_on_surface
+from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.spec import TOOLS
+from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, in_picture, look_at_lesion
+
+REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
+"""What a ring point's code means, in the order in which they are looked for."""
+PATCH_SHARES = np.linspace(0.1, 1.6, 16)
+"""Circles of the reachability map, in diameters of the lesion."""
+
+PLANNING_NODES = 150_000
+"""Nodes of the distance fields for planning: coarse, since near the surface distances are exact."""
+
+Report = Callable[[float, float, str], None]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the verdict's table."""
+
+    what: str
+    """What was looked at."""
+    value: str
+    """What was found."""
+    wanted: str
+    """What a scene needs."""
+    good: bool
+    """Whether it holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCheck:
+    """The referee's verdict on a scene."""
+
+    findings: tuple[Finding, ...]
+    """The table."""
+    reason: np.ndarray
+    """(M,) int: index into REASONS of each ring point."""
+    cut: Cut
+    """The laser arm's solutions around the ring."""
+    look: Look
+    """The endoscope arm turned to the lesion."""
+    clearance_mm: np.ndarray
+    """(M,) mm: least clearance of both arms with the beam on each ring point."""
+    view: np.ndarray
+    """(M,) fraction of the ring in view with the beam on each ring point."""
+
+    @property
+    def good(self) -> bool:
+        """Whether every finding holds."""
+        return all(finding.good for finding in self.findings)
+
+    @property
+    def covered(self) -> float:
+        """Fraction of the ring that can be cut."""
+        return float(np.mean(self.reason == 0))
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if self.good:
+            return (
+                f"The scene is ready: the laser reaches {100 * self.covered:.0f} % of the ring, "
+                f"the endoscope sees {100 * self.view.min():.0f} % of it, nothing comes closer "
+                f"than {self.clearance_mm.min():.1f} mm."
+            )
+        bad = [f"{f.what}: {f.value} (needs {f.wanted})" for f in self.findings if not f.good]
+        return f"The scene is not ready: {'; '.join(bad)}."
+
+
+def held_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, Held]:
+    """Both arms at their mounts, by tool."""
+    return {tool: Held.at(scene.spec.mount(tool), reaches[tool]) for tool in TOOLS}
+
+
+def check_scene(
+    scene: Scene,
+    reaches: dict[str, ArmReach],
+    report: Report = lambda done, total, note: None,
+) -> SceneCheck:
+    """Everything a task relies on, decided by FCL on the meshes themselves.
+
+    `reaches` holds the arms' reach tables by tool. The ring must lie on the organ.
+    """
+    limits, ring = scene.spec.limits, scene.ring
+    referee = Referee(scene.bodies)
+    arms = held_arms(scene, reaches)
+    cut = cut_ring(arms["laser"], ring, scene.spec.laser)
+    look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
+    radius = {tool: arms[tool].reach.radius_mm for tool in TOOLS}
+    scope = ArmShape(look.line_mm, radius["endoscope"])
+    shapes = [ArmShape(line, radius["laser"]) for line in cut.lines_mm]
+    clearance, landed = np.empty(len(shapes)), np.zeros(len(shapes), dtype=bool)
+    for i, shape in enumerate(shapes):
+        both = {"laser": shape, "endoscope": scope}
+        clearance[i] = -1.0 if referee.collisions(both) else referee.clearance(both).least_mm
+        hit = referee.cast(
+            cut.lines_mm[i, -1], cut.directions[i], cut.standoff_mm[i] + 50.0, both, own="laser"
+        )
+        landed[i] = bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[i]) <= LANDED_MM
+        report(i + 1, len(shapes) + 2, "ring")
+    needed = np.maximum(limits.clearance_mm, 0.5 * np.maximum(cut.step_mm, np.roll(cut.step_mm, 1)))
+    jumps = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1)) > 0.5 * radius["laser"]
+    tests = (~cut.in_reach, cut.steep, ~landed, clearance < limits.clearance_mm, jumps)
+    reason = np.select(tests, range(1, 6), 0)
+    reason[(reason == 0) & (clearance < needed)] = 4
+    view = _view(referee, look, shapes, scene)
+    report(len(shapes) + 1, len(shapes) + 2, "ways")
+    touching, way_mm, half_step_mm = _ways(referee, arms, cut, look)
+    findings = (*_mesh_findings(scene), *_work_findings(scene, reason, clearance, view, look))
+    findings += (
+        Finding(
+            "contacts at rest and on the way",
+            ", ".join(touching) or f"none (least {way_mm:.1f} mm)",
+            f"none, {limits.clearance_mm:g} mm clear",
+            not touching and way_mm >= max(limits.clearance_mm, half_step_mm),
+        ),
+    )
+    return SceneCheck(findings, reason, cut, look, clearance, view)
+
+
+def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
+    rows = []
+    for body in scene.bodies:
+        mesh = body.mesh
+        closed = mesh.is_watertight and mesh.volume_mm3 > 0.0
+        kind = "closed" if closed else "inside out" if mesh.is_watertight else "open"
+        rows.append(
+            Finding(
+                f"{body.role} '{body.name}'",
+                f"{len(mesh.faces)} faces, {kind}, {mesh.volume_mm3 / 1000.0:.3g} ml",
+                "closed, wound outwards",
+                closed,
+            )
+        )
+    centre = np.asarray(scene.spec.lesion.centre_mm)
+    nearest, _ = nearest_on_surface(scene.organ.world_mesh, centre[None])
+    off = float(np.linalg.norm(nearest[0] - centre))
+    rows.append(Finding("lesion on the surface", f"{off:.3f} mm off", "0.5 mm", off <= 0.5))
+    return tuple(rows)
+
+
+def _work_findings(scene, reason, clearance, view, look) -> tuple[Finding, ...]:
+    limits, camera = scene.spec.limits, scene.spec.camera
+    lacking = [
+        f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
+        for code in np.unique(reason[reason > 0])
+    ]
+    reach = f"{100 * np.mean(reason == 0):.0f} %"
+    least = float(clearance.min())
+    low, high = camera.range_mm
+    return (
+        Finding(
+            "ring within the laser's reach", ", ".join((reach, *lacking)), "100 %", not lacking
+        ),
+        Finding(
+            "clearance at work",
+            f"{least:.1f} mm" if least >= 0.0 else "touches",
+            f"{limits.clearance_mm:g} mm",
+            least >= limits.clearance_mm,
+        ),
+        Finding(
+            "ring in view",
+            f"{100 * view.min():.0f} %",
+            f"{100 * limits.view_fraction:.0f} %",
+            bool(view.min() >= limits.view_fraction),
+        ),
+        Finding(
+            "camera to lesion",
+            f"{look.distance_mm:.0f} mm",
+            f"{low:g} to {high:g} mm",
+            low <= look.distance_mm <= high,
+        ),
+    )
+
+
+def _view(referee: Referee, look: Look, shapes: list[ArmShape], scene: Scene) -> np.ndarray:
+    """(M,) fraction of ring points in the picture and hidden by no body and not by the laser."""
+    points, eye = scene.ring.points_mm, look.line_mm[-1]
+    towards = points - eye
+    length = np.linalg.norm(towards, axis=1)
+    towards /= length[:, None]
+    hit = referee.cast(np.tile(eye, (len(points), 1)), towards, float(length.max()) + 50.0)
+    free = hit.on_organ & (np.abs(hit.distance_mm - length) <= LANDED_MM)
+    free &= in_picture(eye, look.direction, points, scene.spec.camera)
+    fractions = []
+    for shape in shapes:
+        first, _ = ray_chain(eye, towards, shape.centreline_mm, shape.radius_mm)
+        fractions.append(np.mean(free & (first >= length)))
+    return np.array(fractions)
+
+
+def _ways(referee: Referee, arms: dict[str, Held], cut: Cut, look: Look):
+    """Contacts at rest and from rest to the lesion, the endoscope first; least clearance (mm).
+
+    Also half the largest step (mm): between two of the shapes looked at, no point of an arm is
+    farther than that from one of them, so a greater clearance leaves nothing missed.
+    """
+    scope_way = arms["endoscope"].lines(arms["endoscope"].way(look.commands))[0]
+    laser_way = arms["laser"].lines(arms["laser"].way(cut.centre))[0]
+    moments = [(laser_way[0], line) for line in scope_way]
+    moments += [(line, scope_way[-1]) for line in laser_way]
+    touching: dict[str, None] = {}
+    least = np.inf
+    for laser_line, scope_line in moments:
+        both = {
+            "laser": ArmShape(laser_line, arms["laser"].reach.radius_mm),
+            "endoscope": ArmShape(scope_line, arms["endoscope"].reach.radius_mm),
+        }
+        for collision in referee.collisions(both):
+            touching[f"{collision.arm} touches {collision.other}"] = None
+        least = min(least, referee.clearance(both).least_mm)
+    steps = [np.linalg.norm(np.diff(w, axis=0), axis=-1).max() for w in (scope_way, laser_way)]
+    return list(touching), float(least), 0.5 * float(max(steps))
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The surface around the lesion as the laser arm meets it."""
+
+    flat_mm: np.ndarray
+    """(N, 2) places in the plane of the lesion (mm), its centre at (0, 0)."""
+    reason: np.ndarray
+    """(N,) int: index into REASONS."""
+    incidence_rad: np.ndarray
+    """(N,) between beam and surface normal (rad)."""
+    ring_flat_mm: np.ndarray
+    """(M, 2) the ring in the same plane (mm)."""
+
+
+def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> Patch:
+    """Reach and incidence on circles about the lesion's centre, out to 1.6 of its diameter."""
+    mesh, ring, laser = scene.organ.world_mesh, scene.ring, scene.spec.laser
+    arm = held_arms(scene, reaches)["laser"]
+    _, face = nearest_on_surface(mesh, ring.centre_mm[None])
+    engine = BatchedScene(scene.bodies, {"laser": arm.reach.radius_mm}, most_nodes=PLANNING_NODES)
+    plane = frames.rotation_from_z(ring.normal)
+    flat, reasons, incidences = [], [], []
+    for share in PATCH_SHARES:
+        circle = circle_on(
+            mesh, ring.centre_mm, int(face[0]), share * scene.spec.lesion.diameter_mm, count
+        )
+        if circle is None:
+            break
+        cut = cut_ring(arm, replace(circle, centre_mm=ring.centre_mm, normal=ring.normal), laser)
+        lines = torch.from_numpy(cut.lines_mm)
+        hit = engine.cast(
+            lines[:, -1],
+            torch.from_numpy(cut.directions),
+            laser.standoff_mm[1] + 50.0,
+            {"laser": lines},
+            own="laser",
+        )
+        away = np.abs(hit.distance_mm.numpy() - cut.standoff_mm)
+        blocked = ~(hit.on_organ.numpy() & (away <= LANDED_MM))
+        near = engine.clearance({"laser": lines}).least_mm.numpy()
+        tests = (~cut.in_reach, cut.steep, blocked, near < scene.spec.limits.clearance_mm)
+        reasons.append(np.select(tests, range(1, 5), 0))
+        incidences.append(cut.incidence_rad)
+        flat.append(((circle.points_mm - ring.centre_mm) @ plane)[:, :2])
+    return Patch(
+        np.concatenate(flat),
+        np.concatenate(reasons),
+        np.concatenate(incidences),
+        ((ring.points_mm - ring.centre_mm) @ plane)[:, :2],
+    )

@@ -1,0 +1,83 @@
+"""A scene folder opened: the file's values, the meshes in their places, the ring on the organ."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+
+from surgisoft.errors import InputError
+from surgisoft.scene.lesion import Ring, lesion_ring
+from surgisoft.scene.mesh import Body
+from surgisoft.scene.meshio import read_mesh
+from surgisoft.scene.spec import FILE, SceneSpec, load_spec, spec_path
+from surgisoft.toml_config import to_table
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene with its meshes read; world frame, mm."""
+
+    spec: SceneSpec
+    """The values of `scene.toml`."""
+    folder: Path
+    """Folder of the scene."""
+    bodies: tuple[Body, ...]
+    """Every body with its mesh and pose, in the file's order."""
+
+    @property
+    def organ(self) -> Body:
+        """The body that carries the lesion."""
+        return next(body for body in self.bodies if body.name == self.spec.lesion.body)
+
+    @cached_property
+    def ring(self) -> Ring:
+        """The lesion's path, 72 points on the organ."""
+        return self.ring_of()
+
+    def ring_of(self, **count: int) -> Ring:
+        """The lesion's path with `count` points; an InputError where it does not lie."""
+        return lesion_ring(self.organ.world_mesh, self.spec.lesion, **count)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """sha256 in hex over the file's values and every mesh; comments do not count."""
+        digest = hashlib.sha256(tomli_w.dumps(to_table(self.spec)).encode())
+        for body in self.bodies:
+            digest.update(body.mesh.content_hash.encode())
+        return digest.hexdigest()
+
+
+def open_scene(path: str | Path) -> Scene:
+    """Open a scene folder (or its scene.toml); what is missing or bad is one line."""
+    spec = load_spec(path)
+    folder = spec_path(path).parent
+    bodies = []
+    for i, body in enumerate(spec.bodies):
+        if not (folder / body.mesh).is_file():
+            raise InputError(
+                f"{folder / FILE}: bodies[{i}].mesh: there is no file '{body.mesh}'; expected a "
+                "mesh in the scene's folder"
+            )
+        bodies.append(Body(body.name, body.role, read_mesh(folder / body.mesh), body.pose()))
+    return Scene(spec, folder, tuple(bodies))
+
+
+def rounded_mount(position_mm, rotation) -> dict:
+    """A mount's place as the file writes it: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
+
+    position_mm (3,) and rotation (3, 3) of the base frame in the world frame; answers
+    `position_mm`, `direction` and `roll_deg` for `MountSpec`.
+    """
+    from surgisoft.scene import frames
+
+    direction = rotation[:, 2].round(6) + 0.0
+    plain = frames.rotation_from_z(direction)
+    roll = np.degrees(np.arctan2(rotation[:, 0] @ plain[:, 1], rotation[:, 0] @ plain[:, 0]))
+    return {
+        "position_mm": tuple((np.asarray(position_mm).round(2) + 0.0).tolist()),
+        "direction": tuple(direction.tolist()),
+        "roll_deg": float(np.round(roll, 2) + 0.0),
+    }

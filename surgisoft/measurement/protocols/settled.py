@@ -6,6 +6,8 @@ direction and memory are then confounded with position. `grid` visits the same l
 every position every chamber has been approached from both sides, after reversals of all sizes.
 """
 
+import itertools
+
 import numpy as np
 
 RUNS = 8
@@ -68,11 +70,16 @@ def grid(points: int, limits: np.ndarray, rng: np.random.Generator):
     m = len(limits)
     levels = lattice_size(points, m)
     boxes = _cut(np.zeros(m, np.int64), np.full(m, levels - 1), rng)
-    rng.shuffle(boxes)
+    boxes.sort(key=lambda box: -int((box[1] - box[0] + 1).prod()))
+    signs = list(itertools.product([-1, 1], repeat=m))
+    deck = list(itertools.product(itertools.permutations(range(m)), signs))
     parts = []
-    for lows, highs in boxes:
-        part = back_and_forth(lows, highs, rng.permutation(m), rng.choice([-1, 1], m))
-        parts.append(part)
+    # Each round through the deck gives boxes of like size every order and every sign once.
+    for k, (lows, highs) in enumerate(boxes):
+        if k % len(deck) == 0:
+            rng.shuffle(deck)
+        parts.append(back_and_forth(lows, highs, *deck[k % len(deck)]))
+    rng.shuffle(parts)
     path = np.concatenate(parts)
     if len(path) > points:
         path = path[np.sort(rng.choice(len(path), points, replace=False))]
@@ -82,7 +89,7 @@ def grid(points: int, limits: np.ndarray, rng: np.random.Generator):
 def _cut(lows: np.ndarray, highs: np.ndarray, rng: np.random.Generator) -> list:
     """A box of the lattice, cut at random until its parts are small enough."""
     sizes = highs - lows + 1
-    enough = np.exp(rng.uniform(np.log(12.0), np.log(700.0)))
+    enough = np.exp(rng.uniform(np.log(12.0), np.log(250.0)))
     if sizes.prod() <= enough:
         return [(lows, highs)]
     axis = rng.choice(len(sizes), p=(sizes - 1) / (sizes - 1).sum())

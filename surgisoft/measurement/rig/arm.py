@@ -313,8 +313,8 @@ def _rod(design: ArmDesign, steps, planes, rng: np.random.Generator) -> Rod:
         rest=np.ascontiguousarray(rest),
         beyond=tip_weight + silicone * (1.0 - u),
         planes=planes,
-        base_cap=design.cap_mm,
-        tip_cap=design.cap_mm,
+        base_cap=float(design.cap_mm),
+        tip_cap=float(design.cap_mm),
         tip_weight=tip_weight,
         base=np.array(base),
     )
@@ -340,8 +340,8 @@ def _wall(design: ArmDesign, rng: np.random.Generator) -> Wall:
     fibres = np.radians(design.fibre_deg + rng.normal(0.0, 1.0, m))
     return Wall(
         modulus=modulus,
-        even=design.even,
-        odd=design.odd,
+        even=float(design.even),
+        odd=float(design.odd),
         area=area,
         second=second
         * np.array(

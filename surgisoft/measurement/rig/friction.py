@@ -69,7 +69,7 @@ def move(line, strain, last, depth, stack):
         return
     count = depth[line]
     start = stack[line, count - 1] if count > 0 else 0.0
-    if (strain - before) * (before - start) < 0.0:
+    if (strain > before and before < start) or (strain < before and before > start):
         if count == DEPTH:
             count -= 2
         stack[line, count] = before

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.measurement.rig.arm import STANDARD_GRAVITY
-from surgisoft.measurement.rig.effects import Effects
-from surgisoft.measurement.rig.rod import Loads, Rod
+from surgisoft.measurement.rig.arm import STANDARD_GRAVITY, chamber_thrusts, no_equilibrium
+from surgisoft.measurement.rig.effects import REFERENCE_KPA, Effects
+from surgisoft.measurement.rig.rod import Loads, Rod, balance, new_shape
 
 
 @dataclass
@@ -104,13 +105,41 @@ def _payload(bench: Bench, strength: float, rng: np.random.Generator) -> None:
 
 
 def _contact(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    """A support across the arm's way: touched at 40 % of the body's reach towards it.
+
+    At strength 1 it keeps the tip back by 4 mm where the free arm would go deepest into it.
+    """
+    m = len(bench.effects.gain)
+    plane = int(rng.integers(2, max(3, len(bench.rod.planes) - 1)))
     angle = rng.uniform(0, 2 * np.pi)
-    bench.loads = bench.loads._replace(
-        support=round(0.6 * len(bench.rod.steps)),
-        support_normal=np.array([np.cos(angle), np.sin(angle), 0.0]),
-        support_gap=-6.0,
-        support_stiffness=0.03 * strength,
+    normal = np.array([np.cos(angle), np.sin(angle), 0.0])
+    singles = REFERENCE_KPA * np.eye(m)
+    poses = [np.zeros(m), *singles, *(REFERENCE_KPA - singles)]
+    towards = [-float(_posed(bench, bench.loads, p)[plane] @ normal) for p in poses]
+    deepest = poses[int(np.argmax(towards))]
+    free = _posed(bench, bench.loads, deepest)[-1]
+    support = bench.loads._replace(
+        support=int(bench.rod.planes[plane]),
+        support_normal=normal,
+        support_gap=-(towards[0] + 0.4 * (max(towards) - towards[0])),
     )
+
+    def kept_back(log_stiffness: float) -> float:
+        loads = support._replace(support_stiffness=float(np.exp(log_stiffness)))
+        return float(np.linalg.norm(_posed(bench, loads, deepest)[-1] - free)) - 4.0
+
+    stiffness = np.exp(brentq(kept_back, np.log(1e-4), np.log(0.5), xtol=1e-3))
+    bench.loads = support._replace(support_stiffness=float(strength * stiffness))
+
+
+def _posed(bench: Bench, loads: Loads, pressures: np.ndarray) -> np.ndarray:
+    """Key planes' centres (n, 3) [mm] of the frictionless arm under pressures (m,) [kPa]."""
+    rod, shape = bench.rod, new_shape(bench.rod)
+    thrusts = np.empty((len(rod.stiffness), len(pressures)))
+    chamber_thrusts(rod, np.asarray(pressures, np.float64), thrusts)
+    if not balance(rod, loads, 1.0, thrusts, rod.base, shape):
+        raise no_equilibrium()
+    return shape.centres
 
 
 def _misalignment(bench: Bench, strength: float, rng: np.random.Generator) -> None:
@@ -171,7 +200,7 @@ HIDDEN: dict[str, Hidden] = {
     ),
     "coupling": Hidden("material", "a bulging chamber takes push from the others", _coupling),
     "payload": Hidden("body", "unweighed mass at the tip, off its centre", _payload),
-    "contact": Hidden("body", "yielding one-sided support at mid-body", _contact),
+    "contact": Hidden("body", "yielding one-sided support in the body's way", _contact),
     "misalignment": Hidden(
         "sensor", "camera frame turned, shifted and slightly warped", _misalignment
     ),

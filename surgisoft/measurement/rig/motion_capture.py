@@ -89,9 +89,9 @@ def build_cameras(
         period=1.0 / design.rate_Hz,
         at=at,
         swell=np.ascontiguousarray(swell),
-        white=noise_scale * design.white_mm,
-        slow=noise_scale * design.slow_mm,
-        slow_time=design.slow_s,
+        white=float(noise_scale) * design.white_mm,
+        slow=float(noise_scale) * design.slow_mm,
+        slow_time=float(design.slow_s),
         lose=design.lost_per_s / design.rate_Hz if noise_scale > 0 else 0.0,
         find=min(1.0, 1.0 / (design.lost_s * design.rate_Hz)),
     )

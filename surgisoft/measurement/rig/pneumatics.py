@@ -96,18 +96,18 @@ def build_pumps(
     """
     rng = np.random.default_rng([seed, 0xB0])
     return Pumps(
-        step=design.step_s,
+        step=float(design.step_s),
         bore=math.pi / 4 * design.bore_mm**2,
-        stroke=design.stroke_mm,
-        rest=design.rest_mm,
+        stroke=float(design.stroke_mm),
+        rest=float(design.rest_mm),
         tube=design.tube_mm3 * (1 + rng.normal(0.0, 0.05, len(chamber_mm3))),
         chamber=np.asarray(chamber_mm3, np.float64),
-        bulge=design.bulge_mm3_kPa,
-        limits=np.array([design.top_speed_mm_s, design.acceleration_mm_s2]),
-        gains=np.array([design.kp, design.ki, design.kd]),
+        bulge=float(design.bulge_mm3_kPa),
+        limits=np.array([design.top_speed_mm_s, design.acceleration_mm_s2], np.float64),
+        gains=np.array([design.kp, design.ki, design.kd], np.float64),
         smooth=design.step_s / (design.filter_s + design.step_s),
-        noise=noise_scale * design.sensor_noise_kPa,
-        resolution=design.sensor_step_kPa if noise_scale > 0 else 0.0,
+        noise=float(noise_scale) * design.sensor_noise_kPa,
+        resolution=float(design.sensor_step_kPa) if noise_scale > 0 else 0.0,
     )
 
 

@@ -10,7 +10,6 @@ from surgisoft.measurement.importing_spec import Column, FileRole, ImportMap
 from surgisoft.measurement.importing_table import RawTable
 from surgisoft.measurement.importing_units import SECONDS_PER
 
-
 SAME_TIME_S = 1e-6
 """Times of two files that differ by no more are the same [s]."""
 
@@ -101,10 +100,11 @@ def _paired(
             f"{table.path} {other_rows}, offset_rows {role.offset_rows}), expected the ends to "
             'meet; set offset_rows, or unpaired = "drop" in the map'
         )
-    if role.offset_rows > 0:
+    if role.offset_rows:
+        ahead, of = (main, table) if role.offset_rows > 0 else (table, main)
         notes.append(
-            f"first {min(role.offset_rows, rows)} rows of {main.path} have no partner in "
-            f"{table.path} (offset_rows), left out"
+            f"first {abs(role.offset_rows)} rows of {ahead.path} have no partner in {of.path} "
+            "(offset_rows), left out"
         )
     if left:
         longer, by = (main, left) if left > 0 else (table, -left)

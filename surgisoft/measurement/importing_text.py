@@ -6,6 +6,7 @@ import gzip
 import io
 import lzma
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ def read_bytes(path: Path) -> bytes:
                 data = module.decompress(data)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (EOFError, lzma.LZMAError, ValueError) as error:
+    except (EOFError, lzma.LZMAError, zlib.error, ValueError) as error:
         raise InputError(f"{path}: the compressed file is damaged ({error})") from error
     if b"\0" in data[:4096]:
         raise InputError(f"{path}: not a text file, expected columns of numbers")
@@ -106,7 +107,8 @@ class TextCells:
             cells = next(csv.reader([line], delimiter=self.separator))
             if len(cells) != len(self.names):
                 raise InputError(
-                    f"{self.path}, line {number}: {len(cells)} cells, expected {len(self.names)}"
+                    f"{self.path}, line {number}: {len(cells)} cells, expected "
+                    f"{len(self.names)} as in the {'header' if any(self.names) else 'first row'}"
                 )
             yield number, cells
 

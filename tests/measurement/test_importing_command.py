@@ -1,0 +1,116 @@
+"""`surgisoft import` and `surgisoft recording` as a user types them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.measurement.recording import load_recording
+
+MAP = """
+[time]
+rate_hz = 20
+[measured]
+columns = ["u"]
+unit = "kPa"
+[key_points]
+positions = [["x", "y", "z"]]
+unit = "m"
+"""
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """Two raw files, their map, and an output path."""
+    (tmp_path / "map.toml").write_text(MAP)
+    for name, start in (("one", 0), ("two", 10)):
+        rows = "\n".join(f"{start + i},0.001,0.002,0.0{i + 1}" for i in range(5))
+        (tmp_path / f"{name}.csv").write_text(f"u,x,y,z\n{rows}\n")
+    return tmp_path
+
+
+def surgisoft(*arguments):
+    return run([str(argument) for argument in arguments])
+
+
+def test_files_become_runs_of_one_recording(lab, capsys):
+    out = lab / "new" / "rec.parquet"
+    raw = [lab / "one.csv", lab / "two.csv"]
+    assert surgisoft("import", *raw, "--map", lab / "map.toml", "-o", out) == 0
+    printed = capsys.readouterr().out
+    assert f"wrote {out}: continuous, 10 rows, 2 runs, 1 channel in kPa, 1 key point" in printed
+    read = load_recording(out)
+    np.testing.assert_array_equal(read.measured[:, 0], [0, 1, 2, 3, 4, 10, 11, 12, 13, 14])
+    np.testing.assert_allclose(read.key_points_mm[3, 0], [1, 2, 40])
+
+
+def test_folder_gets_a_recording_a_file(lab):
+    raw = [lab / "one.csv", lab / "two.csv"]
+    assert surgisoft("import", *raw, "--map", lab / "map.toml", "-o", lab / "out") == 0
+    assert sorted(p.name for p in (lab / "out").iterdir()) == [
+        "one.parquet",
+        "one.toml",
+        "two.parquet",
+        "two.toml",
+    ]
+
+
+def test_dry_run_shows_and_writes_nothing(lab, capsys):
+    before = sorted(lab.iterdir())
+    arguments = ("import", lab / "one.csv", "--map", lab / "map.toml", "-o", lab / "rec.csv")
+    assert surgisoft(*arguments, "--dry-run") == 0
+    assert f"would write {lab}/rec.csv: continuous, 5 rows" in capsys.readouterr().out
+    assert sorted(lab.iterdir()) == before
+
+
+def test_existing_recordings_are_kept_all_of_them(lab, capsys):
+    raw = [lab / "one.csv", lab / "two.csv"]
+    out = lab / "out"
+    out.mkdir()
+    (out / "two.parquet").write_text("mine")
+    arguments = ("import", *raw, "--map", lab / "map.toml", "-o", out)
+    assert surgisoft(*arguments) == 2
+    error = capsys.readouterr().err
+    assert error == (
+        f"surgisoft: error: {out}/two.parquet: exists already; choose another name or use --force\n"
+    )
+    assert [p.name for p in out.iterdir()] == ["two.parquet"]
+    assert (out / "two.parquet").read_text() == "mine"
+    assert surgisoft(*arguments, "--force") == 0
+    assert load_recording(out / "two.parquet").samples == 5
+
+
+def test_bad_row_is_one_line_and_nothing_is_written(lab, capsys):
+    (lab / "two.csv").write_text("u,x,y,z\n1,2,3,4\n1,2,3\n")
+    raw = [lab / "one.csv", lab / "two.csv"]
+    assert surgisoft("import", *raw, "--map", lab / "map.toml", "-o", lab / "out") == 2
+    printed = capsys.readouterr()
+    assert printed.err == (
+        f"surgisoft: error: {lab}/two.csv, line 3: 3 cells, expected 4 as in the header\n"
+    )
+    assert not (lab / "out").exists()
+
+
+def test_recording_shows_what_it_holds(lab, capsys):
+    out = lab / "rec.csv"
+    surgisoft("import", lab / "one.csv", "--map", lab / "map.toml", "-o", out)
+    capsys.readouterr()
+    with out.open("a") as file:
+        file.write("0.25,,,,\n".replace(",,,,", ",5.0,,,,0"))
+    assert surgisoft("recording", out) == 0
+    printed = capsys.readouterr().out
+    assert "6 rows, 1 run, 1 channel in kPa, 1 key point" in printed
+    assert "k0 mm: x 1.0 to 1.0, y 2.0 to 2.0, z 10.0 to 50.0, missing in 1 rows" in printed
+    assert surgisoft("recording", lab / "none.csv") == 2
+    assert "none.csv: no such file" in capsys.readouterr().err
+
+
+def test_every_shipped_map_is_valid():
+    from surgisoft.measurement.importing_map import load_map
+
+    folder = Path(__file__).resolve().parents[2] / "docs" / "examples" / "maps"
+    maps = sorted(folder.glob("*.toml"))
+    assert len(maps) >= 5
+    for path in maps:
+        load_map(str(path))

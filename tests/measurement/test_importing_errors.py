@@ -1,0 +1,190 @@
+"""Bad maps and raw files that do not fit them: one line each, with its place."""
+
+import re
+
+import pytest
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing import import_files
+from surgisoft.measurement.importing_map import load_map, parse_map
+from surgisoft.toml_config import read_toml
+
+GOOD = """\
+[file.log]
+header = true
+[time]
+column = "t"
+[measured]
+columns = ["u"]
+unit = "kPa"
+[key_points]
+positions = [["x", "y", "z"]]
+unit = "mm"
+"""
+
+MAPS = [
+    ("[time]", "[times]", "time: missing; expected a table [time]"),
+    ("[measured]", "[mesured]", "measured: missing; expected a table [measured]"),
+    ('[time]\ncolumn = "t"', "", "time: missing; expected a table [time]"),
+    ('column = "t"', "", "time: neither column nor rate_hz; expected one of them"),
+    ('column = "t"', 'column = "t"\nrate_hz = 9', "both column and rate_hz; expected one"),
+    ('column = "t"', "column = 0", "time.column: got integer 0; expected a column's name or its"),
+    ('column = "t"', "column = true", "time.column: got boolean true; expected a column's name"),
+    ('column = "t"', "rate_hz = -5", "time.rate_hz: got integer -5; expected a number > 0"),
+    (
+        'column = "t"',
+        'column = "t"\nunit = "days"',
+        "time.unit: got text 'days'; expected one of s",
+    ),
+    ('column = "t"', 'colum = "t"', "neither column nor rate_hz"),
+    ("header = true", "heade = true", "file.log.heade: unknown field (did you mean 'header'?)"),
+    ("header = true", "header = 1", "file.log.header: got integer 1; expected true or false"),
+    ("header = true", 'separator = "--"', "file.log.separator: got text '--'; expected one char"),
+    ("header = true", "skip_rows = -1", "skip_rows: got integer -1; expected an integer >= 0"),
+    ("header = true", "offset_rows = 1", "file.log: the first file is the main one; expected"),
+    ("header = true", 'format = "excel"', "file.log.format: got text 'excel'; expected one of"),
+    ('columns = ["u"]', "columns = []", "measured.columns: got a list []; expected a list of col"),
+    ('unit = "kPa"', "", "measured.unit: missing; expected the columns' unit such as"),
+    ('unit = "kPa"', 'unit = "N/m"', "measured.unit: got text 'N/m'; expected letters and digits"),
+    ('unit = "kPa"', 'unit = "kPa"\nto = "deg"', "measured.to: got 'deg'; expected one of Pa, hPa"),
+    ('unit = "kPa"', 'unit = "counts"\nto = "V"', "use scale and offset"),
+    ('unit = "kPa"', 'unit = "kPa"\nscale = [1, 2]', "measured.scale: got a list [1, 2]; expected"),
+    (
+        'unit = "kPa"',
+        'unit = "kPa"\nfile = "lok"',
+        "measured.file: got text 'lok'; expected one of",
+    ),
+    (
+        '[["x", "y", "z"]]',
+        '[["x", "y"]]',
+        "key_points.positions: got a list [['x', 'y']]; expected",
+    ),
+    ("positions", 'auto = "planes"\npositions', "got positions and auto; expected exactly one of"),
+    ('positions = [["x", "y", "z"]]', "", "key_points: got nothing; expected exactly one of"),
+    ('positions = [["x", "y", "z"]]', 'markers = [["a", "b"]]', "key_points.markers: got a list"),
+    ('unit = "mm"', "", "key_points.unit: missing; expected the positions' unit, one of mm, cm, m"),
+    ('unit = "mm"', 'unit = "ft"', "key_points.unit: got text 'ft'; expected one of mm, cm, m"),
+    ('unit = "mm"', 'unit = "mm"\npattern = "["', "a regular expression with one group"),
+    (
+        'unit = "mm"',
+        'unit = "mm"\n[frame]\nrotation = "x y"',
+        "frame.rotation: got text 'x y'; exp",
+    ),
+    ('unit = "mm"', 'unit = "mm"\n[frame]\ngravity = [0, 0, 9.81]', "expected a unit vector"),
+    ('unit = "mm"', 'unit = "mm"\n[frame]\norigin = [1, 2]', 'three numbers or "k0"'),
+    ('unit = "mm"', 'unit = "mm"\n[frame.base]\nposition = "B"', "both position and quaternion"),
+    ('unit = "mm"', 'unit = "mm"\n[rows]\nfirst = 5\nlast = 4', "expected an integer >= 5"),
+    ('unit = "mm"', 'unit = "mm"\n[context]\npayload_g = "heavy"', "payload_g: got text 'heavy'"),
+    (
+        'unit = "mm"',
+        'unit = "mm"\n[context]\npayload = 3',
+        "unknown field (did you mean 'payload_g'",
+    ),
+    ('unit = "mm"', 'unit = "mm"\n[arm]\nlength = 3', "[arm]: unknown field 'length', expected"),
+    ('unit = "mm"', 'unit = "mm"\n[recording]\nkind = "live"', "kind: got 'live', expected one of"),
+    ('unit = "mm"', 'unit = "mm"\n[extra]\na = 1', "extra: unknown field; expected one of file"),
+    ('unit = "mm"', "unit = 'mm", "not valid TOML"),
+]
+
+RAW = "t,u,x,y,z\n0,1,2,3,4\n1,2,3,4,5\n"
+
+FILES = [
+    (RAW.replace("u", "U", 1), "", "no column 'u', expected one of t, U, x, y, z"),
+    (
+        RAW.replace("z", "zz", 1),
+        "",
+        "no column 'z', expected one of t, u, x, y, zz; did you mean 'zz'",
+    ),
+    (
+        RAW.replace("y", "x", 1),
+        "",
+        "2 columns are called 'x', expected one; give the column's numb",
+    ),
+    (RAW, "header = false", "no column 'u', the file has no header; expected a column's number"),
+    (
+        RAW.replace("2,3,4,5", "2,3,far,5"),
+        "",
+        "line 3, column 'y' (4): got 'far', expected a number",
+    ),
+    (RAW.replace("2,3,4,5", "2,3,inf,5"), "", "line 3, column 'y' (4): got inf, expected a finite"),
+    (RAW.replace("1,2,3,4,5", "1,2,3,4"), "", "line 3: 4 cells, expected 5"),
+    (RAW.replace("1,2,3,4,5", ",2,3,4,5"), "", "line 3, column 't': no time, expected a number in"),
+    (RAW.replace("1,2,3,4,5", "0,2,3,4,5"), "", "line 3: time 0.0 s after 0.0 s, expected"),
+    ("t,u,x,y,z\n0,,2,3,4\n1,,3,4,5\n", "", "line 2: the actuation is missing in every row"),
+    ("t,u,x,y,z\n0,1,,3,4\n1,2,,4,5\n", "", "every key point is missing in every row"),
+    ("t,u,x,y,z\n", "", "no rows of numbers"),
+    ("", "", "the file is empty"),
+    (RAW.replace(",", ";"), "", "one column only when separated by ','; check the separator"),
+    (RAW, "skip_rows = 9", "fewer than the 9 lines that the map skips"),
+    ("\0\1\2" + RAW, "", "not a text file"),
+]
+
+
+def message_of(action):
+    with pytest.raises(InputError) as error:
+        action()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), MAPS)
+def test_bad_map(tmp_path, old, new, expected):
+    assert old in GOOD
+    path = tmp_path / "map.toml"
+    path.write_text(GOOD.replace(old, new, 1))
+    message = message_of(lambda: load_map(str(path)))
+    assert message.startswith(str(path))
+    assert expected in message
+
+
+def test_map_error_names_its_line(tmp_path):
+    path = tmp_path / "map.toml"
+    path.write_text(GOOD.replace('unit = "mm"', 'unit = "ft"'))
+    assert re.match(
+        rf"{re.escape(str(path))}:10: key_points.unit", message_of(lambda: load_map(str(path)))
+    )
+
+
+def test_unknown_map_names_the_ready_ones(tmp_path):
+    message = message_of(lambda: load_map("optitrack"))
+    assert "optitrack: no such map, expected a TOML file or one of the ready maps motive" in message
+
+
+@pytest.mark.parametrize(("content", "field", "expected"), FILES)
+def test_bad_raw_file(tmp_path, content, field, expected):
+    path, map_path = tmp_path / "raw.csv", tmp_path / "map.toml"
+    path.write_text(content)
+    map_path.write_text(GOOD.replace("header = true", field or "header = true"))
+    spec = parse_map(*read_toml(map_path))
+    message = message_of(lambda: import_files([path], spec, "x"))
+    assert message.startswith(str(path))
+    assert expected in message
+
+
+def test_damaged_archive(tmp_path):
+    path, map_path = tmp_path / "raw.csv.gz", tmp_path / "map.toml"
+    path.write_bytes(b"\x1f\x8b\x08\0" + b"rubbish" * 9)
+    map_path.write_text(GOOD)
+    message = message_of(lambda: import_files([path], parse_map(*read_toml(map_path)), "x"))
+    assert str(path) in message
+
+
+def test_number_beyond_the_last_column(tmp_path):
+    path, map_path = tmp_path / "raw.csv", tmp_path / "map.toml"
+    path.write_text(RAW)
+    map_path.write_text(GOOD.replace('["u"]', "[6]"))
+    spec = parse_map(*read_toml(map_path))
+    message = message_of(lambda: import_files([path], spec, "x"))
+    assert message == f"{path}: no column 6, expected at most 5"
+
+
+def test_command_and_measurement_must_fit(tmp_path):
+    path, map_path = tmp_path / "raw.csv", tmp_path / "map.toml"
+    path.write_text(RAW)
+    for extra, expected in (
+        ('columns = ["u", "x"]\nunit = "kPa"', "2 commanded columns, expected 1 as in [measured]"),
+        ('columns = ["u"]\nunit = "psi"', "command in psi but measured in kPa, expected one unit"),
+    ):
+        map_path.write_text(f"{GOOD}[commanded]\n{extra}\n")
+        spec = parse_map(*read_toml(map_path))
+        assert expected in message_of(lambda spec=spec: import_files([path], spec, "x"))

@@ -1,0 +1,255 @@
+"""Files that belong together, runs, and the rows that are kept."""
+
+import numpy as np
+import pytest
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing import import_files
+
+from .test_importing import spec, text, written
+
+TWO = """
+[file.positions]
+match = "pos*"
+[file.inputs]
+match = "inp*"
+OFFSET
+[time]
+rate_hz = 10
+[measured]
+file = "inputs"
+columns = ["u1", "u2"]
+unit = "deg"
+[key_points]
+positions = [["x", "y", "z"]]
+unit = "mm"
+"""
+ONE = """
+ROWS
+[time]
+column = "t"
+[measured]
+columns = ["u"]
+unit = "kPa"
+[key_points]
+positions = [["x", "y", "z"], ["x", "y", "w"]]
+unit = "mm"
+KEYS
+"""
+
+
+def positions(rows):
+    i = np.arange(rows) * 1.0
+    return np.stack([i, 10 + i, 20 + i], axis=1)
+
+
+def inputs(rows):
+    i = np.arange(rows) * 1.0
+    return np.stack([100 + i, 200 + i], axis=1)
+
+
+def pair(tmp_path, rows, input_rows, suffix=""):
+    return [
+        written(tmp_path / f"inp{suffix}.csv", text(inputs(input_rows), header=["u1", "u2"])),
+        written(tmp_path / f"pos{suffix}.csv", text(positions(rows), header=["x", "y", "z"])),
+    ]
+
+
+def run(tmp_path, files, content, name="x"):
+    return import_files(files, spec(tmp_path, content), name)
+
+
+@pytest.mark.parametrize("offset", [-2, -1, 0, 1, 3])
+def test_row_i_of_the_second_file_belongs_to_row_i_plus_offset(tmp_path, offset):
+    files = pair(tmp_path, 20, 20 - offset)
+    (part,) = run(tmp_path, files, TWO.replace("OFFSET", f"offset_rows = {offset}"))
+    first = max(0, offset)
+    rows = np.arange(first, 20)
+    np.testing.assert_array_equal(part.recording.key_points_mm[:, 0, 0], rows)
+    np.testing.assert_array_equal(part.recording.measured[:, 0], 100 + rows - offset)
+    np.testing.assert_allclose(part.recording.t_s, (rows - first) / 10)
+    if offset:
+        longer = "pos.csv" if offset > 0 else "inp.csv"
+        assert f"first {abs(offset)} rows of {tmp_path}/{longer} have no partner" in part.notes[0]
+
+
+def test_ends_that_do_not_meet(tmp_path):
+    content = TWO.replace("OFFSET", "offset_rows = 1")
+    with pytest.raises(InputError, match=r"pos\.csv: 4 rows at the end have no partner") as error:
+        run(tmp_path, pair(tmp_path, 20, 15), content)
+    assert "20 rows" in str(error.value)
+    assert "15, offset_rows 1" in str(error.value)
+    with pytest.raises(InputError, match=r"inp\.csv: 6 rows at the end have no partner"):
+        run(tmp_path, pair(tmp_path, 20, 25), content)
+    dropping = content.replace("offset_rows = 1", 'offset_rows = 1\nunpaired = "drop"')
+    (part,) = run(tmp_path, pair(tmp_path, 20, 15), dropping)
+    assert part.recording.samples == 15
+    assert any("last 4 rows of" in note for note in part.notes)
+    (part,) = run(tmp_path, pair(tmp_path, 20, 25), dropping)
+    assert part.recording.samples == 19
+
+
+def test_files_become_runs_in_the_order_given(tmp_path):
+    files = [*pair(tmp_path, 5, 5, "_b"), *pair(tmp_path, 3, 3, "_a")]
+    (part,) = run(tmp_path, files, TWO.replace("OFFSET", ""))
+    recording = part.recording
+    np.testing.assert_array_equal(recording.run, [0] * 5 + [1] * 3)
+    np.testing.assert_allclose(recording.t_s, [0, 0.1, 0.2, 0.3, 0.4, 0, 0.1, 0.2])
+    assert recording.name == "x"
+
+
+def test_one_input_file_serves_every_run(tmp_path):
+    first = pair(tmp_path, 5, 5)
+    second = written(tmp_path / "pos2.csv", text(-positions(5), header=["x", "y", "z"]))
+    (part,) = run(tmp_path, [*first, second], TWO.replace("OFFSET", ""))
+    np.testing.assert_array_equal(part.recording.measured[:5], part.recording.measured[5:])
+    np.testing.assert_array_equal(
+        part.recording.key_points_mm[:5], -part.recording.key_points_mm[5:]
+    )
+
+
+def test_folder_output_makes_a_recording_of_each_file(tmp_path):
+    files = [*pair(tmp_path, 5, 5, "_b"), *pair(tmp_path, 3, 3, "_a")]
+    parts = run(tmp_path, files, TWO.replace("OFFSET", ""), name=None)
+    assert [(p.recording.name, p.recording.samples) for p in parts] == [("pos_b", 5), ("pos_a", 3)]
+    (tmp_path / "other").mkdir()
+    twice = [*files[:2], *pair(tmp_path / "other", 5, 5, "_b")]
+    with pytest.raises(InputError, match="2 files would become the recording 'pos_b'"):
+        run(tmp_path, twice, TWO.replace("OFFSET", ""), name=None)
+
+
+def test_number_of_files_must_fit(tmp_path):
+    files = [*pair(tmp_path, 5, 5, "_a"), *pair(tmp_path, 5, 5, "_b"), *pair(tmp_path, 5, 5, "_c")]
+    content = TWO.replace("OFFSET", "")
+    with pytest.raises(InputError, match=r"2 files for \[file.inputs\] and 3 for"):
+        run(tmp_path, [p for p in files if p.name != "inp_b.csv"], content)
+    with pytest.raises(InputError, match=r"no file for \[file.inputs\].*matches 'inp\*'"):
+        run(tmp_path, files[1::2], content)
+    stranger = written(tmp_path / "readme.txt", "hello")
+    with pytest.raises(InputError, match=r"readme\.txt: fits no file of the map, expected one of"):
+        run(tmp_path, [*files, stranger], content)
+    with pytest.raises(InputError, match=r"none\.csv: no such file"):
+        run(tmp_path, [tmp_path / "none.csv"], content)
+
+
+def test_raw_folder_stands_for_its_files(tmp_path):
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    pair(folder, 5, 5)
+    (part,) = run(tmp_path, [folder], TWO.replace("OFFSET", ""))
+    assert part.recording.samples == 5
+
+
+# --- rows and runs of one file -----------------------------------------------------------------
+
+
+def log(tmp_path, t, u=None, x=None, label=None):
+    t = np.asarray(t, np.float64)
+    i = np.arange(len(t)) * 1.0
+    u = i if u is None else np.asarray(u)
+    x = i if x is None else np.asarray(x)
+    columns = [t, u, x, 0 * t, 0 * t, 50 + 0 * t]
+    names = ["t", "u", "x", "y", "z", "w"]
+    lines = text(np.stack(columns, axis=1), header=names).splitlines()
+    if label:
+        lines = [f"{line},{end}" for line, end in zip(lines, ["label", *label], strict=True)]
+    return written(tmp_path / "log.csv", "\n".join(lines) + "\n")
+
+
+def one(tmp_path, path, rows="", keys=""):
+    content = ONE.replace("ROWS", rows).replace("KEYS", keys)
+    (part,) = import_files([path], spec(tmp_path, content), "x")
+    return part
+
+
+def test_time_that_does_not_increase(tmp_path):
+    path = log(tmp_path, [0, 1, 1, 2, 1.5, 3])
+    with pytest.raises(InputError, match=r"log\.csv, line 4: time 1.0 s after 1.0 s, expected"):
+        one(tmp_path, path)
+    part = one(tmp_path, path, '[rows]\nrepeated_time = "drop"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 1, 2, 3])
+    np.testing.assert_array_equal(part.recording.measured[:, 0], [0, 1, 3, 5])
+    assert "2 rows whose time does not increase left out" in part.notes[-1]
+
+
+def test_time_that_restarts_begins_a_run(tmp_path):
+    part = one(tmp_path, log(tmp_path, [0, 1, 2, 0, 1, 0.5]), "[runs]\ntime_restarts = true")
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 2])
+
+
+def test_gap_in_time_begins_a_run(tmp_path):
+    part = one(tmp_path, log(tmp_path, [0, 1, 2, 12, 13, 14.5]), "[runs]\ngap_s = 5")
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 0, 1, 1, 1])
+
+
+def test_column_of_texts_begins_a_run(tmp_path):
+    path = log(tmp_path, np.arange(5.0), label=["up", "up", "down", "up", "up"])
+    part = one(tmp_path, path, '[runs]\ncolumn = "label"')
+    np.testing.assert_array_equal(part.recording.run, [0, 0, 1, 2, 2])
+
+
+def test_rows_are_cut_and_thinned(tmp_path):
+    path = log(tmp_path, np.arange(20.0))
+    part = one(tmp_path, path, "[rows]\nfirst = 3\nlast = 12\nevery = 4")
+    np.testing.assert_array_equal(part.recording.measured[:, 0], [2, 6, 10])
+    np.testing.assert_array_equal(part.recording.t_s, [0, 4, 8])
+
+
+def test_rows_that_repeat_are_dropped_when_asked(tmp_path):
+    path = log(tmp_path, np.arange(6.0), u=[1, 1, 2, 2, 2, 1], x=[1, 1, 2, 3, 3, 1])
+    assert one(tmp_path, path).recording.samples == 6
+    part = one(tmp_path, path, '[rows]\nduplicates = "drop"')
+    np.testing.assert_array_equal(part.recording.t_s, [0, 2, 3, 5])
+
+
+def test_stale_positions_are_missing_when_asked(tmp_path):
+    path = log(tmp_path, np.arange(7.0), x=[1, 1, 1, 2, 3, 3, 1])
+    assert not np.isnan(one(tmp_path, path).recording.key_points_mm).any()
+    part = one(tmp_path, path, keys='repeated = "missing"')
+    lost = np.isnan(part.recording.key_points_mm).any(axis=2)
+    np.testing.assert_array_equal(lost, np.array([[0, 1, 1, 0, 0, 1, 0]] * 2, bool).T)
+    assert "k0 3, k1 3 of 7 rows" in part.notes[0]
+
+
+def test_settled_points_are_the_means_of_their_rows(tmp_path):
+    path = log(
+        tmp_path,
+        np.arange(8.0),
+        u=[1, 2, 3, 10, 20, 5, 7, 9],
+        x=[1, 2, 6, np.nan, 8, 0, 0, np.nan],
+        label=["a", "a", "a", "", "b", "b", "a", "a"],
+    )
+    part = one(tmp_path, path, '[rows]\naverage = "label"')
+    recording = part.recording
+    assert recording.kind == "settled"
+    np.testing.assert_allclose(recording.measured[:, 0], [2, 12.5, 8])
+    np.testing.assert_allclose(recording.t_s, [0, 3.5, 5.5])
+    np.testing.assert_allclose(recording.key_points_mm[:, 0, 0], [3, 4, 0])  # NaN is left out
+    assert "7 rows averaged into 3 settled points" in part.notes[-1]
+
+
+def test_frozen_rows_are_left_out_when_asked(tmp_path):
+    rng = np.random.default_rng(0)
+    t = np.arange(600) / 20
+    u = 10 * np.sin(t) + rng.normal(0, 0.1, 600)
+    u[200:320] = u[200]
+    path = log(tmp_path, t, u=u, x=10 * np.sin(t) + rng.normal(0, 0.1, 600))
+    assert one(tmp_path, path).recording.samples == 600
+    part = one(tmp_path, path, '[rows]\nfrozen = "drop"')
+    np.testing.assert_array_equal(part.recording.t_s, np.delete(t, slice(201, 320)))
+    assert "p1 frozen at 10.000 s of run 0: 119 rows left out" in part.notes[-1]
+
+
+def test_spikes_are_missing_when_asked(tmp_path):
+    rng = np.random.default_rng(0)
+    t = np.arange(600) / 20
+    x = 10 * np.sin(0.3 * t) + rng.normal(0, 0.02, 600)
+    x[300:303] += 9
+    path = log(tmp_path, t, u=np.sin(0.3 * t) + rng.normal(0, 0.01, 600), x=x)
+    content = ONE.replace('["x", "y", "w"]', '["y", "y", "w"]').replace("ROWS", "")
+    kept = run(tmp_path, [path], content.replace("KEYS", ""))[0]
+    assert not np.isnan(kept.recording.key_points_mm).any()
+    marked = run(tmp_path, [path], content.replace("KEYS", 'spikes = "missing"'))[0]
+    lost = np.argwhere(np.isnan(marked.recording.key_points_mm).all(axis=2)).tolist()
+    assert lost == [[300, 0], [301, 0], [302, 0]]
+    assert "spikes of key points count as missing: k0 3 of 600 rows" in marked.notes[-1]

@@ -1,0 +1,356 @@
+"""Laser ablation on the dose patch: fluence in, ablated depth and the state of the ring out.
+
+State in, state out, batched over environments. Between two moments the beam sweeps in a straight
+line from hit to hit; the dose of such a sweep has a closed form, so steps of any length add up to
+the same dose. Depth follows from the dose by the blow-off model in `tissue`: no heat conduction,
+no shielding by the plume, and the surface's shape stays as it was.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, SPACING_WAISTS, DosePatch, samples_at
+from surgisoft.scene.kernels import compiled
+from surgisoft.scene.tissue import Tissue
+
+REACH_WAISTS = 2.3
+"""The beam is followed out to so many 1/e^2 radii; 3e-5 of its power lies beyond."""
+COARSEST_WAISTS = 0.9
+"""Coarser patches than this share of the beam's 1/e^2 radius would lose energy and are refused."""
+STEEPEST_COSINE = 0.1
+"""Faces steeper than this to the beam (84 degrees) may miss the outermost part of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class AblationState:
+    """What the laser has done so far, for B environments, P samples, N stations. Frame: patch's."""
+
+    dose: torch.Tensor
+    """(B, P) float32 J/mm^2: radiant exposure of the surface."""
+    peak: torch.Tensor
+    """(B, N) float32 J/mm^2: highest dose inside the ring's band at each station."""
+    band_mm2: torch.Tensor
+    """(B, N) float32 mm^2: ablated area of the band at each station."""
+    zone_mm2: torch.Tensor
+    """(B, 3) float32 mm^2: ablated area by zone (lesion, ring, healthy)."""
+    zone_j: torch.Tensor
+    """(B, 3) float32 J: energy received by zone."""
+    delivered_j: torch.Tensor
+    """(B,) float32 J: energy that reached the organ, on the patch or off it."""
+    last_point_mm: torch.Tensor
+    """(B, 3) mm: where the beam ended at the last moment."""
+    last_direction: torch.Tensor
+    """(B, 3): the beam's direction at the last moment."""
+    last_on: torch.Tensor
+    """(B,) bool: whether the beam ended on the organ at the last moment."""
+
+
+_SUMS = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j", "delivered_j")
+"""The parts of the state that begin at zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class RingReport:
+    """How far the ring is done; (B,) tensors."""
+
+    completion: torch.Tensor
+    """0..1: share of the ring that is ablated to the asked depth."""
+    largest_gap_mm: torch.Tensor
+    """Length of the longest stretch that is not (mm)."""
+    largest_gap_deg: torch.Tensor
+    """The same as an angle: 360 degrees are the whole ring."""
+    width_mm: torch.Tensor
+    """Mean width of the cut where the ring is cut (mm), within the band; 0 for no cut."""
+    healthy_mm2: torch.Tensor
+    """Area of healthy tissue ablated, on the patch (mm^2)."""
+    healthy_j: torch.Tensor
+    """Energy that went into healthy tissue, on the patch and beyond it (J)."""
+    lesion_mm2: torch.Tensor
+    """Area ablated inside the ring (mm^2)."""
+    delivered_j: torch.Tensor
+    """Energy that reached the organ (J)."""
+
+
+class AblationMap:
+    """The laser on one patch; built once, advanced every step."""
+
+    def __init__(
+        self,
+        patch: DosePatch,
+        waist_mm: float,
+        tissue: Tissue | None = None,
+        depth_mm: float = 0.0,
+        device: str | torch.device = "cpu",
+    ):
+        """waist_mm is the beam's 1/e^2 radius; the ring counts as cut where it is depth_mm deep."""
+        if not 0.0 < waist_mm < math.inf:
+            raise InputError(f"laser waist is {waist_mm} mm: expected more than 0")
+        if not 0.0 <= depth_mm < math.inf:
+            raise InputError(f"ablation depth is {depth_mm} mm: expected 0 or more")
+        if patch.spacing_mm > COARSEST_WAISTS * waist_mm:
+            raise InputError(
+                f"dose patch of {patch.spacing_mm:g} mm is too coarse for a waist of "
+                f"{waist_mm:g} mm: cut it with a spacing of {SPACING_WAISTS * waist_mm:g} mm"
+            )
+        self.patch, self.waist_mm, self.tissue = patch, float(waist_mm), tissue or Tissue()
+        self.threshold = self.tissue.threshold_j_per_mm2
+        self.cut_dose = self.tissue.dose_for_depth(depth_mm)
+        self.device = torch.device(device)
+        self._samples = [
+            torch.tensor(array, device=self.device)
+            for array in (patch.points_mm, patch.normals, patch.areas_mm2)
+        ]
+        self._zone = torch.tensor(patch.zone, device=self.device, dtype=torch.int64)
+        self._station = torch.tensor(patch.station, device=self.device)
+
+    def start(self, point_mm, direction, on) -> AblationState:
+        """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool."""
+        count, patch = len(point_mm), self.patch
+        sizes = (
+            (count, len(patch.areas_mm2)),
+            (count, patch.stations),
+            (count, patch.stations),
+            (count, 3),
+            (count, 3),
+            (count,),
+        )
+        empty = [torch.zeros(size, device=self.device) for size in sizes]
+        return AblationState(*empty, *self._beam(point_mm, direction, on))
+
+    def reset(
+        self, state: AblationState, mask, point_mm, direction, on, in_place=False
+    ) -> AblationState:
+        """Fresh tissue where mask (B,) is set; the beam as for `start`.
+
+        With in_place the old state's tensors are given up.
+        """
+        new = self._beam(point_mm, direction, on)
+        old = (state.last_point_mm, state.last_direction, state.last_on)
+        beam = [
+            torch.where(mask.reshape(-1, *[1] * (o.ndim - 1)), n, o)
+            for n, o in zip(new, old, strict=True)
+        ]
+        kept = [getattr(state, name) for name in _SUMS]
+        if in_place:
+            for tensor in kept:
+                tensor[mask] = 0.0
+        else:
+            kept = [torch.where(mask.reshape(-1, *[1] * (t.ndim - 1)), 0.0, t) for t in kept]
+        return AblationState(*kept, *beam)
+
+    def advance(
+        self, state: AblationState, point_mm, direction, on, power_w, dt_s: float, in_place=False
+    ) -> AblationState:
+        """The state dt_s later, the beam having swept from its last place to this one.
+
+        point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
+        (B,), held over the step. Where the beam was on the organ at one end of the step only, half
+        of the step's energy goes there. With in_place the old state's tensors are given up.
+        """
+        point, aim, on = self._beam(point_mm, direction, on)
+        power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)
+        both, one = on & state.last_on, on ^ state.last_on
+        energy = torch.where(both, 1.0, torch.where(one, 0.5, 0.0)) * power * dt_s
+        energy = torch.where(energy > 0.0, energy, 0.0)
+        began = torch.where(state.last_on[:, None], state.last_point_mm, point)
+        ended = torch.where(on[:, None], point, state.last_point_mm)
+        before = torch.where(state.last_on[:, None], state.last_direction, aim)
+        after = torch.where(on[:, None], aim, state.last_direction)
+        middle = torch.nn.functional.normalize(before + after, dim=1)
+        tensors = (state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j)
+        if not in_place:
+            tensors = tuple(t.clone() for t in tensors)
+        deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
+        dose, peak, band, area, joule = deposit(began, ended, middle, energy, *tensors)
+        return AblationState(
+            dose, peak, band, area, joule, state.delivered_j + energy, point, aim, on
+        )
+
+    def _beam(self, point_mm, direction, on):
+        """The beam's end as float32, direction and flag; where either is not finite it is off."""
+        point = point_mm.detach().to(self.device, torch.float32)
+        aim = direction.detach().to(self.device, torch.float32)
+        on = torch.as_tensor(on, device=self.device)
+        finite = point.isfinite().all(1) & aim.isfinite().all(1)
+        held = finite[:, None]
+        return torch.where(held, point, 0.0), torch.where(held, aim, 0.0), on & finite
+
+    def _deposit(self, began, ended, direction, energy, dose, peak, band, area, joule):
+        patch, grid = self.patch, self.patch.buckets
+        beams = [t.contiguous().numpy() for t in (began, ended, direction, energy)]
+        kept = [t.numpy() for t in (dose, peak, band, area, joule)]
+        samples = (patch.points_mm, patch.normals, patch.areas_mm2, patch.zone, patch.station)
+        place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
+        _deposit(*beams, self.waist_mm, self.threshold, samples, place, *kept)
+        return dose, peak, band, area, joule
+
+    def _deposit_torch(self, began, ended, direction, energy, dose, peak, band, area, joule):
+        """The same on an accelerator: every sample of every environment, a few at a time."""
+        points, normals, areas = (t.float() for t in self._samples)
+        size = max(1, 32_000_000 // len(points))
+        for i in range(0, len(dose), size):
+            part = slice(i, i + size)
+            p, q, d = began[part], ended[part], direction[part]
+            gain = sweep_fluence(p, q, d, energy[part], self.waist_mm, points)
+            gain = gain * (-(d @ normals.T)).clamp(min=0.0)
+            after = dose[part] + gain
+            burnt = (after >= self.threshold) & (dose[part] < self.threshold)
+            shape = (len(p), len(points))
+            zone, station = self._zone.expand(shape), self._station.expand(shape)
+            in_ring = self._zone == RING
+            joule[part] = joule[part].scatter_add(1, zone, gain * areas)
+            area[part] = area[part].scatter_add(1, zone, burnt * areas)
+            band[part] = band[part].scatter_add(1, station, burnt * areas * in_ring)
+            peak[part] = peak[part].scatter_reduce(1, station, after * in_ring, "amax")
+            dose[part] = after
+        return dose, peak, band, area, joule
+
+    def report(self, state: AblationState) -> RingReport:
+        """How far the ring of each environment is done."""
+        cut = state.peak >= self.cut_dose
+        length = self.patch.ring_length_mm / self.patch.stations
+        gap = longest_run(~cut)
+        cut_length = cut.sum(1) * length
+        burnt = (state.band_mm2 * cut).sum(1)
+        beyond = (state.delivered_j - state.zone_j.sum(1)).clamp(min=0.0)
+        return RingReport(
+            completion=cut.float().mean(1),
+            largest_gap_mm=gap * length,
+            largest_gap_deg=gap * (360.0 / self.patch.stations),
+            width_mm=torch.where(cut_length > 0.0, burnt / cut_length.clamp(min=length), 0.0),
+            healthy_mm2=state.zone_mm2[:, HEALTHY],
+            healthy_j=state.zone_j[:, HEALTHY] + beyond,
+            lesion_mm2=state.zone_mm2[:, LESION],
+            delivered_j=state.delivered_j,
+        )
+
+    def paint(self, state: AblationState, environment: int = 0):
+        """For `render`: colours one environment's patch by dose, from blanched to charred."""
+        dose = state.dose[environment].detach().cpu().numpy()
+        share = np.clip(dose / self.threshold, 0.0, None)
+
+        def recolour(_faces, points, colours):
+            sample = samples_at(self.patch, points)
+            heat = np.where(sample >= 0, share[sample], 0.0)[:, None]
+            blanched = np.array([0.62, 0.50, 0.42])
+            charred = np.array([0.015, 0.012, 0.010])
+            pale = colours + (blanched - colours) * np.clip(heat, 0.0, 1.0)
+            return np.where(heat >= 1.0, charred, pale)
+
+        return recolour
+
+
+def sweep_fluence(began, ended, direction, energy, waist_mm: float, points_mm):
+    """Fluence (B, P) J/mm^2 across the beam at points (P, 3) mm, for a straight sweep.
+
+    A Gaussian beam, 2 E / (pi w^2) exp(-2 r^2 / w^2) (Siegman 1986, section 17.1), whose axis moves
+    evenly from began to ended (B, 3) mm while it points along direction (B, 3), with energy (B,) J:
+    across the sweep it stays a Gaussian, along it its integral is a difference of error functions.
+    """
+    away = points_mm[None] - began[:, None]
+    away = away - (away * direction[:, None]).sum(-1, keepdim=True) * direction[:, None]
+    sweep = ended - began
+    sweep = sweep - (sweep * direction).sum(-1, keepdim=True) * direction
+    length = sweep.norm(dim=-1)
+    unit = sweep / length.clamp(min=1e-9)[:, None]
+    along = (away * unit[:, None]).sum(-1)
+    across2 = away.square().sum(-1) - along.square()
+    peak = (2.0 * energy / (math.pi * waist_mm**2))[:, None]
+    scale = math.sqrt(2.0) / waist_mm
+    span = length.clamp(min=1e-3 * waist_mm)[:, None]
+    mean = (torch.erf(scale * along) - torch.erf(scale * (along - span))) / (scale * span)
+    moving = 0.5 * math.sqrt(math.pi) * mean
+    still = torch.exp(-((scale * (along - 0.5 * length[:, None])) ** 2))
+    profile = torch.where(length[:, None] > 1e-3 * waist_mm, moving, still)
+    return peak * torch.exp(-((scale**2) * across2.clamp(min=0.0))) * profile
+
+
+def longest_run(flags: torch.Tensor) -> torch.Tensor:
+    """(B,) length of the longest run of True in rings (B, N): the last neighbours the first."""
+    count = flags.shape[1]
+    twice = torch.cat((flags, flags), 1)
+    place = torch.arange(1, 2 * count + 1, device=flags.device)
+    broken = torch.where(twice, 0, place).cummax(1).values
+    return (place - broken).amax(1).clamp(max=count)
+
+
+@compiled
+def _deposit(
+    began, ended, direction, energy, waist, threshold, samples, place, dose, peak, band, area, joule
+):
+    """Add each environment's sweep to the samples near its path; see `sweep_fluence`."""
+    points, normals, areas, zone, station = samples
+    origin, cell, shape, starts = place
+    scale = math.sqrt(2.0) / waist
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(energy)):
+        if not energy[n] > 0.0:
+            continue
+        d0, d1, d2 = direction[n, 0], direction[n, 1], direction[n, 2]
+        reach = REACH_WAISTS * waist
+        for i in range(3):
+            # Where the beam meets steep faces the lit patch is longer along the beam.
+            tall = reach * (1.0 + abs(direction[n, i]) / STEEPEST_COSINE)
+            near = min(began[n, i], ended[n, i]) - tall - origin[i]
+            far = max(began[n, i], ended[n, i]) + tall - origin[i]
+            low[i] = max(0, math.floor(max(near / cell, -1.0)))
+            high[i] = min(shape[i] - 1, math.floor(min(far / cell, 1e6)))
+        m0, m1, m2 = ended[n, 0] - began[n, 0], ended[n, 1] - began[n, 1], ended[n, 2] - began[n, 2]
+        slip = m0 * d0 + m1 * d1 + m2 * d2
+        m0, m1, m2 = m0 - slip * d0, m1 - slip * d1, m2 - slip * d2
+        length = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+        moving = length > 1e-5 * waist
+        if moving:
+            m0, m1, m2 = m0 / length, m1 / length, m2 / length
+        strength = 2.0 * energy[n] / (math.pi * waist * waist)
+        for ci in range(low[0], high[0] + 1):
+            for cj in range(low[1], high[1] + 1):
+                for ck in range(low[2], high[2] + 1):
+                    cube = (ci * shape[1] + cj) * shape[2] + ck
+                    if starts[cube] == starts[cube + 1]:
+                        continue
+                    x = origin[0] + (ci + 0.5) * cell - began[n, 0]
+                    y = origin[1] + (cj + 0.5) * cell - began[n, 1]
+                    z = origin[2] + (ck + 0.5) * cell - began[n, 2]
+                    depth = x * d0 + y * d1 + z * d2
+                    along = (x * m0 + y * m1 + z * m2) if moving else 0.0
+                    along = min(max(along, 0.0), length)
+                    x = x - depth * d0 - along * m0
+                    y = y - depth * d1 - along * m1
+                    z = z - depth * d2 - along * m2
+                    if x * x + y * y + z * z > (reach + 0.87 * cell) ** 2:
+                        continue
+                    for s in range(starts[cube], starts[cube + 1]):
+                        cosine = -(d0 * normals[s, 0] + d1 * normals[s, 1] + d2 * normals[s, 2])
+                        if cosine <= 0.0:
+                            continue
+                        x = points[s, 0] - began[n, 0]
+                        y = points[s, 1] - began[n, 1]
+                        z = points[s, 2] - began[n, 2]
+                        depth = x * d0 + y * d1 + z * d2
+                        x, y, z = x - depth * d0, y - depth * d1, z - depth * d2
+                        along = (x * m0 + y * m1 + z * m2) if moving else 0.0
+                        across2 = x * x + y * y + z * z - along * along
+                        if across2 > reach * reach or along < -reach or along > length + reach:
+                            continue
+                        profile = math.exp(-scale * scale * max(across2, 0.0))
+                        if moving:
+                            span = math.erf(scale * along) - math.erf(scale * (along - length))
+                            profile *= 0.5 * math.sqrt(math.pi) * span / (scale * length)
+                        gain = strength * profile * cosine
+                        after = dose[n, s] + gain
+                        kind = zone[s]
+                        joule[n, kind] += gain * areas[s]
+                        if after >= threshold and dose[n, s] < threshold:
+                            area[n, kind] += areas[s]
+                            if kind == RING:
+                                band[n, station[s]] += areas[s]
+                        if kind == RING and after > peak[n, station[s]]:
+                            peak[n, station[s]] = after
+                        dose[n, s] = after

@@ -1,0 +1,293 @@
+"""The stretch of the organ's surface around the lesion on which the laser's dose is kept.
+
+The mesh's own faces are far coarser than a beam, so the faces near the ring are cut into small
+triangles; each keeps the dose at its centroid. With edges up to `SPACING_WAISTS` of the beam's
+1/e^2 radius a Gaussian is summed to better than 1 % wherever it lands.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.scene.kernels import compiled
+from surgisoft.scene.mesh import Mesh
+
+LESION, RING, HEALTHY = 0, 1, 2
+"""Zones of the patch: inside the ring, the ring itself, outside."""
+SPACING_WAISTS = 0.75
+"""Longest edge of a sample as a share of the beam's 1/e^2 radius."""
+LEAST_FACING = -0.2
+"""Faces turned away from the ring's own normal by more than this cosine are the far side."""
+MOST_SAMPLES = 400_000
+"""A patch that would need more samples than this is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class DosePatch:
+    """P sample triangles around a ring of N stations; frame of the mesh it was cut from."""
+
+    points_mm: np.ndarray
+    """(P, 3) float64 mm: centroids, sorted by bucket."""
+    normals: np.ndarray
+    """(P, 3) float64: outward unit normals of the faces."""
+    areas_mm2: np.ndarray
+    """(P,) float64 mm^2."""
+    faces: np.ndarray
+    """(P,) int64: face of the mesh that each sample was cut from."""
+    offset_mm: np.ndarray
+    """(P,) float64 mm: distance from the ring's path, negative inside the ring."""
+    station: np.ndarray
+    """(P,) int64: nearest of the N equal stretches of the ring."""
+    zone: np.ndarray
+    """(P,) int8: LESION, RING or HEALTHY."""
+    stations: int
+    """N: number of stretches of the ring."""
+    ring_length_mm: float
+    """Length of the ring's closed path (mm)."""
+    spacing_mm: float
+    """Longest edge of a sample (mm)."""
+    buckets: Buckets
+    """Where the samples are, for looking up those near a point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Buckets:
+    """Samples by the cubes of a grid: cube c holds samples starts[c] to starts[c + 1]."""
+
+    origin_mm: np.ndarray
+    """(3,) mm: lowest corner of the grid."""
+    cell_mm: float
+    """Edge of a cube (mm)."""
+    shape: tuple[int, int, int]
+    """Cubes along each axis."""
+    starts: np.ndarray
+    """(X Y Z + 1,) int64."""
+
+
+def cut_patch(
+    mesh: Mesh,
+    ring_mm: np.ndarray,
+    ring_normals: np.ndarray,
+    centre_mm: np.ndarray,
+    spacing_mm: float,
+    band_mm: float = 2.0,
+    margin_mm: float = 4.0,
+    station_mm: float = 0.5,
+) -> DosePatch:
+    """The patch of a closed ring (M, 3) mm with outward normals (M, 3) about centre_mm (3,).
+
+    Samples have edges of at most spacing_mm; the ring is the band of width band_mm along its path,
+    parted into stations of about station_mm; the patch reaches margin_mm beyond the path, and all
+    over the inside.
+    """
+    ring, normals = np.asarray(ring_mm, float), np.asarray(ring_normals, float)
+    centre = np.asarray(centre_mm, float)
+    if ring.ndim != 2 or len(ring) < 3 or ring.shape != normals.shape:
+        raise InputError(f"ring has shape {ring.shape}: expected (M, 3) points, M >= 3, normals")
+    if not (spacing_mm > 0.0 and 0.0 < band_mm <= 2.0 * margin_mm):
+        raise InputError(
+            f"dose patch: spacing {spacing_mm} mm, band {band_mm} mm, margin {margin_mm} mm; "
+            "expected all above 0 and the band within the margin"
+        )
+    reach = np.linalg.norm(ring - centre, axis=1).max() + margin_mm
+    near = _faces_near(mesh, ring, reach, centre)
+    points, faces, areas = _subdivide(mesh, near, spacing_mm, reach, centre)
+    steps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
+    along, offset = _ring_coordinates(points, ring, normals, centre, steps)
+    below = normals[np.searchsorted(np.cumsum(steps), along).clip(max=len(ring) - 1)]
+    facing = frames.dot(mesh.face_normals[faces], below) > LEAST_FACING
+    kept = (offset <= margin_mm) & facing
+    if not kept.any():
+        raise InputError("dose patch: the ring lies nowhere near the organ's surface")
+    order, buckets = _fill_buckets(points[kept], max(2.0 * spacing_mm, 0.5))
+    chosen = np.flatnonzero(kept)[order]
+    points, faces, areas, along, offset = (x[chosen] for x in (points, faces, areas, along, offset))
+    length = float(steps.sum())
+    stations = max(12, round(length / station_mm))
+    zone = np.where(np.abs(offset) <= 0.5 * band_mm, RING, np.where(offset < 0, LESION, HEALTHY))
+    station = np.minimum((along / length * stations).astype(np.int64), stations - 1)
+    if len(np.unique(station[zone == RING])) < stations:
+        raise InputError("dose patch: stretches of the ring have no surface below them; move it")
+    return DosePatch(
+        points_mm=points,
+        normals=np.array(mesh.face_normals[faces]),
+        areas_mm2=areas,
+        faces=faces,
+        offset_mm=offset,
+        station=station,
+        zone=zone.astype(np.int8),
+        stations=stations,
+        ring_length_mm=length,
+        spacing_mm=float(spacing_mm),
+        buckets=buckets,
+    )
+
+
+def _faces_near(mesh: Mesh, ring: np.ndarray, reach: float, centre: np.ndarray) -> np.ndarray:
+    """Faces within reach of the centre that hang together with those under the ring."""
+    corners = mesh.triangles_mm
+    size = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    middles = corners.mean(axis=1)
+    candidates = np.flatnonzero(frames.norm(middles - centre) <= reach + size)
+    if len(candidates) == 0:
+        return candidates
+    label = np.arange(len(mesh.vertices_mm))
+    faces = mesh.faces[candidates]
+    while True:
+        least = label[faces].min(axis=1)
+        before = label.copy()
+        np.minimum.at(label, faces.ravel(), np.repeat(least, 3))
+        label = label[label]
+        if np.array_equal(before, label):
+            break
+    below = [np.argmin(frames.norm(middles[candidates] - p)) for p in ring]
+    parts = np.unique(label[faces[below, 0]])
+    return candidates[np.isin(label[faces[:, 0]], parts)]
+
+
+def _subdivide(mesh: Mesh, faces: np.ndarray, spacing: float, reach: float, centre: np.ndarray):
+    """Centroids (P, 3), face numbers (P,) and areas (P,) of small triangles within reach.
+
+    Large faces are quartered, leaving out what lies beyond reach, until n^2 equal parts of each
+    piece do the rest.
+    """
+    corners, owner = mesh.triangles_mm[faces], faces
+    while True:
+        middles = corners.mean(axis=1)
+        size = frames.norm(corners - middles[:, None]).max(axis=1)
+        kept = frames.norm(middles - centre) <= reach + size
+        corners, owner = corners[kept], owner[kept]
+        edges = frames.norm(np.roll(corners, -1, axis=1) - corners).max(axis=1, initial=0.0)
+        large = edges > 8.0 * spacing
+        if not large.any():
+            break
+        _check_count(len(corners), spacing)
+        quarters = np.einsum("qkc,fcx->fqkx", _QUARTERS, corners[large]).reshape(-1, 3, 3)
+        corners = np.concatenate((corners[~large], quarters))
+        owner = np.concatenate((owner[~large], np.repeat(owner[large], 4)))
+    parts = np.maximum(1, np.ceil(edges / spacing).astype(int))
+    _check_count(int((parts**2).sum()), spacing)
+    area = 0.5 * frames.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    points, owners, areas = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0)]
+    for n in np.unique(parts):
+        chosen = parts == n
+        weights = _centroid_weights(int(n))
+        points.append(np.einsum("kc,fcx->fkx", weights, corners[chosen]).reshape(-1, 3))
+        owners.append(np.repeat(owner[chosen], n * n))
+        areas.append(np.repeat(area[chosen] / (n * n), n * n))
+    return tuple(np.concatenate(x) for x in (points, owners, areas))
+
+
+def _check_count(count: int, spacing: float) -> None:
+    if count > MOST_SAMPLES:
+        raise InputError(
+            f"dose patch: {count} samples of {spacing} mm and counting; expected at most "
+            f"{MOST_SAMPLES}: use a larger spot or a smaller lesion"
+        )
+
+
+_QUARTERS = 0.5 * np.array(
+    [
+        [[2, 0, 0], [1, 1, 0], [1, 0, 1]],
+        [[1, 1, 0], [0, 2, 0], [0, 1, 1]],
+        [[1, 0, 1], [0, 1, 1], [0, 0, 2]],
+        [[1, 1, 0], [0, 1, 1], [1, 0, 1]],
+    ]
+)
+"""(4, 3, 3) barycentric corners of a triangle's four equal parts."""
+
+
+def _centroid_weights(n: int) -> np.ndarray:
+    """(n^2, 3) barycentric centroids of a triangle cut into n^2 equal ones."""
+    upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+    hanging = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - i - 1)]
+    v, w = np.array(upright + hanging).T / n
+    return np.stack((1 - v - w, v, w), axis=1)
+
+
+def _ring_coordinates(points, ring, normals, centre, steps):
+    """Arc length along the ring (P,) and signed distance from it (P,), mm, of points (P, 3).
+
+    Negative is the side on which the centre lies, seen along the ring's normal there.
+    """
+    along, offset, side = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
+    _nearest_on_ring(points, ring, normals, steps, along, offset, side)
+    at_centre = [np.empty(1) for _ in range(3)]
+    _nearest_on_ring(centre[None], ring, normals, steps, *at_centre)
+    inward = 1.0 if at_centre[2][0] >= 0.0 else -1.0
+    return along, np.where(side * inward > 0.0, -offset, offset)
+
+
+@compiled
+def _nearest_on_ring(points, ring, normals, steps, along, offset, side):
+    """Nearest point of the closed polyline: its arc length, the distance, and on which side."""
+    count = len(ring)
+    for p in range(len(points)):
+        best, arc = np.inf, 0.0
+        for m in range(count):
+            k = (m + 1) % count
+            ex, ey, ez = ring[k, 0] - ring[m, 0], ring[k, 1] - ring[m, 1], ring[k, 2] - ring[m, 2]
+            x, y, z = (
+                points[p, 0] - ring[m, 0],
+                points[p, 1] - ring[m, 1],
+                points[p, 2] - ring[m, 2],
+            )
+            share = (x * ex + y * ey + z * ez) / max(ex * ex + ey * ey + ez * ez, 1e-300)
+            share = min(max(share, 0.0), 1.0)
+            x, y, z = x - share * ex, y - share * ey, z - share * ez
+            d2 = x * x + y * y + z * z
+            if d2 < best:
+                best = d2
+                along[p] = arc + share * steps[m]
+                nx, ny = normals[m, 0] + normals[k, 0], normals[m, 1] + normals[k, 1]
+                nz = normals[m, 2] + normals[k, 2]
+                side[p] = nx * (ey * z - ez * y) + ny * (ez * x - ex * z) + nz * (ex * y - ey * x)
+            arc += steps[m]
+        offset[p] = np.sqrt(best)
+
+
+def _fill_buckets(points: np.ndarray, cell: float) -> tuple[np.ndarray, Buckets]:
+    """The order (P,) that sorts points (P, 3) mm by bucket, and the buckets then."""
+    origin = points.min(axis=0) - 1e-6
+    index = np.floor((points - origin) / cell).astype(np.int64)
+    shape = tuple(int(n) for n in index.max(axis=0) + 1)
+    flat = np.ravel_multi_index(tuple(index.T), shape)
+    order = np.argsort(flat, kind="stable")
+    starts = np.searchsorted(flat[order], np.arange(int(np.prod(shape)) + 1))
+    return order, Buckets(origin, cell, shape, starts.astype(np.int64))
+
+
+def samples_at(patch: DosePatch, points_mm: np.ndarray) -> np.ndarray:
+    """(N,) nearest sample to surface points (N, 3) mm; -1 farther than a bucket from any."""
+    grid, out = patch.buckets, np.full(len(points_mm), -1, dtype=np.int64)
+    place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
+    _nearest_sample(np.ascontiguousarray(points_mm, dtype=float), patch.points_mm, place, out)
+    return out
+
+
+@compiled
+def _nearest_sample(points, samples, place, out):
+    origin, cell, shape, starts = place
+    for n in range(len(points)):
+        best = cell * cell
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for i in range(3):
+            index = (points[n, i] - origin[i]) / cell
+            index = math.floor(min(max(index, -2.0), shape[i] + 1.0))
+            low[i], high[i] = max(index - 1, 0), min(index + 1, shape[i] - 1)
+        for ci in range(low[0], high[0] + 1):
+            for cj in range(low[1], high[1] + 1):
+                for ck in range(low[2], high[2] + 1):
+                    cube = (ci * shape[1] + cj) * shape[2] + ck
+                    for k in range(starts[cube], starts[cube + 1]):
+                        x = samples[k, 0] - points[n, 0]
+                        y = samples[k, 1] - points[n, 1]
+                        z = samples[k, 2] - points[n, 2]
+                        d2 = x * x + y * y + z * z
+                        if d2 < best:
+                            best, out[n] = d2, k

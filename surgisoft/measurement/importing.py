@@ -31,6 +31,7 @@ from surgisoft.measurement.importing_spec import (
     ContextMap,
     FileRole,
     ImportMap,
+    PointMap,
 )
 from surgisoft.measurement.importing_table import RawTable, parquet_table
 from surgisoft.measurement.importing_text import text_table
@@ -69,7 +70,7 @@ def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path
     A role with one file serves every set.
     """
     by_role: dict[str, list[Path]] = {role.name: [] for role in spec.files}
-    for path in _files(paths):
+    for path in _files(paths, spec):
         by_role[_role_of(path, spec).name].append(path)
     main = by_role[spec.files[0].name]
     needed = {s.file for s in (spec.measured, spec.commanded, spec.key_points) if s}
@@ -91,13 +92,14 @@ def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path
     ]
 
 
-def _files(paths: Sequence[Path]) -> list[Path]:
+def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
+    """The files given, and those of folders that have a role."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.is_file() and p.name[0] != ".")
+            inside = sorted(p for p in path.iterdir() if p.is_file() and _roles_of(p, spec))
             if not inside:
-                raise InputError(f"{path}: an empty folder, expected raw files")
+                raise InputError(f"{path}: no file here fits the map, expected {_patterns(spec)}")
             found += inside
         elif path.is_file():
             found.append(path)
@@ -108,13 +110,25 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+def _roles_of(path: Path, spec: ImportMap) -> list[FileRole]:
+    """The roles whose pattern and format fit."""
+    return [
+        role
+        for role in spec.files
+        if fnmatch.fnmatch(path.name, role.match) and (role.format != "motive" or is_motive(path))
+    ]
+
+
 def _role_of(path: Path, spec: ImportMap) -> FileRole:
-    """The first role whose pattern and format fit."""
-    for role in spec.files:
-        if fnmatch.fnmatch(path.name, role.match) and (role.format != "motive" or is_motive(path)):
-            return role
-    patterns = ", ".join(f"[file.{role.name}] '{role.match}'" for role in spec.files)
-    raise InputError(f"{path}: fits no file of the map, expected one of {patterns}")
+    """The first role that fits."""
+    roles = _roles_of(path, spec)
+    if not roles:
+        raise InputError(f"{path}: fits no file of the map, expected {_patterns(spec)}")
+    return roles[0]
+
+
+def _patterns(spec: ImportMap) -> str:
+    return "one of " + ", ".join(f"[file.{role.name}] '{role.match}'" for role in spec.files)
 
 
 def _open(path: Path, role: FileRole) -> RawTable:
@@ -135,6 +149,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     commanded = commanded if commanded and commanded.columns else None
     _check_actuation(measured, commanded, tables)
     points = key_point_maps(spec.key_points, tables[spec.key_points.file])
+    _check_orientations(points, spec, tables)
     needed: dict[str, list[Column]] = {name: [] for name in tables}
     needed[measured.file] += measured.columns
     needed[spec.key_points.file] += needed_columns(points, spec.frame)
@@ -165,6 +180,18 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     draft, notes = tidy(draft, spec, joined.main.cells.place)
     recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
     return Imported(recording, [*joined.notes, *placed.notes, *notes])
+
+
+def _check_orientations(
+    points: tuple[PointMap, ...], spec: ImportMap, tables: dict[str, RawTable]
+) -> None:
+    role = spec.role(spec.key_points.file)
+    turned = spec.frame.base is not None or any(point.quaternion for point in points)
+    if turned and role.join == "time" and role.interpolate == "linear":
+        raise InputError(
+            f"{tables[role.name].path}: orientations cannot be interpolated between its rows; make "
+            f'it the map\'s first file, or set interpolate = "previous" in [file.{role.name}]'
+        )
 
 
 def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) -> ActuationMap:

@@ -190,7 +190,9 @@ def _dates(table: RawTable, column: Column) -> np.ndarray:
 
 
 def main_times(main: RawTable, spec: ImportMap, count: int | None) -> np.ndarray:
-    """(T,) the main file's clock [s]: its time column, or its rows at the nominal rate."""
+    """(T,) the main file's clock [s]: its time column, or its frames or rows at a nominal rate."""
+    if spec.time.column is not None and spec.time.rate_hz is not None:
+        return times(main, spec.time.column, "s") / spec.time.rate_hz
     if spec.time.column is not None:
         return times(main, spec.time.column, spec.time.unit)
     if count is None:

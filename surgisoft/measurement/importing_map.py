@@ -129,11 +129,8 @@ def _time(top: Section, main: str) -> TimeMap:
     section = _needed(top, "time")
     column = section.column("column", None)
     rate = section.number("rate_hz", None, least=0.0)
-    if (column is None) == (rate is None):
-        raise section.where.error(
-            "both column and rate_hz" if column is not None else "neither column nor rate_hz",
-            "one of them",
-        )
+    if column is None and rate is None:
+        raise section.where.error("neither column nor rate_hz", "a column, a rate, or both")
     unit = section.choice("unit", "s", (*SECONDS_PER, "iso"))
     zero = section.choice("zero", "file", ("file", "recording", "none"))
     section.close()

@@ -61,7 +61,7 @@ class TimeMap:
     unit: str = "s"
     """A unit of time, or "iso" for dates such as 2024-05-01T12:00:00.25."""
     rate_hz: float | None = None
-    """Nominal rate where there are no time stamps [Hz]."""
+    """Nominal rate where there are no time stamps [Hz]; with a column, the column counts frames."""
     zero: str = "file"
     """"file": each file starts at 0; "recording": the first one does; "none": as it is."""
 

@@ -136,8 +136,11 @@ def test_raw_folder_stands_for_its_files(tmp_path):
     folder = tmp_path / "raw"
     folder.mkdir()
     pair(folder, 5, 5)
+    written(folder / "LICENSE", "not a table")
     (part,) = run(tmp_path, [folder], TWO.replace("OFFSET", ""))
     assert part.recording.samples == 5
+    with pytest.raises(InputError, match="no file here fits the map, expected one of"):
+        run(tmp_path, [tmp_path], TWO.replace("OFFSET", ""))
 
 
 # --- rows and runs of one file -----------------------------------------------------------------

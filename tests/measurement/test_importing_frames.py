@@ -1,0 +1,170 @@
+"""Positions of a room come into the arm's base frame, however the frame is given."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from surgisoft.errors import InputError
+
+from .test_importing import imported, text, written
+
+
+def arm_in_a_room(seed, rows=60):
+    """Three key points of an arm (T, 3, 3) [mm] in its frame, a mount, and the same in the room."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / 20
+    bend = 20 * np.sin(t)[:, None] * [0, 0.4, 1.0]
+    points = np.stack([bend, 0.3 * bend, np.broadcast_to([0, 40, 80.0], bend.shape)], axis=2)
+    mount = Rotation.random(random_state=seed % 2**31)
+    return t, points, mount, mount.apply(points.reshape(-1, 3)).reshape(points.shape) + 500, rng
+
+
+POSE = ["bx", "by", "bz", "qx", "qy", "qz", "qw"]
+POSED = """
+[time]
+column = "t"
+[measured]
+columns = ["u1"]
+unit = "kPa"
+[key_points]
+positions = [["x0", "y0", "z0"], ["x1", "y1", "z1"], ["x2", "y2", "z2"]]
+unit = "mm"
+[frame]
+gravity = [0, -1, 0]
+"""
+BODY = """
+[frame.base]
+position = ["bx", "by", "bz"]
+quaternion = ["qx", "qy", "qz", "qw"]
+"""
+
+
+def posed(path, t, room, pose):
+    names = ["t", "u1", *(f"{a}{j}" for j in range(3) for a in "xyz"), *POSE]
+    columns = [t[:, None], np.ones((len(t), 1)), room.reshape(len(t), 9), pose]
+    return written(path, text(np.concatenate(columns, axis=1), header=names))
+
+
+@pytest.mark.parametrize("mode", ["fixed", "rest", "moving"])
+@given(seed=st.integers(0, 2**32))
+def test_pose_of_a_base_body_whose_quaternion_flips(tmp_path_factory, mode, seed):
+    tmp_path = tmp_path_factory.mktemp("pose")
+    t, points, mount, room, rng = arm_in_a_room(seed)
+    q = mount.as_quat() * rng.choice([-1, 1], (len(t), 1))
+    pose = np.concatenate([np.full((len(t), 3), 500.0), q], axis=1)
+    path = posed(tmp_path / "a.csv", t, room, pose)
+    recording, _ = imported(tmp_path, path, f'{POSED}{BODY}mode = "{mode}"\n')
+    np.testing.assert_allclose(recording.key_points_mm, points, atol=1e-9)
+    np.testing.assert_allclose(recording.gravity, mount.inv().apply([0, -1, 0]), atol=1e-12)
+
+
+def test_moving_base_is_taken_out_row_by_row(tmp_path):
+    t, points, _, _, rng = arm_in_a_room(4)
+    mounts = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.05, (len(t), 3)), axis=0))
+    shifts = np.cumsum(rng.normal(0, 3, (len(t), 3)), axis=0)
+    room = np.einsum("tij,tnj->tni", mounts.as_matrix(), points) + shifts[:, None]
+    pose = np.concatenate([shifts, mounts.as_quat()], axis=1)
+    pose[7, 3:] = 0.0  # the cameras lost the base
+    path = posed(tmp_path / "a.csv", t, room, pose)
+    recording, _ = imported(tmp_path, path, f'{POSED}{BODY}mode = "moving"\n')
+    expected = points.copy()
+    expected[7] = np.nan
+    np.testing.assert_allclose(recording.key_points_mm, expected, atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**32))
+def test_constant_rotation_and_origin(tmp_path_factory, seed):
+    tmp_path = tmp_path_factory.mktemp("matrix")
+    t, points, mount, room, _ = arm_in_a_room(seed)
+    path = posed(tmp_path / "a.csv", t, room, np.zeros((len(t), 7)))
+    rows = mount.inv().as_matrix().tolist()
+    frame = f"rotation = {rows}\norigin = [500, 500, 500]\n"
+    recording, notes = imported(tmp_path, path, POSED + frame)
+    np.testing.assert_allclose(recording.key_points_mm, points, atol=1e-9)
+    np.testing.assert_allclose(recording.gravity, mount.inv().apply([0, -1, 0]), atol=1e-12)
+    assert notes == []
+    quaternion = mount.inv().as_quat().tolist()
+    frame = f"rotation = {quaternion}\norigin = [500, 500, 500]\n"
+    np.testing.assert_allclose(
+        imported(tmp_path, path, POSED + frame)[0].key_points_mm, points, atol=1e-9
+    )
+
+
+@given(seed=st.integers(0, 2**32))
+def test_frame_from_the_arm_at_rest(tmp_path_factory, seed):
+    """With origin k0 and z along the arm at rest, any mount gives the same up to heading."""
+    tmp_path = tmp_path_factory.mktemp("rest")
+    t, points, _, room, _ = arm_in_a_room(seed)
+    path = posed(tmp_path / "a.csv", t, room, np.zeros((len(t), 7)))
+    frame = 'origin = "k0"\nalign_z = "rest"\nrest_rows = 1\n'
+    found = imported(tmp_path, path, POSED + frame)[0].key_points_mm
+    np.testing.assert_allclose(found[0], points[0], atol=1e-9)
+    np.testing.assert_allclose(found[..., 2], points[..., 2], atol=1e-9)
+    distances = np.linalg.norm(found[:, None, 2] - found[None, :, 2], axis=2)
+    expected = np.linalg.norm(points[:, None, 2] - points[None, :, 2], axis=2)
+    np.testing.assert_allclose(distances, expected, atol=1e-9)
+    assert np.linalg.det([*found[[20, 40], 2].tolist(), [0, 0, 1]]) == pytest.approx(
+        np.linalg.det([*points[[20, 40], 2].tolist(), [0, 0, 1]]), abs=1e-6
+    )
+
+
+def test_arm_that_does_not_point_along_z_is_said(tmp_path):
+    t, points, _, _, _ = arm_in_a_room(0)
+    path = posed(tmp_path / "a.csv", t, points[..., [2, 0, 1]], np.zeros((len(t), 7)))
+    _, notes = imported(tmp_path, path, POSED)
+    chord = points[:20, 2].mean(axis=0) - points[:20, 0].mean(axis=0)
+    angle = np.degrees(np.arccos(chord[1] / np.linalg.norm(chord)))
+    assert f"in the first 20 rows the arm points {angle:.0f} degrees away from z" in notes[0]
+    assert angle > 80
+
+
+def test_point_beside_a_body_turns_with_it(tmp_path):
+    """A key point 22 mm along the body's own z axis: position + R(q) offset."""
+    t = np.arange(12) / 10
+    turns = Rotation.from_rotvec(t[:, None] * [0, 1, 0])
+    position = np.stack([t, 2 * t, 3 * t], axis=1)
+    q = turns.as_quat()[:, [3, 0, 1, 2]]
+    values = np.concatenate([t[:, None], np.ones((12, 1)), position, q], axis=1)
+    names = ["t", "u", "x", "y", "z", "qw", "qx", "qy", "qz"]
+    path = written(tmp_path / "a.csv", text(values, header=names))
+    content = """
+        [time]
+        column = "t"
+        [measured]
+        columns = ["u"]
+        unit = "kPa"
+        [key_points]
+        unit = "cm"
+        quaternion_order = "wxyz"
+        [[key_points.point]]
+        position = ["x", "y", "z"]
+        [[key_points.point]]
+        position = ["x", "y", "z"]
+        quaternion = ["qw", "qx", "qy", "qz"]
+        offset = [0, 0, 2.2]
+    """
+    found = imported(tmp_path, path, content)[0].key_points_mm
+    np.testing.assert_allclose(found[:, 0], 10 * position)
+    along = np.stack([np.sin(t), 0 * t, np.cos(t)], axis=1)
+    np.testing.assert_allclose(found[:, 1] - found[:, 0], 22 * along, atol=1e-12)
+
+
+def test_orientations_are_not_interpolated(tmp_path):
+    t, _, _, room, _ = arm_in_a_room(1)
+    pose = np.tile([0, 0, 0, 0, 0, 0, 1.0], (len(t), 1))
+    files = [
+        written(tmp_path / "log.csv", text(np.stack([t, t], axis=1), header=["t", "u1"])),
+        posed(tmp_path / "mocap.csv", t, room, pose),
+    ]
+    content = (
+        '[file.log]\nmatch = "log*"\n[file.mocap]\njoin = "time"\ntime = "t"\n'
+        + POSED.replace("[key_points]", '[key_points]\nfile = "mocap"')
+    )
+    recording, _ = imported(tmp_path, files, content)
+    np.testing.assert_allclose(recording.key_points_mm, room, atol=1e-9)
+    with pytest.raises(InputError, match="orientations cannot be interpolated between its rows"):
+        imported(tmp_path, files, content + BODY)
+    held = content.replace('time = "t"', 'time = "t"\ninterpolate = "previous"')
+    np.testing.assert_allclose(imported(tmp_path, files, held + BODY)[0].key_points_mm, room)

@@ -39,7 +39,7 @@ MOUNT = (0.42, 0.0, math.sqrt(1.0 - 0.42**2))
 REST_S = 30.0
 """Time that a reset takes: venting and resting [s]."""
 HEAVIEST_G = 20.0
-"""Largest payload that the arm carries in every posture [g]."""
+"""Largest payload that is taken for meant [g]; a hanging arm carries it, an upright one buckles."""
 CHUNK = 64
 """Points or frames times ten that are computed between two reports of progress."""
 

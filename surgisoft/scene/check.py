@@ -8,19 +8,22 @@ import torch
 
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.capsules import ArmShape, ray_chain
+from surgisoft.scene.camera import view
+from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import circle_on, nearest_on_surface
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import TOOLS
-from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, in_picture, look_at_lesion
+from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, look_at_lesion
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """What a ring point's code means, in the order in which they are looked for."""
 PATCH_SHARES = np.linspace(0.1, 1.6, 16)
 """Circles of the reachability map, in diameters of the lesion."""
 
+VIEW_EVERY = 3
+"""The view is looked at with the beam on every third ring point: 15 degrees of the ring."""
 PLANNING_NODES = 150_000
 """Nodes of the distance fields for planning: coarse, since near the surface distances are exact."""
 
@@ -56,7 +59,7 @@ class SceneCheck:
     clearance_mm: np.ndarray
     """(M,) mm: least clearance of both arms with the beam on each ring point."""
     view: np.ndarray
-    """(M,) fraction of the ring in view with the beam on each ring point."""
+    """(M / VIEW_EVERY,) fraction of the ring in view with the beam on every VIEW_EVERYth point."""
 
     @property
     def good(self) -> bool:
@@ -117,10 +120,10 @@ def check_scene(
     tests = (~cut.in_reach, cut.steep, ~landed, clearance < limits.clearance_mm, jumps)
     reason = np.select(tests, range(1, 6), 0)
     reason[(reason == 0) & (clearance < needed)] = 4
-    view = _view(referee, look, shapes, scene)
+    in_view = _view(referee, look, shapes, scene)
     report(len(shapes) + 1, len(shapes) + 2, "ways")
     touching, way_mm, half_step_mm = _ways(referee, arms, cut, look)
-    findings = (*_mesh_findings(scene), *_work_findings(scene, reason, clearance, view, look))
+    findings = (*_mesh_findings(scene), *_work_findings(scene, reason, clearance, in_view, look))
     findings += (
         Finding(
             "contacts at rest and on the way",
@@ -129,7 +132,7 @@ def check_scene(
             not touching and way_mm >= max(limits.clearance_mm, half_step_mm),
         ),
     )
-    return SceneCheck(findings, reason, cut, look, clearance, view)
+    return SceneCheck(findings, reason, cut, look, clearance, in_view)
 
 
 def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
@@ -153,7 +156,7 @@ def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
     return tuple(rows)
 
 
-def _work_findings(scene, reason, clearance, view, look) -> tuple[Finding, ...]:
+def _work_findings(scene, reason, clearance, in_view, look) -> tuple[Finding, ...]:
     limits, camera = scene.spec.limits, scene.spec.camera
     lacking = [
         f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
@@ -174,9 +177,9 @@ def _work_findings(scene, reason, clearance, view, look) -> tuple[Finding, ...]:
         ),
         Finding(
             "ring in view",
-            f"{100 * view.min():.0f} %",
+            f"{100 * in_view.min():.0f} %",
             f"{100 * limits.view_fraction:.0f} %",
-            bool(view.min() >= limits.view_fraction),
+            bool(in_view.min() >= limits.view_fraction),
         ),
         Finding(
             "camera to lesion",
@@ -188,19 +191,13 @@ def _work_findings(scene, reason, clearance, view, look) -> tuple[Finding, ...]:
 
 
 def _view(referee: Referee, look: Look, shapes: list[ArmShape], scene: Scene) -> np.ndarray:
-    """(M,) fraction of ring points in the picture and hidden by no body and not by the laser."""
-    points, eye = scene.ring.points_mm, look.line_mm[-1]
-    towards = points - eye
-    length = np.linalg.norm(towards, axis=1)
-    towards /= length[:, None]
-    hit = referee.cast(np.tile(eye, (len(points), 1)), towards, float(length.max()) + 50.0)
-    free = hit.on_organ & (np.abs(hit.distance_mm - length) <= LANDED_MM)
-    free &= in_picture(eye, look.direction, points, scene.spec.camera)
-    fractions = []
-    for shape in shapes:
-        first, _ = ray_chain(eye, towards, shape.centreline_mm, shape.radius_mm)
-        fractions.append(np.mean(free & (first >= length)))
-    return np.array(fractions)
+    """Fraction of ring points in view with the laser on every VIEW_EVERYth of them."""
+    camera, ring = scene.spec.camera.camera(), scene.ring
+    looks = (
+        view(referee, camera, look.pose, ring.points_mm, ring.normals, {"laser": shape})
+        for shape in shapes[::VIEW_EVERY]
+    )
+    return np.array([one.fraction for one in looks])
 
 
 def _ways(referee: Referee, arms: dict[str, Held], cut: Cut, look: Look):

@@ -13,6 +13,7 @@ import torch
 
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.camera import view
 from surgisoft.scene.distance import chains_apart
 from surgisoft.scene.lesion import Ring
 from surgisoft.scene.reach import ArmReach
@@ -22,20 +23,20 @@ from surgisoft.scene.sweep import (
     Held,
     Look,
     cut_ring,
-    in_picture,
     look_at_lesion,
     placed,
-    seen,
 )
 
 BENDS_RAD = np.radians([0.0, 25.0, 50.0])
 """How far the arm is bent when it looks at the lesion's centre (rad)."""
 ROLLS = 8
 """Sides to which a bent arm's base may lie, seen along the beam."""
-LASERS, LOOKS = 10, 40
+LASERS, LOOKS = 12, 40
 """How many of the best mounts of each kind are tried together."""
 MOST_JUDGED = 240
 """How many mounts of each kind are judged on the whole ring."""
+PORTS_MM = 100.0
+"""Shafts farther apart than two ports in an abdominal wall gain nothing more (mm)."""
 COMFORT_MM = 10.0
 """Clearance beyond this is worth nothing more (mm)."""
 
@@ -249,9 +250,8 @@ def _judge_look(engine, arm: Held, ring: Ring, camera: CameraSpec, limits: Limit
     answer = engine.clearance({"endoscope": torch.from_numpy(way)})
     least = float(min(answer.bodies_mm.min(), answer.self_mm.min()))
     needed = max(limits.clearance_mm, 0.5 * np.linalg.norm(np.diff(way, axis=0), axis=-1).max())
-    eye = look.line_mm[-1]
-    visible = in_picture(eye, look.direction, ring.points_mm, camera)
-    visible &= seen(engine, eye[None], ring.points_mm)[0]
+    pose = torch.from_numpy(look.pose[None])
+    visible = view(engine, camera.camera(), pose, ring.points_mm, ring.normals).visible[0].numpy()
     base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
     middle = 0.5 * (camera.range_mm[0] + camera.range_mm[1])
     score = (
@@ -311,11 +311,11 @@ def find_mounts(
 
 
 def _spread(sites: list, count: int) -> list:
-    """The best sites, at most `count`, each with its base at least 15 mm from the others'."""
+    """The best sites, at most `count`, each with its base at least 25 mm from the others'."""
     chosen: list = []
     for site in sites:
         place = site.arm.pose[:3, 3]
-        if all(np.linalg.norm(place - other.arm.pose[:3, 3]) >= 15.0 for other in chosen):
+        if all(np.linalg.norm(place - other.arm.pose[:3, 3]) >= 25.0 for other in chosen):
             chosen.append(site)
         if len(chosen) == count:
             break
@@ -338,26 +338,35 @@ def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
             steps = [np.linalg.norm(np.diff(a, axis=0), axis=-1).max() for a in (work, way)]
             if apart < max(limits.clearance_mm, 0.5 * max(steps)):
                 continue
-            score = laser.score + look.score + 1.5 * min(apart, 2 * COMFORT_MM) / COMFORT_MM
+            score = laser.score + look.score + min(apart, COMFORT_MM) / COMFORT_MM
+            score += 3.0 * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
             pairs.append(Pair(laser, look, apart, float(look.visible.mean()), score))
     pairs.sort(key=lambda pair: -pair.score)
     seen_pairs = []
     for pair in pairs:
-        view = least_view(engine, pair.look.look, pair.laser.cut.lines_mm, ring, camera)
-        if view >= limits.view_fraction:
-            seen_pairs.append(replace(pair, view=view))
+        fraction = least_view(engine, pair.look.look, pair.laser.cut.lines_mm, ring, camera)
+        if fraction >= limits.view_fraction:
+            seen_pairs.append(replace(pair, view=fraction))
         if len(seen_pairs) == 5:
             break
     return seen_pairs
 
 
+def _ports_apart_mm(first: Held, second: Held) -> float:
+    """Distance of the two shafts where they are nearest: at their bases or at their far ends."""
+    ends = [
+        np.array([arm.pose[:3, 3] - s * arm.pose[:3, 2] for s in (0.0, arm.shaft_mm)])
+        for arm in (first, second)
+    ]
+    return float(np.linalg.norm(ends[0] - ends[1], axis=1).min())
+
+
 def least_view(engine, look: Look, laser_lines_mm, ring: Ring, camera: CameraSpec) -> float:
     """Least fraction of the ring in view while the laser arm stands at each of its lines."""
-    count = len(laser_lines_mm)
-    eye, direction = look.line_mm[-1], look.direction
-    picture = in_picture(eye, direction, ring.points_mm, camera)
-    free = seen(engine, np.tile(eye, (count, 1)), ring.points_mm, {"laser": laser_lines_mm})
-    return float((free & picture).mean(axis=1).min())
+    poses = torch.from_numpy(np.tile(look.pose, (len(laser_lines_mm), 1, 1)))
+    arms = {"laser": torch.from_numpy(laser_lines_mm)}
+    views = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, arms)
+    return float(views.fraction.min())
 
 
 def _laser_lack(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> str:

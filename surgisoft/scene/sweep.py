@@ -7,10 +7,8 @@ by the referee (`check`). Everything is in the world frame.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from surgisoft.scene import frames
-from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.lesion import Ring
 from surgisoft.scene.reach import ArmReach, aim, nearest_commands
 from surgisoft.scene.spec import CameraSpec, LaserSpec, MountSpec
@@ -117,6 +115,8 @@ class Look:
     """(K, 3) centreline, world frame, shaft included."""
     direction: np.ndarray
     """(3,) of the camera's axis."""
+    pose: np.ndarray
+    """(4, 4) camera frame to world frame, z along its axis, mm."""
     distance_mm: float
     """From the camera to the lesion's centre (mm)."""
     axis_error_rad: float
@@ -133,35 +133,7 @@ def look_at_lesion(arm: Held, ring: Ring, camera: CameraSpec) -> Look:
         aimed.commands[0],
         line[0],
         direction[0],
+        frames.pose_from_z(line[0, -1], direction[0]),
         float(np.linalg.norm(towards)),
         float(frames.angle_between(direction[0], towards)),
     )
-
-
-def in_picture(eye_mm, direction, points_mm, camera: CameraSpec) -> np.ndarray:
-    """(..., M) bool: points (..., M, 3) mm within the camera's cone and range; world frame."""
-    towards = points_mm - np.asarray(eye_mm)[..., None, :]
-    distance = np.linalg.norm(towards, axis=-1)
-    angle = frames.angle_between(np.asarray(direction)[..., None, :], towards)
-    low, high = camera.range_mm
-    return (angle <= np.radians(camera.fov_deg / 2)) & (distance >= low) & (distance <= high)
-
-
-def seen(
-    engine: BatchedScene, eyes_mm, points_mm, arms: dict[str, np.ndarray] | None = None
-) -> np.ndarray:
-    """(B, M) bool: points (M, 3) that lines of sight from eyes (B, 3) reach; world frame, mm.
-
-    `arms` name -> (B, K, 3) stand in the way.
-    """
-    origins = np.broadcast_to(np.asarray(eyes_mm)[:, None], (len(eyes_mm), *points_mm.shape))
-    towards = points_mm - origins
-    length = np.linalg.norm(towards, axis=-1)
-    tensors = {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in (arms or {}).items()}
-    hit = engine.cast(
-        torch.from_numpy(np.ascontiguousarray(origins)),
-        torch.from_numpy(towards / length[..., None]),
-        float(length.max()) + 50.0,
-        tensors,
-    )
-    return hit.on_organ.numpy() & (np.abs(hit.distance_mm.numpy() - length) <= LANDED_MM)

@@ -1,0 +1,1 @@
+"""Pictures and recordings for the eye: the only part that draws."""

@@ -1,0 +1,219 @@
+"""A scene as a Rerun recording: bodies, both arms at work, ring, beam and the camera's cone."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from surgisoft.errors import InputError
+from surgisoft.replay.shapes import finer, polar_patch, tube, view_cone
+from surgisoft.scene import frames
+from surgisoft.scene.check import held_arms
+from surgisoft.scene.folder import Scene
+from surgisoft.scene.lesion import circle_on, nearest_on_surface
+from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.sweep import Cut, Held, Look, cut_ring, look_at_lesion
+
+ROLE_COLOURS = {
+    "organ": (142, 58, 48),
+    "keep-out": (112, 140, 62),
+    "support": (176, 186, 196),
+}
+ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196)}
+SHAFT_COLOUR = (88, 94, 102)
+LESION_COLOUR = (214, 172, 118)
+RING_COLOUR = (255, 214, 64)
+BEAM_COLOUR = (255, 40, 32)
+CONE_COLOUR = (90, 200, 250)
+BACKGROUND = (24, 28, 34)
+BORE_MM = 1.5
+"""Radius of the arm's channel: 3 mm across in the paper's arm (mm)."""
+FRAMES = 72
+"""Moments of the recording: the laser goes once around the ring."""
+
+
+def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> None:
+    """Write the scene as an .rrd file that opens by itself with a fitting view."""
+    path = Path(path)
+    if path.suffix != ".rrd":
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .rrd")
+    arms, ring = held_arms(scene, reaches), scene.ring
+    cut = cut_ring(arms["laser"], ring, scene.spec.laser)
+    look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".rrd", dir=path.parent)
+    os.close(handle)
+    try:
+        recording = rr.RecordingStream("surgisoft_scene", recording_id=scene.content_hash[:16])
+        recording.save(name, default_blueprint=blueprint(scene, arms))
+        _log_bodies(recording, scene)
+        _log_lesion(recording, scene)
+        _log_endoscope(recording, scene, arms["endoscope"], look)
+        _log_laser(recording, arms["laser"], cut, ring.points_mm)
+        recording.flush()
+        recording.disconnect()
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def blueprint(scene: Scene, arms: dict[str, Held]) -> rrb.Blueprint:
+    """One 3D view from the side on which the lesion lies, with lesion and both bases in it."""
+    organ = scene.organ.world_mesh.bounds_mm
+    points = np.array([*organ, *(arm.pose[:3, 3] for arm in arms.values())])
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    towards = _side_of_both_arms(scene, arms)
+    eye = middle + 1.05 * size * frames.normalise(towards + np.array([0.0, 0.0, 0.45]))
+    view = rrb.Spatial3DView(
+        origin="/",
+        name="Scene",
+        background=rrb.Background(BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
+    )
+    return rrb.Blueprint(
+        view,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed"),
+    )
+
+
+def _side_of_both_arms(scene: Scene, arms: dict[str, Held]) -> np.ndarray:
+    """(3,) horizontal unit vector from which lesion and both arms lie side by side."""
+    first, second = (arm.pose[:3, 3] for arm in arms.values())
+    apart = (first - second) * [1.0, 1.0, 0.0]
+    facing = scene.ring.normal * [1.0, 1.0, 0.0]
+    if np.linalg.norm(facing) < 0.1:
+        facing = np.array([0.0, -1.0, 0.0])
+    facing = frames.normalise(facing)
+    across = frames.normalise(np.cross([0.0, 0.0, 1.0], apart))
+    across = across if across @ facing >= 0.0 else -across
+    return frames.normalise(across + 0.5 * facing)
+
+
+def _log_bodies(recording, scene: Scene) -> None:
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for body in scene.bodies:
+        mesh = body.world_mesh
+        vertices, faces, normals = _creased(mesh)
+        recording.log(
+            f"/bodies/{body.name}",
+            rr.Mesh3D(
+                vertex_positions=vertices,
+                triangle_indices=faces,
+                vertex_normals=normals,
+                albedo_factor=ROLE_COLOURS[body.role],
+            ),
+            static=True,
+        )
+
+
+def _creased(mesh):
+    """Vertices, faces and normals; sharp-edged coarse meshes keep a normal for every face."""
+    cosine = np.einsum("fk,fck->fc", mesh.face_normals, mesh.vertex_normals[mesh.faces])
+    if np.mean(cosine < 0.8) < 0.3:
+        return mesh.vertices_mm, mesh.faces, mesh.vertex_normals
+    vertices = mesh.triangles_mm.reshape(-1, 3)
+    return vertices, np.arange(len(vertices)).reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)
+
+
+def _log_lesion(recording, scene: Scene) -> None:
+    ring, lesion, mesh = scene.ring, scene.spec.lesion, scene.organ.world_mesh
+    recording.log(
+        "/lesion/ring",
+        rr.LineStrips3D(
+            [np.vstack((ring.points_mm, ring.points_mm[:1])) + 0.3 * ring.normal],
+            colors=[RING_COLOUR],
+            radii=[0.45],
+        ),
+        static=True,
+    )
+    if lesion.path_mm:
+        return
+    _, face = nearest_on_surface(mesh, ring.centre_mm[None])
+    circles = [
+        circle_on(mesh, ring.centre_mm, int(face[0]), share * lesion.diameter_mm)
+        for share in np.linspace(0.15, 0.85, 6)
+    ]
+    if any(circle is None for circle in circles):
+        return
+    lifted = [circle.points_mm + 0.2 * circle.normals for circle in circles]
+    vertices, faces = polar_patch(lifted, ring.centre_mm + 0.2 * ring.normal)
+    normals = np.vstack((ring.normal[None], *(circle.normals for circle in circles)))
+    recording.log(
+        "/lesion/tissue",
+        rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces,
+            vertex_normals=normals,
+            albedo_factor=LESION_COLOUR,
+        ),
+        static=True,
+    )
+
+
+def _log_arm(recording, tool: str, arm: Held, line_mm: np.ndarray, static: bool) -> None:
+    """The soft body as a tube; the shaft behind it once."""
+    body = line_mm[1:] if arm.shaft_mm > 0.0 else line_mm
+    vertices, faces, normals = tube(finer(body, 2.0), arm.reach.radius_mm, BORE_MM)
+    recording.log(
+        f"/arms/{tool}/body",
+        rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces,
+            vertex_normals=normals,
+            albedo_factor=ARM_COLOURS[tool],
+        ),
+        static=static,
+    )
+
+
+def _log_shaft(recording, tool: str, arm: Held) -> None:
+    if arm.shaft_mm <= 0.0:
+        return
+    ends = arm.pose[:3, 3] - np.array([arm.shaft_mm, 0.0])[:, None] * arm.pose[:3, 2]
+    vertices, faces, normals = tube(finer(ends, 10.0), 1.02 * arm.reach.radius_mm)
+    recording.log(
+        f"/arms/{tool}/shaft",
+        rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces,
+            vertex_normals=normals,
+            albedo_factor=SHAFT_COLOUR,
+        ),
+        static=True,
+    )
+
+
+def _log_endoscope(recording, scene: Scene, arm: Held, look: Look) -> None:
+    _log_shaft(recording, "endoscope", arm)
+    _log_arm(recording, "endoscope", arm, look.line_mm, static=True)
+    half = np.radians(scene.spec.camera.fov_deg / 2)
+    lines = view_cone(look.line_mm[-1], look.direction, half, 0.8 * look.distance_mm)
+    recording.log(
+        "/arms/endoscope/view",
+        rr.LineStrips3D(lines, colors=[CONE_COLOUR] * len(lines), radii=[0.2] * len(lines)),
+        static=True,
+    )
+
+
+def _log_laser(recording, arm: Held, cut: Cut, ring_mm: np.ndarray) -> None:
+    """The laser goes round the ring, one moment a point."""
+    _log_shaft(recording, "laser", arm)
+    for i in range(0, len(ring_mm), max(1, len(ring_mm) // FRAMES)):
+        recording.set_time("ring_point", sequence=i)
+        _log_arm(recording, "laser", arm, cut.lines_mm[i], static=False)
+        tip = cut.lines_mm[i, -1]
+        end = tip + cut.directions[i] * max(float(cut.standoff_mm[i]), 1.0)
+        recording.log(
+            "/beam", rr.LineStrips3D([np.stack((tip, end))], colors=[BEAM_COLOUR], radii=[0.35])
+        )
+        recording.log("/beam/hit", rr.Points3D([end], colors=[BEAM_COLOUR], radii=[0.9]))
+    recording.reset_time()

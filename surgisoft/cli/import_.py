@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.errors import InputError
 
 
 def _warn(text: str) -> None:
@@ -40,7 +41,9 @@ def import_(
     from surgisoft.measurement.recording_summary import summary
     from surgisoft.measurement.recording_warnings import find_oddities
 
-    to_file = output.suffix in (".csv", ".parquet") and not output.is_dir()
+    to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
+    if to_file and output.suffix not in (".csv", ".parquet"):
+        raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
     parts = import_files(raw, load_map(map_name), output.stem if to_file else None)
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
     for target in targets if not dry_run else []:

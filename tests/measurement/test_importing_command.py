@@ -1,12 +1,29 @@
 """`surgisoft import` and `surgisoft recording` as a user types them."""
 
+import dataclasses
+import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.measurement.importing_map import load_map
+from surgisoft.measurement.importing_spec import (
+    ActuationMap,
+    BaseMap,
+    FileRole,
+    FrameMap,
+    KeyPointsMap,
+    RowsMap,
+    RunsMap,
+    TimeMap,
+)
 from surgisoft.measurement.recording import load_recording
+from surgisoft.measurement.recording_sidecar import parse_sidecar
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 MAP = """
 [time]
@@ -92,6 +109,13 @@ def test_bad_row_is_one_line_and_nothing_is_written(lab, capsys):
     assert not (lab / "out").exists()
 
 
+def test_suffix_that_is_no_recording(lab, capsys):
+    out = lab / "rec.txt"
+    assert surgisoft("import", lab / "one.csv", "--map", lab / "map.toml", "-o", out) == 2
+    assert "suffix '.txt', expected .csv, .parquet or a folder" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_recording_shows_what_it_holds(lab, capsys):
     out = lab / "rec.csv"
     surgisoft("import", lab / "one.csv", "--map", lab / "map.toml", "-o", out)
@@ -107,10 +131,25 @@ def test_recording_shows_what_it_holds(lab, capsys):
 
 
 def test_every_shipped_map_is_valid():
-    from surgisoft.measurement.importing_map import load_map
-
-    folder = Path(__file__).resolve().parents[2] / "docs" / "examples" / "maps"
-    maps = sorted(folder.glob("*.toml"))
+    maps = sorted((DOCS / "examples" / "maps").glob("*.toml"))
     assert len(maps) >= 5
     for path in maps:
         load_map(str(path))
+
+
+def test_examples_of_the_documentation_are_valid(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
+    sidecar, example = blocks
+    assert parse_sidecar(tomllib.loads(sidecar), "docs")["noise_mm"] == 0.08
+    (tmp_path / "map.toml").write_text(example)
+    assert load_map(str(tmp_path / "map.toml")).time.unit == "ms"
+
+
+@pytest.mark.parametrize(
+    "part", [FileRole, TimeMap, ActuationMap, KeyPointsMap, FrameMap, BaseMap, RowsMap, RunsMap]
+)
+def test_every_field_of_a_map_is_documented(part):
+    text = (DOCS / "recordings.md").read_text()
+    for field in dataclasses.fields(part):
+        if field.name not in ("name", "file", "points"):
+            assert re.search(rf"`[^`]*\b{field.name}\b[^`]*`", text), field.name

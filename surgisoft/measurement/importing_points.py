@@ -92,7 +92,7 @@ def read_points(
         [_raw_point(joined, spec, point, j, scale, notes) for j, point in enumerate(maps)], axis=1
     )
     if spec.repeated == "missing":
-        notes.append(_stale_text(joined, spec, maps))
+        notes += _stale_notes(joined, spec, maps)
     turned, to_base = _relative_to_base(joined, spec, frame.base, raw, scale, frame.rest_rows)
     rest = _rest(turned, frame.rest_rows)
     origin = rest[0] if isinstance(frame.origin, str) else np.array(frame.origin) * scale
@@ -160,15 +160,16 @@ def _stale(joined: Joined, cells: np.ndarray) -> np.ndarray:
     return np.concatenate([[False], same])
 
 
-def _stale_text(joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...]) -> str:
+def _stale_notes(joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...]) -> list[str]:
     counts = []
     for point in maps:
         cells = [joined.take(spec.file, columns_of(p, "xyz")) for p in point.positions]
         counts.append(int(_stale(joined, np.concatenate(cells, axis=1)).sum()))
-    each = ", ".join(f"k{j} {count}" for j, count in enumerate(counts))
-    return (
+    each = ", ".join(f"k{j} {count}" for j, count in enumerate(counts) if count)
+    text = (
         f"positions that repeat the row before count as missing: {each} of {len(joined.rows)} rows"
     )
+    return [text] if each else []
 
 
 def _relative_to_base(

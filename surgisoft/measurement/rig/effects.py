@@ -186,7 +186,7 @@ def add_effect_forces(effects, strains, history, forces):
     """Add the effects' tension of each line [N] to forces (J,); strains: (J,) [-].
 
     Rate: a shear-thinning fluid's power law. Stick-slip: springs that let go all at once.
-    Softening: Ogden & Roxburgh (1999, eq. 40), the share erf((W_max - W) / (m + b W_max)) of the
+    Softening: Ogden & Roxburgh (1999), the share erf((W_max - W) / (m + b W_max)) of the
     damage. Stiffening: exponential, as Fung's (1967) tissue.
     """
     for j in range(strains.shape[0]):

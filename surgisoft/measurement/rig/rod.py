@@ -1,6 +1,6 @@
 """Statics of the arm: an extensible, shearable Cosserat rod under gravity and pressure.
 
-Balance (Antman 2005, ch. 8; Till, Aloi & Rucker 2019, eq. 5) for the internal force n and moment
+Balance (Antman 2005, ch. 8; Till, Aloi & Rucker 2019) for the internal force n and moment
 m over the reference length s, with weight f per length:
 
     r' = R v,   R' = R [u],   n' = -f,   m' = -r' x n.

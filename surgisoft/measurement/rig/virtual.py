@@ -6,6 +6,7 @@ It is the truth that arm models are judged on, so it shares nothing with them: n
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from surgisoft.measurement.rig import bench
 from surgisoft.measurement.rig.arm import (
     STANDARD_GRAVITY,
     ArmDesign,
+    Specimen,
     fabricate,
     no_equilibrium,
     plain_loads,
@@ -94,7 +96,7 @@ class VirtualRig:
     ) -> None:
         design = design or ArmDesign()
         check_options(seed, gravity, payload_g, noise)
-        specimen = fabricate(design, seed, np.array(MOUNT))
+        specimen = _cast(design, seed)
         self.chambers, self.key_planes = design.chambers, design.key_planes
         self.limits = np.tile([design.low_kPa, design.high_kPa], (design.chambers, 1))
         self.arm = ArmInfo(design.length_mm, design.diameter_mm)
@@ -226,6 +228,12 @@ class VirtualRig:
         shaped = (a.reshape(len(commands), count, *a.shape[1:]) for a in frames)
         mean = bench.Frames(*(average(a) for a in shaped))
         return Part(average(steps * self._plant.pumps.step), commands, mean)
+
+
+@lru_cache(maxsize=64)
+def _cast(design: ArmDesign, seed: int) -> Specimen:
+    """The specimen of a seed, calibrated in the default mount; nothing changes it later."""
+    return fabricate(design, seed, np.array(MOUNT))
 
 
 def check_options(seed: int, gravity, payload_g: float, noise: float) -> None:

@@ -9,7 +9,7 @@ e(x, y) = eps + u_x y - u_y x. Integrating the energy over a section with area A
 and fourth moment J = int y^4 dA gives the resultants below, so the law has a potential.
 
 A chamber of area A_i at (x_i, y_i) pushes with the thrust of a fibre-wound tube (Chou & Hannaford
-1996, eq. 7, with the fibre angle from the arm's axis), p_i A_i (1 - 3 c^2 L^2) / (1 - c^2) where
+1996; by virtual work, p dV/dL of a tube whose fibres at an angle from its axis do not stretch), p_i A_i (1 - 3 c^2 L^2) / (1 - c^2) where
 c = cos(angle) and L = 1 + e(x_i, y_i).
 """
 

@@ -9,8 +9,11 @@ e(x, y) = eps + u_x y - u_y x. Integrating the energy over a section with area A
 and fourth moment J = int y^4 dA gives the resultants below, so the law has a potential.
 
 A chamber of area A_i at (x_i, y_i) pushes with the thrust of a fibre-wound tube (Chou & Hannaford
-1996; by virtual work, p dV/dL of a tube whose fibres at an angle from its axis do not stretch), p_i A_i (1 - 3 c^2 L^2) / (1 - c^2) where
-c = cos(angle) and L = 1 + e(x_i, y_i).
+1996: virtual work p dV of a tube whose fibres do not stretch),
+
+    p_i A_i (1 - 3 c^2 L^2) / (1 - c^2),   L = 1 + e(x_i, y_i),
+
+with c the cosine of the fibres' angle from the arm's axis.
 """
 
 from typing import NamedTuple

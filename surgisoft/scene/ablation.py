@@ -141,7 +141,7 @@ class AblationMap:
             for tensor in kept:
                 tensor[mask] = 0.0
         else:
-            kept = [torch.where(mask.reshape(-1, *[1] * (t.ndim - 1)), 0.0, t) for t in kept]
+            kept = [_pick(mask, 0.0, tensor) for tensor in kept]
         return AblationState(*kept, *beam)
 
     def advance(
@@ -260,7 +260,7 @@ def sweep_fluence(began, ended, direction, energy, waist_mm: float, points_mm):
     length = sweep.norm(dim=-1)
     unit = sweep / length.clamp(min=1e-9)[:, None]
     along = (away * unit[:, None]).sum(-1)
-    across2 = away.square().sum(-1) - along.square()
+    across2 = (away - along[..., None] * unit[:, None]).square().sum(-1)
     peak = (2.0 * energy / (math.pi * waist_mm**2))[:, None]
     scale = math.sqrt(2.0) / waist_mm
     span = length.clamp(min=1e-3 * waist_mm)[:, None]
@@ -268,7 +268,7 @@ def sweep_fluence(began, ended, direction, energy, waist_mm: float, points_mm):
     moving = 0.5 * math.sqrt(math.pi) * mean
     still = torch.exp(-((scale * (along - 0.5 * length[:, None])) ** 2))
     profile = torch.where(length[:, None] > 1e-3 * waist_mm, moving, still)
-    return peak * torch.exp(-((scale**2) * across2.clamp(min=0.0))) * profile
+    return peak * torch.exp(-((scale**2) * across2)) * profile
 
 
 def longest_run(flags: torch.Tensor) -> torch.Tensor:
@@ -278,6 +278,11 @@ def longest_run(flags: torch.Tensor) -> torch.Tensor:
     place = torch.arange(1, 2 * count + 1, device=flags.device)
     broken = torch.where(twice, 0, place).cummax(1).values
     return (place - broken).amax(1).clamp(max=count)
+
+
+def _pick(mask, fresh, old):
+    """fresh where mask (B,) is set, else old (B, ...)."""
+    return torch.where(mask.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
 
 
 @compiled

@@ -31,6 +31,8 @@ from surgisoft.scene.torch_distance import (
     rays_to_chains_torch,
 )
 
+ENGINES = ("compiled", "torch")
+"""The batched engines: Embree and compiled queries, or torch alone."""
 EXACT_WITHIN_MM = 5.0
 """Nearer than this, clearances are exact; farther, off by the field's interpolation (mm)."""
 
@@ -76,7 +78,9 @@ class BatchedScene:
         exact_within_mm: float = EXACT_WITHIN_MM,
         most_nodes: int = MOST_NODES,
         cache: Path | None = None,
+        engine: str | None = None,
     ):
+        """`engine` is `compiled` (CPU only, its default) or `torch` (any device)."""
         for name, radius in radii_mm.items():
             if not (math.isfinite(radius) and radius > 0.0):
                 raise InputError(f"radius of arm '{name}' is {radius} mm: expected more than 0")
@@ -84,7 +88,13 @@ class BatchedScene:
         self.device = torch.device(device)
         self.horizon_mm, self.exact_within_mm = float(horizon_mm), float(exact_within_mm)
         thickest = max(self.radii_mm.values(), default=1.0)
-        kind = CompiledSurface if self.device.type == "cpu" else TorchSurface
+        engine = engine or ("compiled" if self.device.type == "cpu" else "torch")
+        if engine not in ENGINES:
+            raise unknown_name("geometry engine", engine, ENGINES)
+        if engine == "compiled" and self.device.type != "cpu":
+            raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
+        self._compiled = engine == "compiled"
+        kind = CompiledSurface if self._compiled else TorchSurface
         self._surfaces = []
         for body in self.bodies:
             tree = build_tree(body.mesh)
@@ -185,7 +195,7 @@ class BatchedScene:
         return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
-        if self.device.type != "cpu":
+        if not self._compiled:
             return chains_apart_torch(first, second, radii, self.horizon_mm)
         out = torch.empty(len(first), dtype=first.dtype)
         chains_apart(first.numpy(), second.numpy(), radii, self.horizon_mm, out.numpy())
@@ -193,14 +203,14 @@ class BatchedScene:
 
     def _folded(self, line, radius: float) -> torch.Tensor:
         gap = self_contact_gap_mm(radius)
-        if self.device.type != "cpu":
+        if not self._compiled:
             return chains_folded_torch(line, radius, gap, self.horizon_mm)
         out = torch.empty(len(line), dtype=line.dtype)
         chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
         return out
 
     def _chain_hits(self, origins, aims, line, radius, gap, best):
-        if self.device.type != "cpu":
+        if not self._compiled:
             return rays_to_chains_torch(origins, aims, line, radius, gap, best)
         distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
         rays_to_chains(

@@ -195,6 +195,7 @@ class Referee:
             raise InputError(f"body names repeat: {', '.join(sorted(names))}; rename one")
         self.bodies = tuple(bodies)
         self.horizon_mm = float(horizon_mm)
+        self._inward = [frames.invert(body.pose) for body in bodies]
         self._objects = [
             _placed(surface_model(body.mesh.vertices_mm, body.mesh.faces), body.pose)
             for body in bodies
@@ -203,7 +204,7 @@ class Referee:
     def inside(self, body: int, points_mm: np.ndarray) -> np.ndarray:
         """(N,) bool: world points (N, 3) mm inside body number `body`; never in an open mesh."""
         mesh = self.bodies[body].mesh
-        points = frames.apply(frames.invert(self.bodies[body].pose), points_mm)
+        points = frames.apply(self._inward[body], points_mm)
         return points_inside(mesh, points)
 
     def collisions(self, arms: Mapping[str, ArmShape]) -> tuple[Collision, ...]:
@@ -291,8 +292,9 @@ class Referee:
 
     def _cast_one(self, origin, direction, range_mm, arms, own) -> tuple:
         best = (Struck.NOTHING, -1, -1, range_mm, origin + range_mm * direction, -direction)
+        probe = _probe(origin, direction, range_mm)
         for index, body in enumerate(self.bodies):
-            face, t = self._first_face(index, origin, direction, best[3])
+            face, t = self._first_face(index, probe, origin, direction, best[3])
             if face >= 0:
                 normal = body.pose[:3, :3] @ body.mesh.face_normals[face]
                 best = (struck_of(body), index, face, t, origin + t * direction, normal)
@@ -306,29 +308,35 @@ class Referee:
             if t < best[3]:
                 point = origin + t * direction
                 best = (kind, -1, -1, t, point, chain_normal(point, line, segment))
-        cosine = abs(np.dot(best[5], direction))
-        sine = frames.norm(np.cross(best[5], direction))
+        cosine = abs(frames.dot(best[5], direction))
+        sine = frames.norm(frames.cross(best[5], direction))
         return (*best, float(np.arctan2(sine, cosine)))
 
-    def _first_face(self, index: int, origin, direction, range_mm: float) -> tuple[int, float]:
+    def _first_face(self, index: int, probe, origin, direction, range_mm) -> tuple[int, float]:
         """Nearest face of a body on a ray and its distance, (-1, range) for none."""
-        end = origin + range_mm * direction
-        side = frames.rotation_from_z(direction)[:, 0] * PROBE_WIDTH_MM
-        sliver = surface_model(np.stack((origin, end, end + side)), np.array([[0, 1, 2]]))
         request = fcl.CollisionRequest(num_max_contacts=MOST_CONTACTS, enable_contact=True)
         result = fcl.CollisionResult()
-        fcl.collide(self._objects[index], fcl.CollisionObject(sliver), request, result)
-        faces = np.unique([contact.b1 for contact in result.contacts]).astype(int)
-        if len(faces) == 0:
+        if not fcl.collide(self._objects[index], probe, request, result):
             return -1, range_mm
-        body = self.bodies[index]
-        inward = frames.invert(body.pose)
-        o = frames.apply(inward, origin[None])[0]
-        t = ray_triangles(o, inward[:3, :3] @ direction, body.mesh.triangles_mm[faces])
+        faces = np.array([contact.b1 for contact in result.contacts])
+        inward = self._inward[index]
+        o = inward[:3, :3] @ origin + inward[:3, 3]
+        d = inward[:3, :3] @ direction
+        t = ray_triangles(o, d, self.bodies[index].mesh.triangles_mm[faces])
         nearest = int(np.argmin(t))
         return (
             (int(faces[nearest]), float(t[nearest])) if t[nearest] <= range_mm else (-1, range_mm)
         )
+
+
+def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
+    """The sliver that stands for a ray: one long triangle, a micrometre wide."""
+    across = np.zeros(3)
+    across[np.argmin(np.abs(direction))] = 1.0
+    side = frames.normalise(frames.cross(direction, across)) * PROBE_WIDTH_MM
+    end = origin + range_mm * direction
+    corners = np.stack((origin, end, end + side))
+    return fcl.CollisionObject(surface_model(corners, np.array([[0, 1, 2]])))
 
 
 def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
@@ -339,13 +347,13 @@ def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
     slack = 1e-12
     a = triangles_mm[:, 0]
     e1, e2 = triangles_mm[:, 1] - a, triangles_mm[:, 2] - a
-    p = np.cross(direction, e2)
+    p = frames.cross(direction, e2)
     determinant = frames.dot(e1, p)
     with np.errstate(divide="ignore", invalid="ignore"):
         s = origin - a
         u = frames.dot(s, p) / determinant
-        q = np.cross(s, e1)
-        v = frames.dot(np.broadcast_to(direction, q.shape), q) / determinant
+        q = frames.cross(s, e1)
+        v = frames.dot(direction, q) / determinant
         t = frames.dot(e2, q) / determinant
         hit = (u >= -slack) & (v >= -slack) & (u + v <= 1 + slack) & (t >= 0)
     return np.where(hit, t, np.inf)

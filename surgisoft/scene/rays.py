@@ -181,41 +181,36 @@ def rays_to_chains(origins, directions, lines, radius, gap, distance, segment):
     between them and the tip are left out (a negative gap keeps all).
     """
     segments = lines.shape[1] - 1
-    from_tip = np.empty(segments)
+    halves = np.empty(segments)
+    middles, line = np.empty((segments, 3)), np.empty((segments + 1, 3))
     for n in range(len(lines)):
-        arc = 0.0
-        for k in range(segments - 1, -1, -1):
-            from_tip[k] = arc
-            dx = np.float64(lines[n, k + 1, 0]) - lines[n, k, 0]
-            dy = np.float64(lines[n, k + 1, 1]) - lines[n, k, 1]
-            dz = np.float64(lines[n, k + 1, 2]) - lines[n, k, 2]
-            arc += math.sqrt(dx * dx + dy * dy + dz * dz)
+        arc, free = 0.0, 0
+        for k in range(segments, -1, -1):
+            for i in range(3):
+                line[k, i] = lines[n, k, i]
+            if k < segments:
+                dx, dy, dz = (
+                    line[k + 1, 0] - line[k, 0],
+                    line[k + 1, 1] - line[k, 1],
+                    line[k + 1, 2] - line[k, 2],
+                )
+                length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                halves[k] = 0.5 * length
+                free = max(free, k + 1) if arc >= gap else free
+                arc += length
+                for i in range(3):
+                    middles[k, i] = 0.5 * (line[k, i] + line[k + 1, i])
         for r in range(origins.shape[1]):
             o = (origins[n, r, 0], origins[n, r, 1], origins[n, r, 2])
             d = (directions[n, r, 0], directions[n, r, 1], directions[n, r, 2])
-            for k in range(segments):
-                if from_tip[k] < gap:
-                    break
-                a = (
-                    np.float64(lines[n, k, 0]),
-                    np.float64(lines[n, k, 1]),
-                    np.float64(lines[n, k, 2]),
-                )
-                b = (
-                    np.float64(lines[n, k + 1, 0]),
-                    np.float64(lines[n, k + 1, 1]),
-                    np.float64(lines[n, k + 1, 2]),
-                )
-                half = 0.5 * (from_tip[k - 1] - from_tip[k] if k > 0 else arc - from_tip[0])
-                mx, my, mz = (
-                    0.5 * (a[0] + b[0]) - o[0],
-                    0.5 * (a[1] + b[1]) - o[1],
-                    0.5 * (a[2] + b[2]) - o[2],
-                )
-                t = max(0.0, mx * d[0] + my * d[1] + mz * d[2])
-                x, y, z = mx - t * d[0], my - t * d[1], mz - t * d[2]
-                reach = radius + half + 1e-9
+            for k in range(free):
+                x, y, z = middles[k, 0] - o[0], middles[k, 1] - o[1], middles[k, 2] - o[2]
+                t = max(0.0, x * d[0] + y * d[1] + z * d[2])
+                x, y, z = x - t * d[0], y - t * d[1], z - t * d[2]
+                reach = radius + halves[k] + 1e-9
                 if x * x + y * y + z * z <= reach * reach:
+                    a = (line[k, 0], line[k, 1], line[k, 2])
+                    b = (line[k + 1, 0], line[k + 1, 1], line[k + 1, 2])
                     hit = _capsule_entry(o, d, a, b, radius)
                     if hit < distance[n, r]:
                         distance[n, r], segment[n, r] = hit, k

@@ -89,8 +89,11 @@ def lasers(count, rng):
     return frames.pose_from_z(away * 150, -away + 0.4 * rng.normal(size=(count, 3)))
 
 
-def test_arms_in_the_way_agree_with_the_referee(scene):
-    bodies, engine = scene
+@pytest.mark.parametrize("name", ["compiled", "torch"])
+def test_arms_in_the_way_agree_with_the_referee(scene, name, tmp_path):
+    bodies, _ = scene
+    radii = {"laser": 4.0, "scope": 5.0}
+    engine = BatchedScene(bodies, radii, most_nodes=5_000, cache=tmp_path, engine=name)
     rng = np.random.default_rng(3)
     count = 400
     origins, aims = random_rays(count, seed=4)

@@ -216,6 +216,9 @@ def _judge_laser(engine, arm: Held, ring: Ring, laser: LaserSpec, limits: Limits
         - cut.incidence_rad.mean()
         + 0.7 * base[2]
         + 0.5 * np.median(spare)
+        - 2.0
+        * np.abs(cut.standoff_mm - 0.5 * sum(laser.standoff_mm)).max()
+        / (laser.standoff_mm[1] - laser.standoff_mm[0])
     )
     return LaserSite(arm, cut, landed, clearance[:count], good, least, float(score))
 

@@ -224,7 +224,11 @@ def _unbranch(vertices, faces):
     also = np.where(alike[:, None], after, np.stack((after[:, 0], pairs[:, 1]), axis=1))
     label = _linked(np.concatenate((crossed, also)), 3 * len(faces))
     first = np.unique(label, return_index=True)[1]
-    return vertices[faces.reshape(-1)[first]], label.reshape(-1, 3)
+    vertex_of = faces.reshape(-1)[first]
+    order = np.argsort(vertex_of, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    return vertices[vertex_of[order]], rank[label].reshape(-1, 3)
 
 
 def _drop_specks(vertices, faces, size, log):

@@ -1,0 +1,92 @@
+"""The reachability map of a scene: the surface around the lesion as the laser meets it."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.scene.check import REASONS, Patch, SceneCheck
+from surgisoft.scene.folder import Scene
+from surgisoft.toml_config import write_atomically
+
+REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
+"""One colour a reason, in the order of REASONS."""
+
+
+def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) -> None:
+    """Write a .png: the patch coloured by incidence where it can be cut, and the ring unrolled."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .png")
+    figure = Figure(figsize=(12.0, 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    _draw_patch(figure, left, scene, verdict, patch)
+    rows = right.get_subplotspec().subgridspec(3, 1)
+    right.remove()
+    _draw_ring([figure.add_subplot(row) for row in rows], scene, verdict)
+    figure.suptitle(f"{scene.spec.name}: {verdict.sentence}", fontsize=9, wrap=True)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, buffer.getvalue())
+
+
+def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -> None:
+    from matplotlib.tri import Triangulation
+
+    triangles = Triangulation(*patch.flat_mm.T)
+    worst = scene.spec.laser.max_incidence_deg
+    shown = axes.tripcolor(
+        triangles,
+        np.degrees(patch.incidence_rad),
+        shading="gouraud",
+        cmap="viridis_r",
+        vmin=0.0,
+        vmax=worst,
+    )
+    figure.colorbar(shown, ax=axes, label="incidence of the beam (degrees)", shrink=0.85)
+    for code in np.unique(patch.reason[patch.reason > 0]):
+        bad = patch.flat_mm[patch.reason == code]
+        axes.scatter(*bad.T, s=26, marker="s", color=REASON_COLOURS[code], label=REASONS[code])
+    closed = np.vstack((patch.ring_flat_mm, patch.ring_flat_mm[:1]))
+    axes.plot(*closed.T, color="white", lw=3.5)
+    for code in np.unique(verdict.reason):
+        here = verdict.reason == code
+        axes.scatter(
+            *patch.ring_flat_mm[here].T,
+            s=14,
+            color=REASON_COLOURS[code],
+            label=f"ring: {REASONS[code]} ({100 * here.mean():.0f} %)",
+            zorder=3,
+        )
+    axes.set(aspect="equal", xlabel="mm", ylabel="mm", title="surface around the lesion")
+    axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+
+
+def _draw_ring(axes, scene: Scene, verdict: SceneCheck) -> None:
+    """Clearance, incidence and length of the beam over the angle around the ring."""
+    angle = 360.0 * np.arange(len(verdict.reason)) / len(verdict.reason)
+    limits, laser = scene.spec.limits, scene.spec.laser
+    cut = verdict.cut
+    rows = (
+        ("clearance (mm)", verdict.clearance_mm, (limits.clearance_mm,)),
+        ("incidence (deg)", np.degrees(cut.incidence_rad), (laser.max_incidence_deg,)),
+        ("beam length (mm)", cut.standoff_mm, laser.standoff_mm),
+    )
+    for one, (label, values, bounds) in zip(axes, rows, strict=True):
+        one.plot(angle, values, color="#333333", lw=1.2)
+        colours = [REASON_COLOURS[code] for code in verdict.reason]
+        one.scatter(angle, values, s=9, c=colours, zorder=3)
+        for bound in bounds:
+            one.axhline(bound, color="#c1121f", lw=0.9, ls="--")
+        one.set(ylabel=label, xlim=(0.0, 360.0), xticks=range(0, 361, 60))
+        one.grid(alpha=0.3)
+        if one is not axes[-1]:
+            one.set_xticklabels([])
+    axes[0].set_title("around the ring (dashed: the scene's limits)", fontsize=9)
+    axes[-1].set_xlabel("angle around the ring (degrees)")

@@ -41,8 +41,11 @@ def fit(
     actuation: Annotated[
         Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
     ] = "measured",
-    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 400,
+    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 300,
     seed: Annotated[int, typer.Option(help="Seed of weights and order of rows.")] = 0,
+    threads: Annotated[
+        int, typer.Option(min=1, help="Threads; more than one only pays on idle cores.")
+    ] = 1,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing model.")] = False,
 ) -> None:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings.
@@ -50,6 +53,8 @@ def fit(
     Grows from pressure to direction to effects, keeps each only where held-out data rewards it,
     and says which inputs the recordings cannot support.
     """
+    import torch
+
     from surgisoft.measurement.histories import arm_spec, check_fits, history_of
     from surgisoft.measurement.recording import check_same_arm, load_recordings
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
@@ -58,6 +63,7 @@ def fit(
     from surgisoft.surrogate.network import parse_widths
 
     claim_folder(output, force)
+    torch.set_num_threads(threads)
     train = load_recordings(recordings, on_warning=_warn)
     held = load_recordings(valid, on_warning=_warn) if valid else None
     check_same_arm(train)

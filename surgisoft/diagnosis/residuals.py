@@ -46,7 +46,7 @@ def residuals(model: ArmModel, recordings: list[Recording]) -> Residuals:
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
         predicted = model.predict(history)
-        anchor, direction = directions.trace(history.pressure, model.band)
+        anchor, direction = directions.trace(history.pressure, model.band, model.rest)
         moved = (anchor.diff(dim=1, prepend=anchor[:, :1]) != 0).any(-1)
         steps = history.pressure.diff(dim=1, prepend=history.pressure[:, :1])
         rate = steps / history.dt_s.clamp(min=1e-6)[..., None]

@@ -46,6 +46,13 @@ class ArmSpec:
                 )
 
     @property
+    def rest(self) -> tuple[float, ...]:
+        """Actuation of the arm at rest: zero, or the end of the range that is nearest to it."""
+        return tuple(
+            min(max(0.0, low), high) for low, high in zip(self.low, self.high, strict=True)
+        )
+
+    @property
     def span(self) -> tuple[float, ...]:
         """Range of the actuation of each chamber, in `unit`; never zero."""
         return tuple(

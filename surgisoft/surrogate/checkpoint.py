@@ -99,13 +99,13 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
                 for key, value in config["arm"].items()
             }
         )
-        low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+        low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
         network = dict(config["network"])
         kind = network.pop("kind")
         if kind not in NETWORKS:
             raise unknown_name("network", kind, NETWORKS)
         effects = {
-            name: make_effect(name, low, high, **arguments)
+            name: make_effect(name, low, high, rest, **arguments)
             for name, arguments in config["effects"].items()
         }
         model = ArmModel(

@@ -17,8 +17,12 @@ def advance(anchor: Tensor, direction: Tensor, pressure: Tensor, band: Tensor):
     return moved, sign.where(sign != 0, direction)
 
 
-def trace(pressure: Tensor, band: Tensor):
-    """The same over whole runs: (anchor, direction), each (R, T, m), from pressure (R, T, m)."""
-    anchor = clamp_scan(pressure - band, pressure + band, pressure[:, 0])
-    sign = anchor.diff(dim=1, prepend=anchor[:, :1]).sign()
+def trace(pressure: Tensor, band: Tensor, rest: Tensor):
+    """The same over whole runs: (anchor, direction), each (R, T, m), from pressure (R, T, m).
+
+    Every run starts from rest (m,), without a direction.
+    """
+    start = rest.expand(len(pressure), -1)
+    anchor = clamp_scan(pressure - band, pressure + band, start)
+    sign = anchor.diff(dim=1, prepend=start.unsqueeze(1)).sign()
     return anchor, last_nonzero(sign)

@@ -76,7 +76,8 @@ def excitation(
     history: History, low: Tensor, high: Tensor, band: Tensor
 ) -> list[ChamberExcitation]:
     """What a history excites, one answer a chamber; low, high, band (m,) in the arm's unit."""
-    _, direction = directions.trace(history.pressure, band)
+    rest = torch.zeros_like(low).clamp(low, high)
+    _, direction = directions.trace(history.pressure, band, rest)
     pressure = history.rows(history.pressure)
     span = (high - low).where(high > low, torch.ones_like(low))
     scaled = ((pressure - low) / span).double().numpy()

@@ -26,20 +26,20 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.network import HIDDEN, HawNN
 from surgisoft.surrogate.rows import (
-    Rows,
-    hold_out,
-    known_to,
-    make_rows,
-    measured_rows,
+    Data,
     model_rows,
     normalise,
     rest_shape,
     validated_error,
 )
-from surgisoft.surrogate.training import CHECK_EVERY, PATIENCE
-from surgisoft.surrogate.training import train as train_rows
+from surgisoft.surrogate.training import CHECK_EVERY
+from surgisoft.surrogate.training import train as train_model
 
 INPUTS = ("pressure", "pressure+direction")
+SIMPLE_SHARE = 0.2
+"""Share of the epochs for a stage that only prepares the next, or comes after an effect."""
+EFFECT_SHARE = 1 / 3
+"""Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
 
@@ -58,10 +58,9 @@ class FitConfig:
     """Widths of the hidden layers of HAW-NN."""
     sections: int = 0
     """Constant-curvature sections; 0: one for every 3 chambers."""
-    epochs: int = 400
-    """Most epochs of each stage; the first has `first_share` of them where more follow."""
-    first_share: float = 0.5
-    """Share of the epochs for every stage but the last."""
+    epochs: int = 300
+    """Most epochs of a stage without memory; stages that others follow, or with memory, have a
+    share of them."""
     batch: int = 512
     """Rows a step."""
     learning_rate: float = 3e-3
@@ -134,40 +133,39 @@ Progress = Callable[[str, int, int, float], None]
 def fit(
     train: History, valid: History | None, spec: ArmSpec, config: FitConfig, progress=None
 ) -> FitResult:
-    """Fit a model to `train`; choose by `valid`, or by held-out blocks of `train` without it."""
+    """Fit a model to `train`; choose by `valid`, or by held-out rows of `train` without it."""
     _check(train, valid, spec, config)
     start = time.perf_counter()
     torch.manual_seed(config.seed)
+    data = Data.split(train, valid, config.seed)
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
-    excited = excitation(train, low, high, band)
-    judge = _Judge.make(train, valid, spec, config, low, high, band)
-    result = FitResult(None, [], excited, [], 0.0)
+    result = FitResult(None, [], excitation(train, low, high, band), [], 0.0)
     if config.network == "recurrent":
-        _fit_recurrent(train, valid, spec, config, judge.held, result, progress)
-        result.seconds = time.perf_counter() - start
-        return result
-    for name in _stages(config):
-        candidate = _grow(result.model, name, spec, config, excited, judge, train, result.warnings)
-        if candidate is not None:
-            _stage(candidate, name, config, judge, train, valid, result, progress)
-    model = result.model.eval().requires_grad_(False)
-    rows = judge.rows(model, train, valid)[1]
-    model.validation = validated_error(rows.target, model_rows(model, rows))
+        _fit_recurrent(data, spec, config, result, progress)
+    else:
+        judged = excitation(data.judge, low, high, band)
+        support = _Support(result.excitation, all(chamber.minor_loops for chamber in judged))
+        for name in _stages(config):
+            candidate = _grow(result, name, spec, config, support, train)
+            if candidate is not None:
+                _stage(candidate, name, config, data, result, progress)
+        rows = data.judging_rows(result.model)
+        result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
+    result.model.eval().requires_grad_(False)
     result.seconds = time.perf_counter() - start
     return result
 
 
-def _fit_recurrent(train, valid, spec, config, held, result: FitResult, progress) -> None:
+def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> None:
     model = new_recurrent(spec)
-    normalise(model.network, train)
-    model.rest_mm.copy_(rest_shape(train))
+    normalise(model.network, data.train)
+    model.rest_mm.copy_(rest_shape(data.train))
     result.loss, epochs = train_recurrent(
-        model, train, held, valid, config.epochs, config.learning_rate, config.seed,
-        CHECK_EVERY, PATIENCE, progress,
-    )  # fmt: skip
-    predicted, measured = held_rows(model, train, held, valid)
+        model, data, config.epochs, config.learning_rate, config.seed, progress
+    )
+    predicted, measured = held_rows(model, data)
     model.validation = validated_error(measured, predicted)
-    result.model = model.eval().requires_grad_(False)
+    result.model = model
     result.stages.append(StageReport("recurrent", model.validation["rmse_mm"], epochs, 0.0, True))
 
 
@@ -192,42 +190,55 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
 
 
 def _stages(config: FitConfig) -> list[str]:
+    """Names of the stages: with memory in place, a direction has to earn its place last."""
     if config.network == "constant_curvature":
         return ["constant curvature"]
-    names = ["pressure"]
+    names = ["pressure", *config.effects]
     if config.inputs == "pressure+direction":
         names.append("direction")
-    return names + list(config.effects)
+    return names
+
+
+def _stage_epochs(name: str, config: FitConfig) -> int:
+    """Epochs of a stage: the richest that was asked for has most."""
+    share = 1.0
+    if name in config.effects:
+        share = EFFECT_SHARE
+    elif len(_stages(config)) > 1 and (name == "pressure" or config.effects):
+        share = SIMPLE_SHARE
+    return max(CHECK_EVERY, round(share * config.epochs))
 
 
 @dataclass(frozen=True)
-class _Judge:
-    """Splits rows into training and held-out ones."""
+class _Support:
+    """Which inputs the recordings support."""
 
-    held: Tensor | None
-    """(R, T) rows of the training history that are held out; None with a validation history."""
-    inner: bool
-    """Whether the held-out data itself has reversals inside the range in every chamber."""
+    chambers: list[ChamberExcitation]
+    judged_inside: bool
+    """Whether the judging data reverses inside the range in every chamber."""
 
-    @classmethod
-    def make(cls, train, valid, spec, config, low, high, band) -> "_Judge":
-        judged = train if valid is None else valid
-        inner = all(chamber.minor_loops for chamber in excitation(judged, low, high, band))
-        return cls(hold_out(train, config.seed) if valid is None else None, inner)
+    def use(self, name: str) -> Tensor:
+        """(m,) 1 for each chamber whose direction or memory may be used, else 0.
 
-    def rows(self, model: ArmModel, train: History, valid: History | None) -> tuple[Rows, Rows]:
-        """(training, held-out) rows as the model sees them."""
-        if valid is not None:
-            return make_rows(model, train), make_rows(model, valid)
-        every = make_rows(model, train)
-        held = train.rows(self.held)
-        held = held[measured_rows(train)]
-        return every.take(~held), every.take(held)
+        A memory needs inner reversals to be learned. A direction that was only seen in full
+        sweeps may still be right: that is left to judging data which has inner reversals.
+        """
+        lenient = name == "direction" and self.judged_inside
+        return torch.tensor(
+            [float(x.direction if lenient else x.minor_loops) for x in self.chambers]
+        )
 
 
-def _grow(model, name, spec, config, excited, judge, train, warnings) -> ArmModel | None:
+def _grow(
+    result: FitResult,
+    name: str,
+    spec: ArmSpec,
+    config: FitConfig,
+    support: _Support,
+    train: History,
+) -> ArmModel | None:
     """The model with one stage more, the same function as before; None if data forbids it."""
-    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
     if name == "pressure":
         network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
         normalise(network, train)
@@ -236,49 +247,46 @@ def _grow(model, name, spec, config, excited, judge, train, warnings) -> ArmMode
         network = ConstantCurvature(low, high, spec.key_points, config.sections)
         network.set_rest(rest_shape(train))
         return ArmModel(spec, network)
-    use = torch.tensor([float(chamber.direction) for chamber in excited])
-    if not judge.inner:
-        use = use * torch.tensor([float(chamber.minor_loops) for chamber in excited])
-    if name != "direction":
-        use = use * torch.tensor([float(chamber.minor_loops) for chamber in excited])
-    if not config.check_excitation:
-        use = torch.ones_like(use)
-    for chamber, used in zip(excited, use, strict=True):
+    use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
+    for chamber, used in zip(support.chambers, use, strict=True):
         if not used:
-            warnings.append(f"{name} left out for {chamber.complaint()}")
+            result.warnings.append(f"{name} left out for {chamber.complaint()}")
     if not use.any():
         return None
-    grown = copy.deepcopy(model)
+    grown = copy.deepcopy(result.model)
     if name == "direction":
         grown.network = grown.network.with_directions(use)
         return grown
-    effect = make_effect(name, low, high)
+    effect = make_effect(name, low, high, rest)
     effect.use.copy_(use)
     return ArmModel(spec, grown.network, {**grown.effects, name: effect})
 
 
-def _stage(candidate, name, config, judge, train, valid, result, progress) -> None:
+def _stage(candidate, name: str, config, data: Data, result: FitResult, progress) -> None:
     """Train one stage and keep it if held-out data rewards it."""
     begin = time.perf_counter()
-    fitted, held = judge.rows(candidate, train, valid)
-    last = name == _stages(config)[-1]
-    epochs = config.epochs if last else max(CHECK_EVERY, round(config.epochs * config.first_share))
-    before = None
-    if result.model is not None:
-        before = (model_rows(result.model, known_to(result.model, held)) - held.target).square()
-    done = train_rows(candidate, fitted, held, name, epochs, config, result.loss, progress)
-    after = (model_rows(candidate, held) - held.target).square()
-    rmse = math.sqrt(float(after.sum(-1).nanmean()))
+    epochs = train_model(
+        candidate, data, name, _stage_epochs(name, config), config, result.loss, progress
+    )
+    after = _square(candidate, data)
     kept, reason = True, ""
-    if before is not None:
-        kept, reason = _better(before, after, held.block)
+    if result.model is not None:
+        block = data.judging_rows(candidate).block
+        kept, reason = _better(_square(result.model, data), after, block)
         if not kept:
             result.warnings.append(f"{name} left out: {reason}")
     if kept:
-        candidate.rest_mm.copy_(rest_shape(train))
+        candidate.rest_mm.copy_(rest_shape(data.train))
         result.model = candidate
+    rmse = math.sqrt(float(after.sum(-1).nanmean()))
     seconds = time.perf_counter() - begin
-    result.stages.append(StageReport(name, rmse, done, seconds, kept, reason))
+    result.stages.append(StageReport(name, rmse, epochs, seconds, kept, reason))
+
+
+def _square(model: ArmModel, data: Data) -> Tensor:
+    """(S, n, 3) squared error in mm^2 on the judging rows; NaN where missing."""
+    rows = data.judging_rows(model)
+    return (model_rows(model, rows) - rows.target).square()
 
 
 def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.network import range_weights, weighted_mse
 from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.rows import Data
+from surgisoft.surrogate.training import CHECK_EVERY, PATIENCE
 
 WINDOW = 96
 """Rows of a training window."""
@@ -18,26 +19,16 @@ BURN_IN = 32
 
 
 def train_recurrent(
-    model: ArmModel,
-    train: History,
-    held: Tensor | None,
-    valid: History | None,
-    epochs: int,
-    rate: float,
-    seed: int,
-    check: int,
-    patience: int,
-    progress=None,
+    model: ArmModel, data: Data, epochs: int, rate: float, seed: int, progress=None
 ) -> tuple[list[tuple[str, int, float, float]], int]:
-    """Adam on windows; ends as the best on held-out rows. Returns (losses, epochs done)."""
+    """Adam on windows; ends as the best on judging rows. Returns (losses, epochs done)."""
+    train = data.train
     generator = torch.Generator().manual_seed(seed)
     network: RecurrentArm = model.network
     with torch.no_grad():
         trace = model.trace(train)
     weights = range_weights(train.rows(train.key_points))
-    target = train.key_points
-    if held is not None:
-        target = torch.where(held[..., None, None], torch.nan, target)
+    target = data.targets
     window = min(WINDOW, train.valid.shape[1])
     burn = min(BURN_IN, window // 3)
     starts = [
@@ -68,32 +59,30 @@ def train_recurrent(
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
             optimiser.step()
             schedule.step()
-        if epoch % check == 0 or epoch == epochs:
-            now = held_error(model, train, held, valid, weights)
+        if epoch % CHECK_EVERY == 0 or epoch == epochs:
+            now = held_error(model, data, weights)
             losses.append(("recurrent", epoch, float(loss.detach()), now))
             waited = 0 if now < best else waited + 1
             if now < best:
                 best, best_state = now, copy.deepcopy(model.state_dict())
             if progress is not None:
                 progress("recurrent", epoch, epochs, best)
-            if waited >= patience:
+            if waited >= PATIENCE:
                 break
     model.load_state_dict(best_state)
     return losses, epoch
 
 
-def held_rows(
-    model: ArmModel, train: History, held: Tensor | None, valid: History | None
-) -> tuple[Tensor, Tensor]:
-    """(predicted, measured) key points (S, n, 3) in mm on the held-out rows."""
-    judged, mask = (train, held) if valid is None else (valid, valid.valid)
+def held_rows(model: ArmModel, data: Data) -> tuple[Tensor, Tensor]:
+    """(predicted, measured) key points (S, n, 3) in mm on the judging rows."""
+    mask = data.judge.valid if data.held is None else data.held
     with torch.no_grad():
-        return model.predict(judged)[mask], judged.key_points[mask]
+        return model.predict(data.judge)[mask], data.judge.key_points[mask]
 
 
-def held_error(model, train, held, valid, weights) -> float:
-    """Weighted MSE in mm^2 on the held-out rows."""
-    predicted, measured = held_rows(model, train, held, valid)
+def held_error(model: ArmModel, data: Data, weights: Tensor) -> float:
+    """Weighted MSE in mm^2 on the judging rows."""
+    predicted, measured = held_rows(model, data)
     return float(weighted_mse(predicted, measured, weights))
 
 

@@ -55,6 +55,7 @@ class ArmModel(nn.Module):
         rest = torch.zeros(spec.key_points, 3) if rest_mm is None else rest_mm.float()
         self.register_buffer("rest_mm", rest)
         self.register_buffer("band", torch.tensor(spec.band, dtype=torch.float32))
+        self.register_buffer("rest", torch.tensor(spec.rest, dtype=torch.float32))
 
     def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
         """The effects of one stage, by name, in order."""
@@ -72,12 +73,10 @@ class ArmModel(nn.Module):
     def initial_state(self, batch: int = 1, pressure: Tensor | None = None) -> ArmState:
         """(B) arms without history at `pressure` (B, m) in the arm's unit.
 
-        Without a pressure: at zero, or at the end of the range that is nearest to it.
+        Without a pressure: at rest (`ArmSpec.rest`).
         """
         if pressure is None:
-            low = self.band.new_tensor(self.spec.low)
-            high = self.band.new_tensor(self.spec.high)
-            pressure = torch.zeros_like(low).clamp(low, high).expand(batch, -1)
+            pressure = self.rest.expand(batch, -1)
         memory = {}
         signal = pressure
         for name, effect in self.stage("line") + self.stage("material"):
@@ -121,15 +120,15 @@ class ArmModel(nn.Module):
         return ArmState(pressure, anchor, direction, memory), points
 
     def trace(self, history: History) -> Trace:
-        """What `shape` needs in each row; every run starts without history at its first row."""
-        dt = history.dt_s
+        """What `shape` needs in each row; every run starts from an arm at rest."""
+        dt, start = history.dt_s, self.initial_state(history.runs).memory
         chamber = history.pressure
-        for _, effect in self.stage("line"):
-            chamber = effect.apply(chamber, effect.scan(chamber, dt))
-        _, direction = directions.trace(chamber, self.band)
+        for name, effect in self.stage("line"):
+            chamber = effect.apply(chamber, effect.scan(start[name], chamber, dt))
+        _, direction = directions.trace(chamber, self.band, self.rest)
         memory, signal = {}, chamber
         for name, effect in self.stage("material"):
-            memory[name] = effect.scan(signal, dt)
+            memory[name] = effect.scan(start[name], signal, dt)
             signal = effect.apply(signal, memory[name])
         return Trace(chamber, direction, memory)
 
@@ -152,9 +151,11 @@ class ArmModel(nn.Module):
             points = self.network(effective, trace.direction, hidden)
         else:
             points = self.shape(trace.pressure, trace.direction, trace.memory)
-        dt = history.dt_s
-        for _, effect in self.stage("body") + self.stage("sensor"):
-            points = effect.apply(points, effect.scan(points, dt))
+        outer = self.stage("body") + self.stage("sensor")
+        if outer:
+            dt, start = history.dt_s, self.initial_state(history.runs).memory
+            for name, effect in outer:
+                points = effect.apply(points, effect.scan(start[name], points, dt))
         return points
 
     def summary(self) -> str:

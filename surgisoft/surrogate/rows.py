@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, Trace
 
 HOLD_BLOCKS = 20
 """Blocks that a single run is cut into where no validation recording is given."""
@@ -56,10 +56,56 @@ def measured_rows(history: History) -> Tensor:
     return history.rows((~history.key_points.isnan()).all(-1).any(-1))
 
 
-def make_rows(model: ArmModel, history: History, block_rows: int = 25) -> Rows:
+@dataclass(frozen=True)
+class Data:
+    """What a model is fitted to and what judges it."""
+
+    train: History
+    """Histories to fit to."""
+    valid: History | None
+    """Histories that judge; None: the rows of `train` in `held` do."""
+    held: Tensor | None
+    """(R, T) rows of `train` that are held out; None with a validation history."""
+
+    @classmethod
+    def split(cls, train: History, valid: History | None, seed: int) -> "Data":
+        """Judge by a validation history, or by held-out runs or blocks without one."""
+        return cls(train, valid, hold_out(train, seed) if valid is None else None)
+
+    @property
+    def judge(self) -> History:
+        """The history that the judging rows are part of."""
+        return self.train if self.valid is None else self.valid
+
+    def fitted_rows(self, model: ArmModel, trace: Trace | None = None) -> Rows:
+        """The rows to fit to, as the model sees them."""
+        rows = make_rows(model, self.train, trace)
+        if self.held is None:
+            return rows
+        return rows.take(~self.train.rows(self.held)[measured_rows(self.train)])
+
+    def judging_rows(self, model: ArmModel) -> Rows:
+        """The rows that judge, as the model sees them."""
+        if self.valid is not None:
+            return make_rows(model, self.valid)
+        held = self.train.rows(self.held)[measured_rows(self.train)]
+        return make_rows(model, self.train).take(held)
+
+    @property
+    def targets(self) -> Tensor:
+        """(R, T, n, 3) key points to fit to, mm; NaN where missing or held out."""
+        if self.held is None:
+            return self.train.key_points
+        return torch.where(self.held[..., None, None], torch.nan, self.train.key_points)
+
+
+def make_rows(
+    model: ArmModel, history: History, trace: Trace | None = None, block_rows: int = 25
+) -> Rows:
     """The measured rows of a history as the model sees them."""
-    with torch.no_grad():
-        trace = model.trace(history)
+    if trace is None:
+        with torch.no_grad():
+            trace = model.trace(history)
     seen = measured_rows(history)
     steps = torch.arange(history.valid.shape[1]).expand_as(history.valid)
     block = history.rows(steps // block_rows) + 1_000_000 * history.run_of_row
@@ -95,12 +141,6 @@ def validated_error(target: Tensor, predicted: Tensor) -> dict:
         "per_key_point_mm": [math.sqrt(float(x)) for x in square.nanmean(0)],
         "rows": len(target),
     }
-
-
-def known_to(model: ArmModel, rows: Rows) -> Rows:
-    """The rows with only the memories that the model has."""
-    memory = {name: rows.memory[name] for name in model.effects if name in rows.memory}
-    return Rows(rows.pressure, rows.direction, memory, rows.target, rows.block)
 
 
 def normalise(network: nn.Module, history: History) -> None:

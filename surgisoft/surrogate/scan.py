@@ -30,6 +30,29 @@ def clamp_scan(low: Tensor, high: Tensor, start: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(start.unsqueeze(1), low), high)
 
 
+def play_scan(signal: Tensor, radius: Tensor, start: Tensor) -> Tensor:
+    """Play operators along a signal: y[:, t] = clamp(y[:, t-1], u - r, u + r).
+
+    Shapes: signal (R, T, ...), radius (...) broadcast to it, start (R, ...). Differentiable: where
+    a play last moved, at step s, it is u[s] -+ r, so its gradient is that of a gather at s, and
+    that of the start where it has not moved yet.
+    """
+    with torch.no_grad():
+        plays = clamp_scan(signal - radius, signal + radius, start)
+    if not (torch.is_grad_enabled() and (signal.requires_grad or start.requires_grad)):
+        return plays
+    moved = plays != torch.cat([start.detach().unsqueeze(1), plays[:, :-1]], dim=1)
+    steps = torch.arange(signal.shape[1], device=signal.device)
+    steps = steps.view(1, -1, *[1] * (signal.ndim - 2)).expand_as(moved)
+    last = torch.where(moved, steps, -torch.ones_like(steps)).cummax(dim=1).values
+    source = torch.where(
+        last >= 0,
+        torch.gather(signal.expand_as(plays), 1, last.clamp(min=0)),
+        start.unsqueeze(1).expand_as(plays),
+    )
+    return source + (plays - source.detach())
+
+
 def last_nonzero(values: Tensor) -> Tensor:
     """At each step the latest value along dim 1 that is not zero; 0 before the first.
 

@@ -12,8 +12,8 @@ EFFECTS: dict[str, type[Effect]] = {"hysteresis": Hysteresis}
 __all__ = ["EFFECTS", "STAGES", "Effect", "Quantity", "Stage", "make_effect"]
 
 
-def make_effect(name: str, low: Tensor, high: Tensor, **config) -> Effect:
-    """The named effect for an arm with pressure range low, high (m,) in its unit."""
+def make_effect(name: str, low: Tensor, high: Tensor, rest: Tensor, **config) -> Effect:
+    """The named effect for an arm with actuation range low, high and rest (m,) in its unit."""
     if name not in EFFECTS:
         raise unknown_name("effect", name, EFFECTS)
-    return EFFECTS[name](low, high, **config)
+    return EFFECTS[name](low, high, rest, **config)

@@ -45,12 +45,19 @@ class Effect(nn.Module, ABC):
         """Memory (B, ...) after the signal (B, ...) has come to pass during dt (B,) seconds."""
 
     @abstractmethod
-    def scan(self, signal: Tensor, dt: Tensor) -> Tensor:
-        """`advance` over whole runs: memory (R, T, ...) from signal (R, T, ...), dt (R, T)."""
+    def scan(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
+        """`advance` over whole runs: memory (R, T, ...) from the memory (R, ...) before them.
+
+        Shapes: signal (R, T, ...), dt (R, T) in seconds.
+        """
 
     @abstractmethod
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """The signal after the effect, same shape; any leading dimensions."""
+
+    def memory_parameters(self) -> list[nn.Parameter]:
+        """Parameters that the memory depends on: they are fitted through whole runs."""
+        return []
 
     @abstractmethod
     def config(self) -> dict:

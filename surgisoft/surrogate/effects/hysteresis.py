@@ -1,14 +1,18 @@
-"""Hysteresis: superposed play operators with memory (Prandtl-Ishlinskii).
+"""Hysteresis: play operators with memory on mixtures of the chambers (Prandtl-Ishlinskii).
 
 A play operator of radius r follows its input through a gap of width 2r:
-y(t) = clamp(y(t-), x(t) - r, x(t) + r) (Krasnosel'skii & Pokrovskii 1989, ch. 1). Many of them
-remember every reversal that no larger one has wiped out. The effective actuation is
+y(t) = clamp(y(t-), u(t) - r, u(t) + r) (Krasnosel'skii & Pokrovskii 1989, ch. 1). Many of them
+remember every reversal that no larger one has wiped out. In a soft arm friction sits in the wall,
+and the strain of a wall line is moved by several chambers at once; as in a vector hysteron model
+(Mayergoyz 2003, ch. 3), plays therefore run along several lines l of the actuation space,
 
-    p_eff_i = p_i + sum_k sum_j (w_ikj + v_ikj x_k) (y_kj - p_k),     x_k = p_k scaled to [-1, 1]
+    u_l = sum_i a_li x_i + sum_{i<=j} b_lij x_i x_j,      x = actuation scaled to [-1, 1],
 
-with thresholds j and chambers i, k: w is the classical superposition (Kuhnen 2003, eq. 8) with
-cross terms between the chambers, v lets the loop's width depend on the pressure, as in a Preisach
-density that is not constant along the diagonal (Mayergoyz 2003, ch. 1).
+whose mixture a, b is fitted with the rest. Superposed (Kuhnen 2003, eq. 8) they give
+
+    x_eff = x + sum_l sum_k (w_lk + v_lk (u_l - u_l(rest))) (y_lk - u_l),
+
+where v lets a loop's width depend on where it lies. With w = v = 0 nothing changes.
 """
 
 import torch
@@ -16,11 +20,11 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import Effect, Quantity
-from surgisoft.surrogate.scan import clamp_scan
+from surgisoft.surrogate.scan import play_scan
 
-RADII = (0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.29, 0.37, 0.45)
-"""Radii of the play operators as shares of the chamber's range: fine for small reversals, and up
-to nearly half of it (a radius above one half never moves)."""
+RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
+"""Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
+the half range (a larger radius never moves)."""
 
 
 class Hysteresis(Effect):
@@ -28,48 +32,74 @@ class Hysteresis(Effect):
 
     stage = "material"
 
-    def __init__(self, low: Tensor, high: Tensor, radii: tuple[float, ...] = RADII):
-        """Pressure range low, high (m,) in the arm's unit; radii as shares of it."""
+    def __init__(self, low: Tensor, high: Tensor, rest: Tensor, radii: tuple[float, ...] = RADII):
+        """Actuation range low, high and rest (m,) in the arm's unit; radii of the plays."""
         super().__init__()
-        centre, half = centre_and_half(low, high)
+        chambers = len(low)
         self.radii = tuple(radii)
+        centre, half = centre_and_half(low, high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
-        self.register_buffer("radius", 2 * half[:, None] * torch.tensor(self.radii))
-        self.register_buffer("use", torch.ones(len(low)))
-        shape = (len(low), len(low), len(self.radii))
+        self.register_buffer("origin", rest)
+        self.register_buffer("radius", torch.tensor(self.radii))
+        self.register_buffer("use", torch.ones(chambers))
+        self.register_buffer("pairs", torch.triu_indices(chambers, chambers))
+        lines = first_lines(chambers)
+        self.linear = nn.Parameter(lines)
+        self.bent = nn.Parameter(lines.new_zeros(len(lines), self.pairs.shape[1]))
+        shape = (chambers, len(lines), len(self.radii))
         self.weight = nn.Parameter(torch.zeros(shape))
         self.slope = nn.Parameter(torch.zeros(shape))
 
+    def lines(self, signal: Tensor) -> Tensor:
+        """(..., L) inputs of the lines' plays from the actuation (..., m)."""
+        x = (signal - self.centre) / self.half_range * self.use
+        products = x[..., self.pairs[0]] * x[..., self.pairs[1]]
+        return x @ self.linear.T + products @ self.bent.T
+
+    def memory_parameters(self) -> list[nn.Parameter]:
+        return [self.linear, self.bent]
+
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m, J) plays centred on the pressure (B, m): no remembered history."""
-        return signal.unsqueeze(-1).expand(*signal.shape, len(self.radii))
+        """(B, L, J) plays centred on the lines at the actuation (B, m): no history."""
+        return self.lines(signal)[..., None].expand(*signal.shape[:-1], -1, len(self.radii))
 
     def advance(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
-        """(B, m, J) plays after the pressure (B, m); dt does not matter."""
-        x = signal.unsqueeze(-1)
-        return torch.minimum(torch.maximum(memory, x - self.radius), x + self.radius)
+        """(B, L, J) plays after the actuation (B, m); dt does not matter."""
+        u = self.lines(signal).unsqueeze(-1)
+        return torch.minimum(torch.maximum(memory, u - self.radius), u + self.radius)
 
-    def scan(self, signal: Tensor, dt: Tensor) -> Tensor:
-        """(R, T, m, J) plays along the pressures (R, T, m)."""
-        x = signal.unsqueeze(-1)
-        return clamp_scan(x - self.radius, x + self.radius, self.rest(signal[:, 0]))
+    def scan(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
+        """(R, T, L, J) plays along the actuation (R, T, m), from plays (R, L, J) before it."""
+        u = self.lines(signal).unsqueeze(-1)
+        return play_scan(u.expand(*u.shape[:-1], len(self.radii)), self.radius, memory)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from pressure (..., m) and plays (..., m, J)."""
-        lag = (memory - signal.unsqueeze(-1)) * self.use[:, None]
-        x = (signal - self.centre) / self.half_range
-        both = torch.cat([lag.flatten(-2), (lag * x.unsqueeze(-1)).flatten(-2)], dim=-1)
+        """Effective actuation (..., m) from actuation (..., m) and plays (..., L, J)."""
+        u = self.lines(signal)
+        lag = memory - u.unsqueeze(-1)
+        away = (u - self.lines(self.origin)).unsqueeze(-1)
+        both = torch.cat([lag.flatten(-2), (lag * away).flatten(-2)], dim=-1)
         table = torch.cat([self.weight.flatten(1), self.slope.flatten(1)], dim=1)
-        return signal + both @ table.T
+        return signal + self.half_range * (both @ table.T)
 
     def config(self) -> dict:
         return {"radii": list(self.radii)}
 
     def quantities(self) -> list[Quantity]:
-        own = self.weight.detach().diagonal().T * self.use[:, None]
+        strength = self.weight.detach().abs().sum(-1) * self.half_range[:, None]
         return [
-            Quantity("radius", self.radius.tolist(), "actuation"),
-            Quantity("weight", own.tolist(), ""),
-            Quantity("loop_share", own.sum(1).tolist(), ""),
+            Quantity("lines", self.linear.detach().tolist(), ""),
+            Quantity("radius", list(self.radii), "half range"),
+            Quantity("weight", self.weight.detach().tolist(), ""),
+            Quantity("loop", strength.tolist(), "actuation"),
         ]
+
+
+def first_lines(chambers: int) -> Tensor:
+    """(L, m) lines to start from: each chamber, and each with its neighbour; |values| sum to 1."""
+    single = torch.eye(chambers)
+    if chambers == 1:
+        return single
+    pairs = (single + single.roll(1, dims=0)) / 2
+    return torch.cat([single, pairs[: 1 if chambers == 2 else chambers]])

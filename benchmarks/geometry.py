@@ -24,7 +24,7 @@ import torch
 import trimesh
 
 from surgisoft.scene import frames
-from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.batched import BatchedScene, refined
 from surgisoft.scene.bvh import build_tree
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee, surface_model
@@ -173,8 +173,9 @@ def body_rates(mesh: Mesh, cache: Path) -> dict[str, dict[str, float]]:
         shapes = [{"arm": ArmShape(line, RADIUS_MM)} for line in lines[:48]]
 
         def batched(batch=batch):
+            line, given = refined(batch)
             return surface.clearance(
-                batch, turn, shift, RADIUS_MM, scene.exact_within_mm, scene.horizon_mm
+                line, given, turn, shift, RADIUS_MM, scene.exact_within_mm, scene.horizon_mm
             )
 
         def trimesh_points(lines=lines):
@@ -249,7 +250,7 @@ def scaling_row(faces: int) -> dict[str, float]:
     surface, (turn, shift) = scene._surfaces[0], scene._inward(scene.bodies[0], None)
     row["ray_us"] = 1e6 / rate(lambda: embree.first_hit(origins, aims, RANGE_MM), 4096)
     row["clearance_us"] = 1e6 / rate(
-        lambda: surface.clearance(lines, turn, shift, RADIUS_MM, 5.0, 60.0), 1024
+        lambda: surface.clearance(*refined(lines), turn, shift, RADIUS_MM, 5.0, 60.0), 1024
     )
     row["fcl_clearance_us"] = 1e6 / rate(
         lambda: [raw_fcl_distance(target, line) for line in raw], len(raw), 1

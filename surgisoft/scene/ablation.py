@@ -193,7 +193,7 @@ class AblationMap:
     def _deposit_torch(self, began, ended, direction, energy, dose, peak, band, area, joule):
         """The same on an accelerator: every sample of every environment, a few at a time."""
         points, normals, areas = (t.float() for t in self._samples)
-        size = max(1, 32_000_000 // len(points))
+        size = max(1, 8_000_000 // len(points))
         for i in range(0, len(dose), size):
             part = slice(i, i + size)
             p, q, d = began[part], ended[part], direction[part]

@@ -33,6 +33,10 @@ from surgisoft.scene.torch_distance import (
 
 ENGINES = ("compiled", "torch")
 """The batched engines: Embree and compiled queries, or torch alone."""
+LONGEST_SEGMENT_MM = 6.0
+"""Longer segments of a centreline are parted before they are held against the bodies (mm)."""
+MOST_PARTS = 256
+"""No segment is cut into more parts than this."""
 EXACT_WITHIN_MM = 5.0
 """Nearer than this, clearances are exact; farther, off by the field's interpolation (mm)."""
 
@@ -116,11 +120,12 @@ class BatchedScene:
         radii = [self.radius_mm(name) for name in names]
         dtype, count = lines[0].dtype, len(lines[0])
         bodies = torch.empty((count, len(names), len(self.bodies)), dtype=dtype, device=self.device)
+        fine = [refined(line) for line in lines]
         for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
             turn, shift = self._inward(body, poses)
-            for a, (line, radius) in enumerate(zip(lines, radii, strict=True)):
+            for a, ((line, given), radius) in enumerate(zip(fine, radii, strict=True)):
                 bodies[:, a, n] = surface.clearance(
-                    line, turn, shift, radius, self.exact_within_mm, self.horizon_mm
+                    line, given, turn, shift, radius, self.exact_within_mm, self.horizon_mm
                 )
         pairs = [
             self._apart(lines[i], lines[j], radii[i] + radii[j])
@@ -234,12 +239,16 @@ class CompiledSurface:
         self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
-    def clearance(self, lines, turn, shift, radius, within, horizon) -> torch.Tensor:
-        """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface."""
+    def clearance(self, lines, given, turn, shift, radius, within, horizon) -> torch.Tensor:
+        """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
+
+        given (K,) bool: the centreline's own points, where depth inside the body counts.
+        """
         out = torch.empty(len(lines), dtype=lines.dtype)
         field = self._field
         chains_to_surface(
             lines.numpy(),
+            given.numpy(),
             turn.numpy(),
             shift.numpy(),
             radius,
@@ -260,6 +269,25 @@ class CompiledSurface:
         """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
         distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
         return torch.from_numpy(distance), torch.from_numpy(face)
+
+
+def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Arms (B, K, 3) mm with long segments parted, and which points were there before (K',) bool.
+
+    Short segments are what the field bounds well; the parts lie on the segments they came from.
+    """
+    steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
+    longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
+    parts = (longest / LONGEST_SEGMENT_MM).ceil().clamp(1, MOST_PARTS).int().tolist()
+    given = torch.zeros(sum(parts) + 1, dtype=torch.bool, device=lines.device)
+    given[torch.tensor([0, *parts], device=lines.device).cumsum(0)] = True
+    if max(parts) == 1:
+        return lines, given
+    pieces = [lines[:, :1]]
+    for k, count in enumerate(parts):
+        share = torch.arange(1, count + 1, device=lines.device, dtype=lines.dtype) / count
+        pieces.append(torch.lerp(lines[:, k, None], lines[:, k + 1, None], share[:, None]))
+    return torch.cat(pieces, 1), given
 
 
 def _held(tensor: torch.Tensor) -> torch.Tensor:

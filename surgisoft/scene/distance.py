@@ -95,7 +95,7 @@ def _gap(p, q):
 
 
 @compiled
-def _line_bounds(line, values_at, lows, values, origin, cell, band, slack):
+def _line_bounds(line, given, values_at, lows, values, origin, cell, band, slack):
     """Field values at the points, least possible values per segment; the least of each (mm).
 
     line: (K, 3) in the body's frame; fills values_at (K,) and lows (K - 1,). On a segment of
@@ -105,7 +105,7 @@ def _line_bounds(line, values_at, lows, values, origin, cell, band, slack):
     for k in range(len(line)):
         p = (line[k, 0], line[k, 1], line[k, 2])
         values_at[k] = field_at(values, origin, cell, p)
-        estimate = min(estimate, values_at[k])
+        estimate = min(estimate, values_at[k] if given[k] else abs(values_at[k]))
         if k > 0:
             o = (line[k - 1, 0], line[k - 1, 1], line[k - 1, 2])
             ends = min(values_at[k - 1], band) + min(values_at[k], band)
@@ -115,7 +115,9 @@ def _line_bounds(line, values_at, lows, values, origin, cell, band, slack):
 
 
 @compiled
-def _exact(line, best, values_at, lows, closed, values, origin, cell, slack, tree, nodes, reach):
+def _exact(
+    line, given, best, values_at, lows, closed, values, origin, cell, slack, tree, nodes, reach
+):
     """Least of the centreline's distance to the surface and its points' signed distances (mm).
 
     `best` is an upper bound of it to begin with. The segment that may come nearest goes first.
@@ -134,7 +136,7 @@ def _exact(line, best, values_at, lows, closed, values, origin, cell, slack, tre
     if not closed:
         return best
     for k in range(len(line)):
-        if values_at[k] - slack < min(best, 0.0):
+        if given[k] and values_at[k] - slack < min(best, 0.0):
             p = (line[k, 0], line[k, 1], line[k, 2])
             bound = abs(values_at[k]) + slack
             d2 = point_surface(p, bound * bound, tree[0], tree[1], tree[2], tree[3])[0]
@@ -147,6 +149,7 @@ def _exact(line, best, values_at, lows, closed, values, origin, cell, slack, tre
 @compiled
 def chains_to_surface(
     lines,
+    given,
     turns,
     shifts,
     radius,
@@ -163,7 +166,8 @@ def chains_to_surface(
 ):
     """Signed clearance (mm) of arms to one body into out (B,), nan for an arm that is not finite.
 
-    lines (B, K, 3) world frame, mm; turns (B or 1, 3, 3) and shifts (B or 1, 3) world to body.
+    lines (B, K, 3) world frame, mm; given (K,) bool, the points at which depth counts; turns
+    (B or 1, 3, 3) and shifts (B or 1, 3) world to body.
     """
     count, points, _ = lines.shape
     line = np.empty((points, 3))
@@ -178,11 +182,14 @@ def chains_to_surface(
         if not math.isfinite(total):
             out[b] = math.nan
             continue
-        estimate, lowest = _line_bounds(line, values_at, lows, values, origin, cell, band, slack)
+        estimate, lowest = _line_bounds(
+            line, given, values_at, lows, values, origin, cell, band, slack
+        )
         if lowest - radius <= within:
             least = min(estimate + slack, horizon + radius)
             estimate = _exact(
                 line,
+                given,
                 least,
                 values_at,
                 lows,

@@ -34,8 +34,11 @@ class TorchSurface:
         distance, face = self._tree.first_hit(o, d, reach)
         return torch.where(face >= 0, distance, float(range_mm)), face
 
-    def clearance(self, lines, turn, shift, radius, within, horizon) -> torch.Tensor:
-        """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface."""
+    def clearance(self, lines, given, turn, shift, radius, within, horizon) -> torch.Tensor:
+        """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
+
+        given (K,) bool: the centreline's own points, where depth inside the body counts.
+        """
         line = lines.double() @ turn.mT + shift[:, None]
         finite = line.isfinite().flatten(1).all(1)
         line = torch.where(finite[:, None, None], line, 0.0)
@@ -43,13 +46,13 @@ class TorchSurface:
         at_points = self.field_at(line)
         field, held = self._field, at_points.clamp(max=self._field.band_mm)
         lows = 0.5 * (held[:, :-1] + held[:, 1:] - norm(b - a)) - field.slack_mm
-        estimate = at_points.amin(1)
+        estimate = torch.where(given, at_points, at_points.abs()).amin(1)
         near = finite & (lows.amin(1) - radius <= within)
         index = near.nonzero()[:, 0]
         least = (estimate[index] + field.slack_mm).clamp(max=horizon + radius)
         least = self._to_segments(a[index], b[index], lows[index], least)
         if self._closed:
-            least = self._to_depths(line[index], at_points[index], least)
+            least = self._to_depths(line[index][:, given], at_points[index][:, given], least)
         centre = estimate.clone()
         centre[index] = least
         clear = (centre - radius).clamp(max=horizon)

@@ -290,3 +290,24 @@ def test_bad_requests_are_named():
         BatchedScene([], {"a": 1.0}, device="cuda", engine="compiled")
     with pytest.raises(InputError, match="margin"):
         field.load_field(ball(), 0.0, 1.0)
+
+
+def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
+    """A first segment of 100 mm behind the arm; sideways passes of long segments too."""
+    bodies, scene = organ_scene
+    referee = Referee(bodies)
+    arms = random_arms(150, seed=11, near=60.0, far=110.0)
+    back = frames.normalise(arms[:, 0] - arms[:, 1])
+    arms = torch.cat((arms[:, :1] + 100.0 * back[:, None], arms), 1)
+    arms[::2] = arms[::2].flip(0) - 60.0 * back[::2, None]
+    for engine in (scene, on_torch(bodies)):
+        found = engine.clearance({"a": arms}).bodies_mm[:, 0, 0]
+        for i, line in enumerate(arms.double().numpy()):
+            shapes = {"a": ArmShape(line, RADIUS)}
+            truth = referee.clearance(shapes).bodies_mm["a", "organ"]
+            if truth < batched.EXACT_WITHIN_MM - 0.1:
+                assert found[i].item() == pytest.approx(truth, abs=1e-4)
+            else:
+                assert found[i].item() == pytest.approx(truth, abs=1.0)
+    assert (found < 0).any()
+    assert (found > 5).any()

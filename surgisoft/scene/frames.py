@@ -27,7 +27,7 @@ def _as_arrays(*values):
 
 def norm(vector):
     """Euclidean length of (..., 3) vectors: (...)."""
-    return _library(vector).sqrt((vector * vector).sum(-1))
+    return _library(vector).sqrt(dot(vector, vector))
 
 
 def normalise(vector):
@@ -45,7 +45,7 @@ def cross(a, b):
 
 def dot(a, b):
     """Dot product of (..., 3) vectors, broadcast: (...)."""
-    return (a * b).sum(-1)
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def pose_from(rotation, position_mm):
@@ -151,7 +151,7 @@ def rotation_from_quaternion(quaternion):
     """Rotation (..., 3, 3) of quaternions (..., 4) as (w, x, y, z); they are normalised first."""
     (quaternion,) = _as_arrays(quaternion)
     lib = _library(quaternion)
-    q = normalise(quaternion)
+    q = _unit_quaternion(quaternion)
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     rows = (
         lib.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
@@ -159,6 +159,11 @@ def rotation_from_quaternion(quaternion):
         lib.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
     )
     return lib.stack(rows, -2)
+
+
+def _unit_quaternion(quaternion):
+    """Quaternions (..., 4) scaled to unit norm."""
+    return quaternion / _library(quaternion).sqrt((quaternion * quaternion).sum(-1))[..., None]
 
 
 def quaternion_from_rotation(rotation):
@@ -192,7 +197,7 @@ def quaternion_from_rotation(rotation):
         row = torch.take_along_dim(candidates, best.expand(*candidates.shape[:-2], 1, 4), -2)
     else:
         row = np.take_along_axis(candidates, best, -2)
-    q = normalise(row[..., 0, :])
+    q = _unit_quaternion(row[..., 0, :])
     return lib.where(q[..., :1] < 0, -q, q)
 
 

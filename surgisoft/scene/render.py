@@ -19,7 +19,7 @@ from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import EmbreeSurface, rays_to_chains
 
 BODY_COLOURS = {
-    "organ": (0.55, 0.16, 0.13),
+    "organ": (0.38, 0.095, 0.07),
     "keep-out": (0.25, 0.33, 0.62),
     "support": (0.36, 0.42, 0.40),
 }

@@ -94,7 +94,8 @@ class EmbreeSurface:
         """Distances (N,) mm and faces (N,) of unit rays (N, 3) float64; the range and -1 to miss.
 
         Embree works in float32; the distance is taken again in float64 in the plane of the face it
-        names. Rays that are not finite miss.
+        names. Rays that are not finite miss. A ray aimed at a mesh vertex to the last bit may slip
+        through it (4 in 1,000 such rays; none of 40,000 random ones); the referee does not.
         """
         finite = np.isfinite(origins_mm).all(axis=1) & np.isfinite(directions).all(axis=1)
         origins = np.where(finite[:, None], origins_mm - self._middle, 1e6)

@@ -79,12 +79,11 @@ def check(
     from surgisoft.scene.folder import open_scene
 
     scene = open_scene(folder)
-    scene.ring  # noqa: B018  (a lesion that does not lie on the organ is an error at once)
-    reaches = reaches_of(scene.spec)
+    reaches = reaches_of(scene)
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
     _print_check(verdict)
-    if picture is not None:
+    if picture is not None and verdict.work is not None:
         from surgisoft.replay.reach_map import draw_reach_map
 
         draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)
@@ -111,7 +110,7 @@ def show(
     from surgisoft.scene.folder import open_scene
 
     scene = open_scene(folder)
-    reaches = reaches_of(scene.spec)
+    reaches = reaches_of(scene)
     if save is not None:
         save_scene_view(scene, reaches, save)
         print(f"wrote {save}")
@@ -180,7 +179,9 @@ def _name(folder: Path) -> str:
 
 
 def _print_check(verdict) -> None:
-    print(verdict.sentence)
+    from surgisoft.scene.check import sentence
+
+    print(sentence(verdict))
     wide = max(len(finding.what) for finding in verdict.findings)
     value = max(len(finding.value) for finding in verdict.findings)
     for finding in verdict.findings:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.errors import InputError
-from surgisoft.scene.check import REASONS, Patch, SceneCheck
+from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
 from surgisoft.toml_config import write_atomically
 
@@ -29,7 +29,7 @@ def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) 
     rows = right.get_subplotspec().subgridspec(3, 1)
     right.remove()
     _draw_ring([figure.add_subplot(row) for row in rows], scene, verdict)
-    figure.suptitle(f"{scene.spec.name}: {verdict.sentence}", fontsize=9, wrap=True)
+    figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,8 +55,8 @@ def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -
         axes.scatter(*bad.T, s=26, marker="s", color=REASON_COLOURS[code], label=REASONS[code])
     closed = np.vstack((patch.ring_flat_mm, patch.ring_flat_mm[:1]))
     axes.plot(*closed.T, color="white", lw=3.5)
-    for code in np.unique(verdict.reason):
-        here = verdict.reason == code
+    for code in np.unique(verdict.work.reason):
+        here = verdict.work.reason == code
         axes.scatter(
             *patch.ring_flat_mm[here].T,
             s=14,
@@ -70,17 +70,17 @@ def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -
 
 def _draw_ring(axes, scene: Scene, verdict: SceneCheck) -> None:
     """Clearance, incidence and length of the beam over the angle around the ring."""
-    angle = 360.0 * np.arange(len(verdict.reason)) / len(verdict.reason)
+    angle = 360.0 * np.arange(len(verdict.work.reason)) / len(verdict.work.reason)
     limits, laser = scene.spec.limits, scene.spec.laser
-    cut = verdict.cut
+    cut = verdict.work.cut
     rows = (
-        ("clearance (mm)", verdict.clearance_mm, (limits.clearance_mm,)),
+        ("clearance (mm)", verdict.work.clearance_mm, (limits.clearance_mm,)),
         ("incidence (deg)", np.degrees(cut.incidence_rad), (laser.max_incidence_deg,)),
         ("beam length (mm)", cut.standoff_mm, laser.standoff_mm),
     )
     for one, (label, values, bounds) in zip(axes, rows, strict=True):
         one.plot(angle, values, color="#333333", lw=1.2)
-        colours = [REASON_COLOURS[code] for code in verdict.reason]
+        colours = [REASON_COLOURS[code] for code in verdict.work.reason]
         one.scatter(angle, values, s=9, c=colours, zorder=3)
         for bound in bounds:
             one.axhline(bound, color="#c1121f", lw=0.9, ls="--")

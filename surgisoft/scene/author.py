@@ -11,7 +11,7 @@ import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene
+from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene, rounded_mount
 from surgisoft.scene.mesh import ROLES, Body, Mesh
 from surgisoft.scene.meshio import MM_PER_UNIT, read_parts, recognise_unit, write_ply
@@ -30,7 +30,6 @@ from surgisoft.scene.spec import (
     SceneSpec,
     save_spec,
 )
-from surgisoft.scene.sweep import LANDED_MM
 
 FAR_OFF = 20.0
 """A mesh whose middle lies this many times its size from the origin is moved there."""
@@ -158,7 +157,10 @@ def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
         found += [(name, mesh) for mesh in repaired.bodies]
     if not found:
         raise failures[0]
-    notes += [f"{path.name}: {count} {what}" for what, count in done.items()]
+    usual = " (an STL repeats every corner)" if path.suffix.lower() == ".stl" else ""
+    for what, count in done.items():
+        note = usual if what == "duplicate vertices joined" else ""
+        notes.append(f"{path.name}: {what}: {count}{note}")
     notes += [f"left out: {error}" for error in failures]
     return found
 
@@ -231,12 +233,12 @@ def author(
             check = check_scene(scene, reaches)
             if check.good:
                 return Authored(scene, check, (*prepared.notes, *_chosen(scene, check)))
-            lacks.append((check.covered, check.sentence))
+            lacks.append((check.work.covered if check.work else 0.0, sentence(check)))
         if lack is not None:
             lacks.append((lack.covered, lack.sentence))
     best = max(lacks, key=lambda lack: lack[0])[1]
     where = "the lesion" if len(sites) == 1 else f"any of {len(sites)} places for the lesion"
-    raise NoMounts(f"no mounts exist for {where}: {best}")
+    raise NoMounts(f"no mounts were found for {where}: {best}")
 
 
 def _coarse(ring):
@@ -287,13 +289,13 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
 
 
 def _chosen(scene: Scene, check: SceneCheck) -> list[str]:
+    cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     return [
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
-        f"beam {check.cut.standoff_mm.min():.0f} to {check.cut.standoff_mm.max():.0f} mm long, "
-        f"incidence up to {np.degrees(check.cut.incidence_rad.max()):.0f} degrees, lands within "
-        f"{LANDED_MM} mm",
+        f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "
+        f"{np.degrees(cut.incidence_rad.max()):.0f} degrees",
     ]
 
 

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.lesion import circle_on, nearest_on_surface
+from surgisoft.scene.lesion import ON_SURFACE_MM, circle_on, nearest_on_surface
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import TOOLS
 from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, look_at_lesion
@@ -45,11 +46,9 @@ class Finding:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneCheck:
-    """The referee's verdict on a scene."""
+class Work:
+    """Both arms at work, point by point of the ring (M of them)."""
 
-    findings: tuple[Finding, ...]
-    """The table."""
     reason: np.ndarray
     """(M,) int: index into REASONS of each ring point."""
     cut: Cut
@@ -57,31 +56,41 @@ class SceneCheck:
     look: Look
     """The endoscope arm turned to the lesion."""
     clearance_mm: np.ndarray
-    """(M,) mm: least clearance of both arms with the beam on each ring point."""
+    """(M,) mm: least clearance of both arms with the beam on each ring point; -1 for contact."""
     view: np.ndarray
     """(M / VIEW_EVERY,) fraction of the ring in view with the beam on every VIEW_EVERYth point."""
-
-    @property
-    def good(self) -> bool:
-        """Whether every finding holds."""
-        return all(finding.good for finding in self.findings)
 
     @property
     def covered(self) -> float:
         """Fraction of the ring that can be cut."""
         return float(np.mean(self.reason == 0))
 
+
+@dataclass(frozen=True, eq=False)
+class SceneCheck:
+    """The referee's verdict on a scene."""
+
+    findings: tuple[Finding, ...]
+    """The table."""
+    work: Work | None
+    """The arms at work; None where the ring does not lie on the organ."""
+
     @property
-    def sentence(self) -> str:
-        """The verdict in one sentence."""
-        if self.good:
-            return (
-                f"The scene is ready: the laser reaches {100 * self.covered:.0f} % of the ring, "
-                f"the endoscope sees {100 * self.view.min():.0f} % of it, nothing comes closer "
-                f"than {self.clearance_mm.min():.1f} mm."
-            )
-        bad = [f"{f.what}: {f.value} (needs {f.wanted})" for f in self.findings if not f.good]
-        return f"The scene is not ready: {'; '.join(bad)}."
+    def good(self) -> bool:
+        """Whether every finding holds."""
+        return all(finding.good for finding in self.findings)
+
+
+def sentence(check: SceneCheck) -> str:
+    """The verdict in one sentence."""
+    if check.good:
+        return (
+            f"The scene is ready: the laser reaches {100 * check.work.covered:.0f} % of the ring, "
+            f"the endoscope sees {100 * check.work.view.min():.0f} % of it, nothing comes closer "
+            f"than {check.work.clearance_mm.min():.1f} mm."
+        )
+    bad = [f"{f.what}: {f.value} (needs {f.wanted})" for f in check.findings if not f.good]
+    return f"The scene is not ready: {'; '.join(bad)}."
 
 
 def held_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, Held]:
@@ -96,11 +105,21 @@ def check_scene(
 ) -> SceneCheck:
     """Everything a task relies on, decided by FCL on the meshes themselves.
 
-    `reaches` holds the arms' reach tables by tool. The ring must lie on the organ.
+    `reaches` holds the arms' reach tables by tool.
     """
+    findings = (*_mesh_findings(scene), _lesion_finding(scene))
+    if not findings[-1].good:
+        return SceneCheck(findings, None)
+    referee, arms = Referee(scene.bodies), held_arms(scene, reaches)
+    work = _work(scene, referee, arms, report)
+    report(len(work.reason) + 1, len(work.reason) + 2, "ways")
+    ways = _way_finding(scene, referee, arms, work)
+    return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
+
+
+def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Report) -> Work:
+    """The laser once around the ring beside the endoscope that looks at it."""
     limits, ring = scene.spec.limits, scene.ring
-    referee = Referee(scene.bodies)
-    arms = held_arms(scene, reaches)
     cut = cut_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
     radius = {tool: arms[tool].reach.radius_mm for tool in TOOLS}
@@ -110,29 +129,17 @@ def check_scene(
     for i, shape in enumerate(shapes):
         both = {"laser": shape, "endoscope": scope}
         clearance[i] = -1.0 if referee.collisions(both) else referee.clearance(both).least_mm
-        hit = referee.cast(
-            cut.lines_mm[i, -1], cut.directions[i], cut.standoff_mm[i] + 50.0, both, own="laser"
-        )
+        reach_mm = max(cut.standoff_mm[i], 0.0) + 50.0
+        hit = referee.cast(cut.lines_mm[i, -1], cut.directions[i], reach_mm, both, own="laser")
         landed[i] = bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[i]) <= LANDED_MM
         report(i + 1, len(shapes) + 2, "ring")
-    needed = np.maximum(limits.clearance_mm, 0.5 * np.maximum(cut.step_mm, np.roll(cut.step_mm, 1)))
-    jumps = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1)) > 0.5 * radius["laser"]
-    tests = (~cut.in_reach, cut.steep, ~landed, clearance < limits.clearance_mm, jumps)
-    reason = np.select(tests, range(1, 6), 0)
-    reason[(reason == 0) & (clearance < needed)] = 4
-    in_view = _view(referee, look, shapes, scene)
-    report(len(shapes) + 1, len(shapes) + 2, "ways")
-    touching, way_mm, half_step_mm = _ways(referee, arms, cut, look)
-    findings = (*_mesh_findings(scene), *_work_findings(scene, reason, clearance, in_view, look))
-    findings += (
-        Finding(
-            "contacts at rest and on the way",
-            ", ".join(touching) or f"none (least {way_mm:.1f} mm)",
-            f"none, {limits.clearance_mm:g} mm clear",
-            not touching and way_mm >= max(limits.clearance_mm, half_step_mm),
-        ),
-    )
-    return SceneCheck(findings, reason, cut, look, clearance, in_view)
+    # the arm moves on to both neighbours: no point of it is farther than half a step from a shape
+    # looked at, and a step is short beside the arm's own thickness, so that it does not jump
+    step = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1))
+    close = clearance < np.maximum(limits.clearance_mm, 0.5 * step)
+    tests = (~cut.in_reach, cut.steep, ~landed, close, step > 0.5 * radius["laser"])
+    reason = np.select(tests, range(1, len(REASONS)), 0)
+    return Work(reason, cut, look, clearance, _view(referee, look, shapes, scene))
 
 
 def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
@@ -149,25 +156,36 @@ def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
                 closed,
             )
         )
-    centre = np.asarray(scene.spec.lesion.centre_mm)
-    nearest, _ = nearest_on_surface(scene.organ.world_mesh, centre[None])
-    off = float(np.linalg.norm(nearest[0] - centre))
-    rows.append(Finding("lesion on the surface", f"{off:.3f} mm off", "0.5 mm", off <= 0.5))
     return tuple(rows)
 
 
-def _work_findings(scene, reason, clearance, in_view, look) -> tuple[Finding, ...]:
-    limits, camera = scene.spec.limits, scene.spec.camera
+def _lesion_finding(scene: Scene) -> Finding:
+    lesion = scene.spec.lesion
+    centre = np.asarray(lesion.centre_mm)
+    nearest, _ = nearest_on_surface(scene.organ.world_mesh, centre[None])
+    off = float(np.linalg.norm(nearest[0] - centre))
+    value, lies = f"{off:.3f} mm off", off <= ON_SURFACE_MM
+    if lies:
+        try:
+            scene.ring_of()
+        except InputError:
+            value, lies = f"its ring of {lesion.diameter_mm:g} mm hangs over an edge", False
+    return Finding("lesion on the surface", value, f"{ON_SURFACE_MM:g} mm, whole ring", lies)
+
+
+def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
+    limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
     lacking = [
-        f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
-        for code in np.unique(reason[reason > 0])
+        f"{100 * np.mean(work.reason == code):.0f} % {REASONS[code]}"
+        for code in np.unique(work.reason[work.reason > 0])
     ]
-    reach = f"{100 * np.mean(reason == 0):.0f} %"
-    least = float(clearance.min())
-    low, high = camera.range_mm
+    least, view_least = float(work.clearance_mm.min()), float(work.view.min())
     return (
         Finding(
-            "ring within the laser's reach", ", ".join((reach, *lacking)), "100 %", not lacking
+            "ring in the laser's reach",
+            ", ".join((f"{100 * work.covered:.0f} %", *lacking)),
+            "100 %",
+            not lacking,
         ),
         Finding(
             "clearance at work",
@@ -177,16 +195,27 @@ def _work_findings(scene, reason, clearance, in_view, look) -> tuple[Finding, ..
         ),
         Finding(
             "ring in view",
-            f"{100 * in_view.min():.0f} %",
+            f"{100 * view_least:.0f} %",
             f"{100 * limits.view_fraction:.0f} %",
-            bool(in_view.min() >= limits.view_fraction),
+            view_least >= limits.view_fraction,
         ),
         Finding(
             "camera to lesion",
-            f"{look.distance_mm:.0f} mm",
+            f"{work.look.distance_mm:.0f} mm",
             f"{low:g} to {high:g} mm",
-            low <= look.distance_mm <= high,
+            low <= work.look.distance_mm <= high,
         ),
+    )
+
+
+def _way_finding(scene: Scene, referee: Referee, arms: dict[str, Held], work: Work) -> Finding:
+    touching, least, half_step = _ways(referee, arms, work.cut, work.look)
+    clearance = scene.spec.limits.clearance_mm
+    return Finding(
+        "contacts at rest and on the way",
+        ", ".join(touching) or f"none (least {least:.1f} mm)",
+        f"none, {clearance:g} mm clear",
+        not touching and least >= max(clearance, half_step),
     )
 
 

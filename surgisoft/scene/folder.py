@@ -39,7 +39,10 @@ class Scene:
 
     def ring_of(self, **count: int) -> Ring:
         """The lesion's path with `count` points; an InputError where it does not lie."""
-        return lesion_ring(self.organ.world_mesh, self.spec.lesion, **count)
+        try:
+            return lesion_ring(self.organ.world_mesh, self.spec.lesion, **count)
+        except InputError as error:
+            raise InputError(f"{self.folder / FILE}: {error}") from None
 
     @cached_property
     def content_hash(self) -> str:

@@ -103,8 +103,8 @@ def good_sites(bodies: list[Mesh], diameter_mm: float) -> list[Site]:
         size = np.ptp(mesh.bounds_mm, axis=0)
         raise InputError(
             f"no ring of {diameter_mm:g} mm lies on a body of "
-            f"{' x '.join(f'{s:.3g}' for s in size)} mm; give a smaller --diameter or the right "
-            "--unit"
+            f"{' x '.join(f'{s:.3g}' for s in size)} mm: it hangs over an edge or the surface is "
+            "too rough; give a smaller --diameter or the right --unit"
         )
     return sites
 

@@ -49,3 +49,37 @@ def arc_directions(bend: np.ndarray) -> np.ndarray:
     """Unit tangent (..., 3) at the end of an arc of bend (..., 2) rad that starts along z."""
     angle = np.linalg.norm(bend, axis=-1, keepdims=True)
     return np.concatenate((np.sinc(angle / np.pi) * bend, np.cos(angle)), axis=-1)
+
+
+COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
+"""Samples of each chamber's range, by the number of chambers: at most 16,000 shapes."""
+
+
+def model_table(model, points: int = 15) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """The same for a fitted model: a grid over its chambers' ranges, each shape reached from rest.
+
+    Axes in the arm's own unit, centrelines (N, points, 3) mm and tip directions (N, 3), base frame.
+    """
+    import torch
+
+    from surgisoft.errors import InputError
+
+    spec = model.spec
+    if spec.chambers not in COUNTS:
+        raise InputError(
+            f"an arm of {spec.chambers} chambers has too many shapes for a table; expected at "
+            f"most {max(COUNTS)}"
+        )
+    count = COUNTS[spec.chambers]
+    axes = tuple(
+        np.linspace(low, max(high, low + 1e-6), count)
+        for low, high in zip(spec.low, spec.high, strict=True)
+    )
+    grid = np.stack([a.reshape(-1) for a in np.meshgrid(*axes, indexing="ij")], axis=1)
+    backbone = model.backbone(points)
+    with torch.no_grad():
+        pressure = torch.as_tensor(grid, dtype=torch.float32)
+        state = model.initial_state(len(grid), pressure)
+        _, key_points = model.step(state, torch.zeros_like(pressure), 1.0)
+        lines, directions = backbone.centreline(key_points), backbone.tip_direction(key_points)
+    return axes, lines.double().numpy(), directions.double().numpy()

@@ -41,7 +41,7 @@ def fit(
     actuation: Annotated[
         Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
     ] = "measured",
-    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 300,
+    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 200,
     seed: Annotated[int, typer.Option(help="Seed of weights and order of rows.")] = 0,
     threads: Annotated[
         int, typer.Option(min=1, help="Threads; more than one only pays on idle cores.")

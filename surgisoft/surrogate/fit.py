@@ -38,7 +38,7 @@ from surgisoft.surrogate.training import train as train_model
 INPUTS = ("pressure", "pressure+direction")
 SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that only prepares the next, or comes after an effect."""
-EFFECT_SHARE = 1 / 3
+EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
@@ -58,7 +58,7 @@ class FitConfig:
     """Widths of the hidden layers of HAW-NN."""
     sections: int = 0
     """Constant-curvature sections; 0: one for every 3 chambers."""
-    epochs: int = 300
+    epochs: int = 200
     """Most epochs of a stage without memory; stages that others follow, or with memory, have a
     share of them."""
     batch: int = 512
@@ -145,10 +145,12 @@ def fit(
     else:
         judged = excitation(data.judge, low, high, band)
         support = _Support(result.excitation, all(chamber.minor_loops for chamber in judged))
-        for name in _stages(config):
-            candidate = _grow(result, name, spec, config, support, train)
-            if candidate is not None:
-                _stage(candidate, name, config, data, result, progress)
+        names = _stages(config)
+        grown = [name for name in names if _possible(result, name, config, support)]
+        for name in grown:
+            candidate = _grow(result.model, name, spec, config, support, train)
+            epochs = _stage_epochs(name, grown, config)
+            _stage(candidate, name, epochs, config, data, result, progress)
         rows = data.judging_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
     result.model.eval().requires_grad_(False)
@@ -199,12 +201,12 @@ def _stages(config: FitConfig) -> list[str]:
     return names
 
 
-def _stage_epochs(name: str, config: FitConfig) -> int:
-    """Epochs of a stage: the richest that was asked for has most."""
+def _stage_epochs(name: str, stages: list[str], config: FitConfig) -> int:
+    """Epochs of a stage: the richest has most, those that lead to it few."""
     share = 1.0
     if name in config.effects:
         share = EFFECT_SHARE
-    elif len(_stages(config)) > 1 and (name == "pressure" or config.effects):
+    elif len(stages) > 1 and (name == "pressure" or any(x in config.effects for x in stages)):
         share = SIMPLE_SHARE
     return max(CHECK_EVERY, round(share * config.epochs))
 
@@ -229,15 +231,19 @@ class _Support:
         )
 
 
-def _grow(
-    result: FitResult,
-    name: str,
-    spec: ArmSpec,
-    config: FitConfig,
-    support: _Support,
-    train: History,
-) -> ArmModel | None:
-    """The model with one stage more, the same function as before; None if data forbids it."""
+def _possible(result: FitResult, name: str, config: FitConfig, support: _Support) -> bool:
+    """Whether the recordings support a stage in any chamber; notes those that they do not."""
+    if name in ("pressure", "constant curvature") or not config.check_excitation:
+        return True
+    use = support.use(name)
+    for chamber, used in zip(support.chambers, use, strict=True):
+        if not used:
+            result.warnings.append(f"{name} left out for {chamber.complaint()}")
+    return bool(use.any())
+
+
+def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, train) -> ArmModel:
+    """The model with one stage more, the same function as before."""
     low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
     if name == "pressure":
         network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
@@ -248,12 +254,7 @@ def _grow(
         network.set_rest(rest_shape(train))
         return ArmModel(spec, network)
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
-    for chamber, used in zip(support.chambers, use, strict=True):
-        if not used:
-            result.warnings.append(f"{name} left out for {chamber.complaint()}")
-    if not use.any():
-        return None
-    grown = copy.deepcopy(result.model)
+    grown = copy.deepcopy(model)
     if name == "direction":
         grown.network = grown.network.with_directions(use)
         return grown
@@ -262,25 +263,32 @@ def _grow(
     return ArmModel(spec, grown.network, {**grown.effects, name: effect})
 
 
-def _stage(candidate, name: str, config, data: Data, result: FitResult, progress) -> None:
-    """Train one stage and keep it if held-out data rewards it."""
+def _stage(
+    candidate, name: str, epochs: int, config, data: Data, result: FitResult, progress
+) -> None:
+    """Train one stage and keep it if held-out data rewards it.
+
+    What it is held against is the simpler model trained just as long: a gain must come from what
+    was added, not from the training.
+    """
     begin = time.perf_counter()
-    epochs = train_model(
-        candidate, data, name, _stage_epochs(name, config), config, result.loss, progress
-    )
+    done = train_model(candidate, data, name, epochs, config, result.loss, progress)
     after = _square(candidate, data)
     kept, reason = True, ""
     if result.model is not None:
-        block = data.judging_rows(candidate).block
-        kept, reason = _better(_square(result.model, data), after, block)
+        simpler = copy.deepcopy(result.model)
+        train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
+        block = data.judging_rows(simpler).block
+        kept, reason = _better(_square(simpler, data), after, block)
         if not kept:
             result.warnings.append(f"{name} left out: {reason}")
+        result.model = simpler
     if kept:
-        candidate.rest_mm.copy_(rest_shape(data.train))
         result.model = candidate
+    result.model.rest_mm.copy_(rest_shape(data.train))
     rmse = math.sqrt(float(after.sum(-1).nanmean()))
     seconds = time.perf_counter() - begin
-    result.stages.append(StageReport(name, rmse, epochs, seconds, kept, reason))
+    result.stages.append(StageReport(name, rmse, done, seconds, kept, reason))
 
 
 def _square(model: ArmModel, data: Data) -> Tensor:

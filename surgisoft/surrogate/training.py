@@ -19,6 +19,8 @@ CHECK_EVERY = 10
 """Epochs between validations (Chen et al. 2025)."""
 PATIENCE = 10
 """Validations without improvement before training stops (Chen et al. 2025)."""
+RATES = {"constant curvature": 10.0}
+"""Factors on the learning rate: a handful of parameters of size one takes larger steps."""
 AVERAGE_EPOCHS = 3
 """Span of the running average of the weights (Polyak & Juditsky 1992) that is validated."""
 WINDOW = 1024
@@ -51,7 +53,7 @@ def train(
     weights = range_weights(rows.target)
     batch = min(config.batch, max(32, len(rows.target) // 16))
     steps = max(1, len(rows.target) // batch)
-    optimiser = torch.optim.Adam(flat, lr=config.learning_rate)
+    optimiser = torch.optim.Adam(flat, lr=RATES.get(name, 1.0) * config.learning_rate)
     schedule = _schedule(optimiser, epochs * steps, 2 * steps)
     through = _Through(model, data, deep, weights, config, epochs, generator) if deep else None
     average = copy.deepcopy(model)

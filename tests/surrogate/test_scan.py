@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgisoft.surrogate.direction import advance, trace
-from surgisoft.surrogate.scan import clamp_scan, last_nonzero
+from surgisoft.surrogate.scan import clamp_scan, last_nonzero, play_scan
 
 
 def walk(steps: int, seed: int, chambers: int = 2, runs: int = 2) -> torch.Tensor:
@@ -23,6 +23,29 @@ def test_clamp_scan_is_the_loop_to_the_bit(steps, seed, radius):
     assert torch.equal(clamp_scan(x - radius, x + radius, x[:, 0]), torch.stack(expected, 1))
 
 
+@given(st.integers(2, 50), st.integers(0, 10_000))
+def test_gradient_of_plays_is_that_of_the_loop(steps, seed):
+    radius = torch.tensor([0.1, 0.7, 2.0], dtype=torch.float64)
+    signal = walk(steps, seed).double().unsqueeze(-1).expand(-1, -1, -1, 3)
+    weight = torch.randn(signal.shape, generator=torch.Generator().manual_seed(1))
+    gradients = []
+    for scanned in (True, False):
+        u = signal.clone().requires_grad_()
+        start = signal[:, 0].clone().requires_grad_()
+        if scanned:
+            plays = play_scan(u, radius, start)
+        else:
+            y, every = start, []
+            for t in range(steps):
+                y = torch.minimum(torch.maximum(y, u[:, t] - radius), u[:, t] + radius)
+                every.append(y)
+            plays = torch.stack(every, 1)
+        (plays * weight).sum().backward()
+        gradients.append((plays.detach(), u.grad, start.grad))
+    for one, other in zip(*gradients, strict=True):
+        assert torch.allclose(one, other, atol=1e-12)
+
+
 def test_last_nonzero_by_hand():
     values = torch.tensor([0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 1.0]).view(1, -1, 1)
     expected = torch.tensor([0.0, 0.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0]).view(1, -1, 1)
@@ -31,15 +54,16 @@ def test_last_nonzero_by_hand():
 
 def test_direction_keeps_its_value_while_the_pressure_rests():
     pressure = torch.tensor([0.0, 0.0, 3.0, 3.0, 3.05, 2.95, 3.0, 1.0, 1.0]).view(1, -1, 1)
-    _, direction = trace(pressure, torch.tensor([0.2]))
+    _, direction = trace(pressure, torch.tensor([0.2]), torch.zeros(1))
     assert direction.flatten().tolist() == [0, 0, 1, 1, 1, 1, 1, -1, -1]
 
 
 @given(st.integers(1, 60), st.integers(0, 10_000))
 def test_direction_steps_as_it_traces(steps, seed):
     pressure, band = walk(steps, seed), torch.tensor([0.3, 0.6])
-    anchors, directions = trace(pressure, band)
-    anchor, direction = pressure[:, 0], torch.zeros_like(pressure[:, 0])
+    rest = torch.tensor([0.5, -1.0])
+    anchors, directions = trace(pressure, band, rest)
+    anchor, direction = rest.expand(2, 2), torch.zeros(2, 2)
     for t in range(steps):
         anchor, direction = advance(anchor, direction, pressure[:, t], band)
         assert torch.equal(anchor, anchors[:, t])

@@ -1,0 +1,150 @@
+"""Fitting: it finds what is there, leaves out what the data cannot support, and is repeatable."""
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.excitation import excitation
+from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.history import pack
+from tests.surrogate.truth import SPEC, history, shape, traverse, walk
+
+NOISE = 0.05
+QUICK = FitConfig(hidden=(64, 64), epochs=60)
+
+
+def rmse(model, judged) -> float:
+    """RMS of a coordinate, mm."""
+    return float(
+        (model.predict(judged) - judged.key_points)[judged.valid].square().nanmean().sqrt()
+    )
+
+
+def spread(judged) -> float:
+    """Standard deviation of a coordinate over time, RMS over all, mm."""
+    points = judged.key_points[judged.valid]
+    return float((points - points.nanmean(0)).square().nanmean().sqrt())
+
+
+@pytest.fixture(scope="module")
+def walks():
+    rng = np.random.default_rng(1)
+    return [history([walk(n, rng) for _ in range(4)], noise=NOISE, seed=n) for n in (700, 150, 160)]
+
+
+def test_memory_beats_direction_beats_pressure(walks):
+    train, valid, test = walks
+    full = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=90, effects=("hysteresis",)))
+    direction = fit(train, valid, SPEC, QUICK)
+    plain = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    assert list(full.model.effects) == ["hysteresis"]
+    errors = [rmse(result.model, test) for result in (full, direction, plain)]
+    assert errors[0] < 0.6 * errors[1]
+    assert errors[1] < 0.8 * errors[2]
+    removed = (errors[2] ** 2 - errors[0] ** 2) / (errors[2] ** 2 - NOISE**2)
+    assert removed > 0.9
+    assert full.model.validation["rmse_mm"] == pytest.approx(
+        np.sqrt(3) * rmse(full.model, valid), rel=1e-5
+    )
+
+
+def test_nothing_is_added_where_there_is_no_hysteresis():
+    """On an arm without memory neither direction nor plays earn a place."""
+    rng = np.random.default_rng(2)
+    train, valid = (history([walk(400, rng)] * 4, hysteresis=0.0, seed=s) for s in (1, 2))
+    config = FitConfig(hidden=(64, 64), epochs=60, effects=("hysteresis",))
+    result = fit(train, valid, SPEC, config)
+    assert not result.model.effects
+    assert not result.model.network.directions
+    assert sum("no gain beyond chance" in warning for warning in result.warnings) == 2
+
+
+def test_a_plain_traverse_supports_neither_direction_nor_memory():
+    """The trap: direction and memory are confounded with position; the simpler model is kept."""
+    rng = np.random.default_rng(3)
+    train, test = history([traverse(11)]), history([walk(400, rng)], seed=4)
+    config = FitConfig(hidden=(64, 64), epochs=60, effects=("hysteresis",))
+    guarded = fit(train, None, SPEC, config)
+    assert not guarded.model.effects
+    assert not guarded.model.network.directions
+    assert any("chamber 1: it reversed only" in warning for warning in guarded.warnings)
+    assert any("swept its whole range" in warning for warning in guarded.warnings)
+    plain = fit(train, None, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    assert rmse(guarded.model, test) <= 1.1 * rmse(plain.model, test)
+
+
+def test_excitation_tells_a_walk_from_a_traverse():
+    low, high, band = (torch.tensor(x) for x in (SPEC.low, SPEC.high, SPEC.band))
+    rng = np.random.default_rng(0)
+    for chamber in excitation(history([walk(1500, rng)]), low, high, band):
+        assert chamber.minor_loops
+        assert chamber.complaint() == ""
+    slow, middle, fast = excitation(history([traverse(12)]), low, high, band)
+    assert not slow.direction
+    assert slow.reversals == 1, "from rest at 0 down to the first level, then only up"
+    assert middle.direction
+    assert fast.direction
+    assert not middle.minor_loops
+    assert not fast.minor_loops
+    # 12 * 12 sweeps of the fast chamber, one reversal between two, one at the start from rest.
+    assert fast.reversals == 144
+
+
+def test_same_seed_same_weights(walks):
+    train, valid, _ = walks
+    config = FitConfig(hidden=(16,), epochs=10, effects=("hysteresis",))
+    one, other = (fit(train, valid, SPEC, config).model.state_dict() for _ in range(2))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_missing_key_points_neither_count_nor_spread(walks):
+    train, valid, test = walks
+    points = train.key_points.clone()
+    lost = torch.rand(points.shape[:3], generator=torch.Generator().manual_seed(0)) < 0.3
+    points[lost] = torch.nan
+    gappy = pack(
+        list(train.t_s), list(train.pressure), list(points)
+    )  # four runs of equal length: no padding
+    result = fit(gappy, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    whole = fit(train, valid, SPEC, FitConfig(hidden=(64, 64), epochs=60, inputs="pressure"))
+    assert rmse(result.model, test) < 1.1 * rmse(whole.model, test)
+
+
+def test_constant_curvature_recovers_a_constant_curvature_arm():
+    """Without hysteresis the truth is one arc, linear but for its stretch: 1 % of the motion."""
+    rng = np.random.default_rng(5)
+    train = history([walk(400, rng)], hysteresis=0.0, noise=0.02)
+    result = fit(train, None, SPEC, FitConfig(network="constant_curvature", epochs=100))
+    assert rmse(result.model, train) < 0.015 * spread(train)
+
+
+def test_recurrent_baseline_learns(walks):
+    train, valid, test = walks
+    result = fit(train, valid, SPEC, FitConfig(network="recurrent", epochs=50))
+    assert rmse(result.model, test) < 0.1 * spread(test)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": "smell"}, "unknown inputs 'smell'"),
+        ({"effects": ("ghost",)}, "unknown effect 'ghost'"),
+    ],
+)
+def test_bad_configs_are_named(walks, change, message):
+    with pytest.raises(InputError, match=message):
+        fit(walks[0], walks[1], SPEC, FitConfig(**change))
+
+
+def test_too_few_rows_are_refused():
+    short = history([walk(20, np.random.default_rng(0))])
+    with pytest.raises(InputError, match="20 rows with key points, expected at least 30"):
+        fit(short, None, SPEC, QUICK)
+
+
+def test_truth_is_not_made_of_plays():
+    """The test's own arm: relays only, so that the model's form is not simply found again."""
+    path = np.array([[0.0, 0, 0], [30, 0, 0], [0, 0, 0]])
+    assert np.abs(shape(path, 5.0)[0] - shape(path, 5.0)[2]).max() > 0.1

@@ -1,0 +1,170 @@
+"""The arm model: stepping is predicting, gradients are right, arms do not disturb each other."""
+
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.recurrent import RecurrentArm
+
+SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
+LOW, HIGH, REST = (torch.tensor(x) for x in (SPEC.low, SPEC.high, SPEC.rest))
+
+
+def model(kind: str = "haw_nn", effects: tuple[str, ...] = ("hysteresis",)) -> ArmModel:
+    """An arm with random weights, outputs of tens of millimetres."""
+    torch.manual_seed(7)
+    if kind == "haw_nn":
+        network = HawNN(LOW, HIGH, 5, hidden=(32, 32))
+    elif kind == "recurrent":
+        network = RecurrentArm(LOW, HIGH, 5, width=16)
+    else:
+        network = ConstantCurvature(LOW, HIGH, 5)
+        network.set_rest(torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)]))
+        network.table.data.normal_(0, 0.4)
+    if hasattr(network, "scale"):
+        network.scale.fill_(20.0)
+    made = {name: make_effect(name, LOW, HIGH, REST) for name in effects}
+    for effect in made.values():
+        for parameter in effect.parameters():
+            parameter.data += 0.05 * torch.randn_like(parameter)
+    rest = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)])
+    return ArmModel(SPEC, network, made, rest).eval().requires_grad_(False)
+
+
+def walks(lengths, seed: int = 0):
+    """A history of random pressure walks, one run a length."""
+    generator = torch.Generator().manual_seed(seed)
+    runs = [
+        (20 + 4 * torch.randn(n, 3, generator=generator).cumsum(0)).clamp(-15, 54) for n in lengths
+    ]
+    times = [torch.arange(len(run)) * 0.05 for run in runs]
+    return pack(times, runs, [torch.zeros(len(run), 5, 3) for run in runs])
+
+
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+@given(seed=st.integers(0, 1000), lengths=st.lists(st.integers(1, 40), min_size=1, max_size=3))
+@settings(max_examples=10)
+def test_stepping_is_predicting(kind, seed, lengths):
+    arm, history = model(kind), walks(lengths, seed)
+    predicted = arm.predict(history)
+    state = arm.initial_state(history.runs)
+    for t in range(max(lengths)):
+        dp = history.pressure[:, t] - state.pressure
+        state, points = arm.step(state, dp, history.dt_s[:, t])
+        alive = history.valid[:, t]
+        assert torch.allclose(points[alive], predicted[:, t][alive], atol=2e-3)
+
+
+def test_a_batch_is_its_arms_one_by_one():
+    arm, history = model(), walks([30, 30, 30], 3)
+    together = arm.predict(history)
+    for run in range(3):
+        assert torch.allclose(
+            arm.predict(history.select(torch.tensor([run])))[0], together[run], atol=1e-3
+        )
+
+
+def test_a_nan_stays_in_its_arm_and_a_masked_reset_removes_it():
+    arm = model()
+    state, fresh = arm.initial_state(3), arm.initial_state(3)
+    dp = torch.full((3, 3), 2.0)
+    dp[1] = torch.nan
+    state, points = arm.step(state, dp, 0.05)
+    assert points[1].isnan().all()
+    assert not points[[0, 2]].isnan().any()
+    broken = torch.tensor([False, True, False])
+    state = state.where(broken, fresh)
+    state, points = arm.step(state, torch.full((3, 3), 2.0), 0.05)
+    assert not points.isnan().any()
+    assert torch.equal(state.pressure[:, 0], torch.tensor([4.0, 2.0, 4.0]))
+
+
+def test_reset_under_inference_mode_and_use_outside_of_it():
+    arm = model()
+    with torch.inference_mode():
+        state, _ = arm.step(arm.initial_state(2), torch.ones(2, 3), 0.05)
+        state = state.where(torch.tensor([True, False]), arm.initial_state(2))
+    _, points = arm.step(state, torch.ones(2, 3), 0.05)
+    assert torch.isfinite(points).all()
+
+
+def test_gradient_by_the_action_matches_finite_differences():
+    arm = model().double()
+    arm.network.double()
+    state = arm.initial_state(1, torch.tensor([[20.0, 5.0, 30.0]], dtype=torch.float64))
+    state, _ = arm.step(state, torch.tensor([[3.0, 2.0, -3.0]], dtype=torch.float64), 0.05)
+
+    def tip(dp):
+        return arm.step(state, dp, 0.05)[1][0, -1]
+
+    dp = torch.tensor([[1.0, 1.5, -1.0]], dtype=torch.float64)
+    exact = torch.autograd.functional.jacobian(tip, dp)[:, 0]
+    h = 1e-5
+    for chamber in range(3):
+        step = torch.zeros_like(dp)
+        step[0, chamber] = h
+        slope = (tip(dp + step) - tip(dp - step)) / (2 * h)
+        assert torch.allclose(slope, exact[:, chamber], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+def test_reloaded_model_is_bit_equal(kind, tmp_path):
+    arm, history = model(kind), walks([25])
+    save_model(arm, tmp_path / "arm", {"note": 1})
+    again = load_model(tmp_path / "arm")
+    assert again.spec == arm.spec
+    assert torch.equal(again.predict(history), arm.predict(history))
+    assert torch.equal(again.rest_mm, arm.rest_mm)
+
+
+def test_saving_never_half_writes_nor_overwrites(tmp_path):
+    arm = model()
+    save_model(arm, tmp_path / "arm")
+    before = (tmp_path / "arm" / "weights.safetensors").read_bytes()
+    with pytest.raises(InputError, match="--force"):
+        save_model(arm, tmp_path / "arm")
+    with pytest.raises(TypeError):
+        save_model(arm, tmp_path / "arm", report={"bad": object()}, force=True)
+    assert (tmp_path / "arm" / "weights.safetensors").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "dear.txt").write_text("keep me")
+    with pytest.raises(InputError, match="no model"):
+        save_model(arm, tmp_path / "letters", force=True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: (d / "config.json").unlink(), "config.json missing"),
+        (lambda d: (d / "config.json").write_text("{"), "damaged model"),
+        (lambda d: (d / "weights.safetensors").write_bytes(b"123"), "damaged model"),
+        (lambda d: (d / "config.json").write_text('{"format": 99}'), "format 99"),
+    ],
+)
+def test_a_damaged_model_is_one_line(tmp_path, damage, message):
+    save_model(model(), tmp_path / "arm")
+    damage(tmp_path / "arm")
+    with pytest.raises(InputError, match=message) as error:
+        load_model(tmp_path / "arm")
+    assert "\n" not in str(error.value)
+
+
+def test_spec_wants_one_value_a_chamber():
+    with pytest.raises(InputError, match="'low' has 2 values"):
+        dataclasses.replace(SPEC, low=(0.0, 0.0))
+
+
+def test_rest_is_zero_or_the_nearest_end():
+    assert ArmSpec(3, 2, (-15.0, 5.0, -9.0), (54.0, 20.0, -2.0)).rest == (0.0, 5.0, -2.0)

@@ -31,6 +31,8 @@ CONE_COLOUR = (90, 200, 250)
 BACKGROUND = (24, 28, 34)
 BORE_MM = 1.5
 """Radius of the arm's channel: 3 mm across in the paper's arm (mm)."""
+LIFT_MM = 0.5
+"""What is drawn on a surface lies this far above it, so that neither shows through (mm)."""
 FRAMES = 72
 """Moments of the recording: the laser goes once around the ring."""
 
@@ -129,7 +131,7 @@ def _log_lesion(recording, scene: Scene) -> None:
     recording.log(
         "/lesion/ring",
         rr.LineStrips3D(
-            [np.vstack((ring.points_mm, ring.points_mm[:1])) + 0.3 * ring.normal],
+            [np.vstack((ring.points_mm, ring.points_mm[:1])) + LIFT_MM * ring.normal],
             colors=[RING_COLOUR],
             radii=[0.45],
         ),
@@ -144,8 +146,8 @@ def _log_lesion(recording, scene: Scene) -> None:
     ]
     if any(circle is None for circle in circles):
         return
-    lifted = [circle.points_mm + 0.2 * circle.normals for circle in circles]
-    vertices, faces = polar_patch(lifted, ring.centre_mm + 0.2 * ring.normal)
+    lifted = [circle.points_mm + LIFT_MM * circle.normals for circle in circles]
+    vertices, faces = polar_patch(lifted, ring.centre_mm + LIFT_MM * ring.normal)
     normals = np.vstack((ring.normal[None], *(circle.normals for circle in circles)))
     recording.log(
         "/lesion/tissue",

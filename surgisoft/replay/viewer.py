@@ -1,6 +1,7 @@
 """Run the Rerun viewer as a process of its own that never outlives its caller."""
 
 import contextlib
+import ctypes
 import os
 import signal
 import socket
@@ -10,6 +11,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import rerun as rr
 
 from surgisoft.errors import InputError
 
@@ -43,6 +46,12 @@ def temporary_recording() -> Iterator[Path]:
         yield Path(folder) / "scene.rrd"
 
 
+def _die_with_parent() -> None:
+    """Ask Linux to end this process with the one that started it (prctl(2), PR_SET_PDEATHSIG)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
 @contextlib.contextmanager
 def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
     """The viewer in a session of its own; whatever happens, its whole group ends with the block."""
@@ -52,7 +61,7 @@ def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
         stdout=sink,
         stderr=sink,
         start_new_session=True,
-        env={**os.environ, "RERUN_ANALYTICS": "off"},
+        preexec_fn=_die_with_parent,
     )
     try:
         yield process
@@ -91,20 +100,21 @@ def open_viewer(recording: Path) -> None:
 
 
 def serve_viewer(recording: Path, tell: Callable[[str], None]) -> None:
-    """Serve viewer and recording to browsers on this machine until interrupted."""
+    """Serve viewer and recording to browsers on this machine until interrupted.
+
+    The recording is handed to the running server: given as an argument of the server, it keeps one
+    core busy for ever (rerun-sdk 0.41).
+    """
     page, data = free_port(), free_port()
-    arguments = (
-        "--serve-web",
-        "--bind",
-        LOCAL,
-        "--web-viewer-port",
-        str(page),
-        "--port",
-        str(data),
-    )
-    with running(str(recording), *arguments) as viewer:
+    ports = ("--web-viewer-port", str(page), "--port", str(data))
+    with running("--serve-web", "--bind", LOCAL, *ports) as viewer:
         wait_for_port(viewer, page)
         wait_for_port(viewer, data)
+        stream = rr.RecordingStream("surgisoft_hand_over")
+        stream.connect_grpc(f"rerun+http://{LOCAL}:{data}/proxy")
+        stream.log_file_from_path(recording)
+        stream.flush()
+        stream.disconnect()
         tell(web_address(page, data))
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()

@@ -14,8 +14,9 @@ MAY_IMPORT = {
     "measurement": {"surrogate"},
     "measurement/rig": {"measurement"},
     "diagnosis": {"surrogate", "measurement"},
+    "studies": {"surrogate", "measurement", "diagnosis"},
     "replay": {"scene"},
-    "cli": {"scene", "surrogate", "measurement", "diagnosis", "replay"},
+    "cli": {"scene", "surrogate", "measurement", "diagnosis", "studies", "replay"},
 }
 """What each part may import beside itself and the ground; the nearest folder's row counts."""
 

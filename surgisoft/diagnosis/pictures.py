@@ -30,11 +30,57 @@ def draw_all(
         ("body", body(rest, backbone, title)),
         ("error", error_over_time(rest, title)),
     ):
-        path = folder / f"{name}.png"
-        figure.savefig(path, dpi=130)
-        plt.close(figure)
-        drawn.append(path)
+        drawn.append(save(figure, folder / f"{name}.png"))
     return drawn
+
+
+def save(figure, path: Path) -> Path:
+    """Write a figure and let go of it."""
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+    return path
+
+
+def ladder_loops(rests: dict[str, Residuals], unit: str):
+    """Nested loops of one recording, measured beside several models, one column a model.
+
+    Below, a cubic through the measured values is taken out of both, which leaves the loops.
+    """
+    figure, axes = plt.subplots(
+        2, len(rests), figsize=(4.2 * len(rests), 6.6), layout="constrained", squeeze=False
+    )
+    for column, (label, rest) in enumerate(rests.items()):
+        chamber = int(np.argmax(_lone_motion(rest)))
+        rows = _stretch(rest, chamber)
+        along = _main_direction(rest.measured_mm[rows, -1])
+        measured, predicted = (
+            points[rows, -1] @ along for points in (rest.measured_mm, rest.predicted_mm)
+        )
+        pressure = rest.pressure[rows, chamber]
+        cubic = np.polyval(np.polyfit(pressure, measured, 3), pressure)
+        error = np.sqrt(np.nanmean(np.square(rest.error_mm[:, -1])))
+        for row, offset in enumerate((0, cubic)):
+            axis = axes[row, column]
+            axis.plot(pressure, measured - offset, c=MEASURED, lw=1.6, label="measured")
+            axis.plot(pressure, predicted - offset, c=PREDICTED, lw=1.0, label="model")
+            axis.grid(alpha=0.25)
+        axes[0, column].set_title(f"{label}: tip RMSE {error:.2f} mm")
+        axes[1, column].set_xlabel(f"chamber {chamber + 1} [{unit}]")
+    axes[0, 0].set_ylabel("tip, main direction [mm]")
+    axes[1, 0].set_ylabel("the same less a cubic [mm]")
+    axes[0, 0].legend(frameon=False)
+    return figure
+
+
+def _lone_motion(rest: Residuals) -> np.ndarray:
+    """(m,) share of its range that each chamber moves in its best stretch, less the others'."""
+    span = np.ptp(rest.pressure, axis=0)
+    span = np.where(span > 0, span, 1)
+    scores = []
+    for chamber in range(rest.pressure.shape[1]):
+        moves = np.ptp(rest.pressure[_stretch(rest, chamber)], axis=0) / span
+        scores.append(2 * moves[chamber] - moves.sum())
+    return np.array(scores)
 
 
 def loops(rest: Residuals, unit: str, title: str = ""):

@@ -57,7 +57,7 @@ class ConstantCurvature(nn.Module):
         centre, half = centre_and_half(low, high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
-        self.register_buffer("fraction", torch.linspace(0, 1, key_points))
+        self.fraction = nn.Parameter(torch.linspace(0, 1, key_points))
         self.register_buffer("length", torch.ones(()))
         self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))
         self.base_turn = nn.Parameter(torch.zeros(3))
@@ -67,7 +67,7 @@ class ConstantCurvature(nn.Module):
         """Lengths from the key points at rest, (n, 3) in mm, base frame."""
         steps = rest.diff(dim=0).norm(dim=-1)
         self.length.copy_(steps.sum())
-        self.fraction.copy_(torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum())
+        self.fraction.data.copy_(torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum())
         self.base_mm.data.copy_(rest[0])
 
     def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
@@ -82,9 +82,9 @@ class ConstantCurvature(nn.Module):
             bend = values[..., section, :2]
             length = self.length / self.sections * values[..., section, 2].exp()
             for k in range(self.key_points):
-                share = float(self.fraction[k]) * self.sections - section
+                share = self.fraction[k] * self.sections - section
                 last = section == self.sections - 1
-                if share >= 0 and (share < 1 or last):
+                if (share >= 0 or section == 0) and (share < 1 or last):
                     local = arc_point(bend * share, length * share)
                     points[k] = start + (turn @ local[..., None])[..., 0]
             start = start + (turn @ arc_point(bend, length)[..., None])[..., 0]

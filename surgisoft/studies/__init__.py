@@ -1,0 +1,1 @@
+"""Long studies, each one command: what they print is committed under docs/results."""

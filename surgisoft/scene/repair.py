@@ -194,7 +194,9 @@ def _around_edge(vertices, faces, half_edges, forward):
     apex = vertices[faces[face, (corner + 2) % 3]] - ends[0]
     x = apex[0] - (apex[0] @ axis) * axis
     angle = np.arctan2(apex @ np.cross(axis, x), apex @ x)
-    ring = half_edges[np.argsort(angle)]
+    angle = np.mod(angle.round(9), round(2.0 * np.pi, 9))
+    # of two faces in one place, the one that ends a solid comes before the one that starts one
+    ring = half_edges[np.lexsort((~forward[half_edges], angle))]
     if forward[ring[0]]:
         ring = np.roll(ring, -1)
     starts, stops = ring[0::2], ring[1::2]

@@ -1,0 +1,106 @@
+"""Mesh files: every format gives the same mesh, units are told, broken files get one line."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.errors import InputError
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.meshio import read_mesh, read_parts, recognise_unit, write_ply
+from tests.scene.shapes import lumpy
+
+
+def write(path, shape):
+    if path.name == "text.stl":
+        path.write_text(trimesh.exchange.stl.export_stl_ascii(shape))
+    else:
+        shape.export(path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.stl", "text.stl", "a.obj", "a.ply", "a.off", "a.glb", "A.STL"])
+def test_every_format_gives_the_same_triangles(name, tmp_path):
+    shape = trimesh.creation.icosphere(subdivisions=2, radius=40.0)
+    shape.apply_translation([5.0, -7.0, 11.0])
+    (part,) = read_parts(write(tmp_path / name, shape))
+    found = part.vertices[part.faces]
+    np.testing.assert_allclose(
+        found.mean(axis=(0, 1)), shape.triangles.mean(axis=(0, 1)), atol=1e-4
+    )
+    mesh = Mesh(part.vertices, part.faces)
+    assert mesh.volume_mm3 == pytest.approx(shape.volume, rel=1e-5)
+    assert len(part.faces) == len(shape.faces)
+
+
+@pytest.mark.parametrize("name", ["two.glb", "two.obj"])
+def test_named_parts_come_apart_in_their_places(name, tmp_path):
+    scene = trimesh.Scene()
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=10.0)
+    moved = trimesh.transformations.translation_matrix([100.0, 0.0, 0.0])
+    scene.add_geometry(ball, geom_name="near", node_name="near")
+    scene.add_geometry(trimesh.creation.box((4, 4, 4)), "far", "far", transform=moved)
+    parts = read_parts(write(tmp_path / name, scene))
+    centres = sorted(part.vertices[part.faces].mean(axis=(0, 1))[0] for part in parts)
+    np.testing.assert_allclose(centres, [0.0, 100.0], atol=1e-6)
+    assert sorted(len(part.faces) for part in parts) == [12, 80]
+
+
+def test_ply_keeps_every_bit(tmp_path):
+    rng = np.random.default_rng(1)
+    mesh = lumpy(3)
+    mesh = Mesh(mesh.vertices_mm * rng.uniform(0.9, 1.1, mesh.vertices_mm.shape), mesh.faces)
+    write_ply(mesh, tmp_path / "m.ply")
+    assert read_mesh(tmp_path / "m.ply").content_hash == mesh.content_hash
+
+
+@given(size=st.floats(61.0, 600.0))
+def test_the_unit_is_told_from_an_organs_size(size):
+    assert recognise_unit(size).unit == "mm"
+    assert recognise_unit(size / 10.0).unit == ("cm" if size < 200.0 else "mm")
+    assert recognise_unit(size / 1000.0).unit == "m"
+
+
+def test_doubt_about_the_unit_is_said():
+    assert "--unit cm" in recognise_unit(35.0).sentence
+    for odd in (5000.0, 1.2, 0.004):
+        assert "in doubt" in recognise_unit(odd).sentence
+    # the nearest to a liver of 180 mm, by factor: 1.2 m, 5 m and 4 mm
+    assert [recognise_unit(odd).unit for odd in (5000.0, 1.2, 0.004)] == ["mm", "m", "m"]
+
+
+POINTS = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n" + (
+    "property float z\nend_header\n0 0 0\n1 1 1\n"
+)
+BROKEN = {
+    "empty.stl": (b"", "the file is empty"),
+    "cut.stl": (b"x" * 80 + (640).to_bytes(4, "little") + b"y" * 500, "cut off"),
+    "word.stl": (b"hello\n", "neither a text nor a binary STL"),
+    "points.ply": (POINTS.encode(), "2 points or lines but no faces"),
+    "lines.obj": (b"v 0 0 0\nv 1 0 0\nl 1 2\n", "no faces"),
+    "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", "NaN or infinite"),
+    "far.obj": (b"v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 9\n", "damaged"),
+    "noise.glb": (b"123" * 40, "cannot be read as GLB"),
+    "text.off": (b"no mesh at all", "OFF"),
+    "blank.obj": (b"# nothing\n", "no triangle"),
+    "shape.step": (b"x", "file type '.step' is not read"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_is_no_mesh_gets_its_line(name, tmp_path):
+    content, says = BROKEN[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_parts(tmp_path / name)
+    assert says in str(caught.value)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_and_a_folder(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_parts(tmp_path / "a.stl")
+    with pytest.raises(InputError, match="is a folder"):
+        read_parts(tmp_path)

@@ -228,9 +228,7 @@ def _sentences(seeds, floors, outcomes) -> list[str]:
         return min(
             np.mean([o.mse_mm2 for o in outcomes if o.case == case])
             for case in cases()
-            if case.inputs == inputs
-            and case.name.startswith("HAW-NN")
-            and "effects" not in case.options
+            if case.inputs == inputs and case.name in names
         )
 
     plain, direction = lowest("pressure"), lowest("pressure+direction")

@@ -1,0 +1,102 @@
+"""The commands as a newcomer types them; and every wrong turn in one line."""
+
+import json
+
+import pytest
+
+from surgisoft.cli import run, spread
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A small collection and a model fitted to it."""
+    folder = tmp_path_factory.mktemp("lab")
+    for protocol, points in (("walk", "600"), ("validation", "150"), ("test", "150")):
+        out = str(folder / f"{protocol}.parquet")
+        assert run(["collect", protocol, "--points", points, "--seed", "4", "-o", out]) == 0
+    assert (
+        run(
+            [
+                "fit", str(folder / "walk.parquet"), "--valid", str(folder / "validation.parquet"),
+                "--effects", "hysteresis", "--epochs", "60", "--widths", "48,48",
+                "-o", str(folder / "arm"),
+            ]
+        )
+        == 0
+    )  # fmt: skip
+    return folder
+
+
+def test_fitted_arm_beats_pressure_alone(lab, capsys):
+    plain = str(lab / "plain")
+    assert (
+        run(
+            [
+                "fit", str(lab / "walk.parquet"), "--valid", str(lab / "validation.parquet"),
+                "--inputs", "pressure", "--epochs", "60", "--widths", "48,48", "-o", plain,
+            ]
+        )
+        == 0
+    )  # fmt: skip
+    errors = {}
+    for name in ("arm", "plain"):
+        file = lab / f"{name}.json"
+        assert (
+            run(["compare", str(lab / name), str(lab / "test.parquet"), "--json", str(file)]) == 0
+        )
+        errors[name] = json.loads(file.read_text())
+    assert errors["arm"]["rmse_mm"] < 0.7 * errors["plain"]["rmse_mm"]
+    assert errors["arm"]["floor_mm"] < errors["arm"]["rmse_mm"]
+    assert errors["arm"]["samples"] == 150
+    assert len(errors["arm"]["per_key_point_mm"]) == 5
+    out = capsys.readouterr().out
+    assert f"RMSE {errors['arm']['rmse_mm']:.4f} mm" in out
+
+
+def test_a_folder_holds_config_weights_and_report(lab):
+    report = json.loads((lab / "arm" / "report.json").read_text())
+    assert [stage["name"] for stage in report["stages"]][:2] == ["pressure", "hysteresis"]
+    assert (lab / "arm" / "weights.safetensors").is_file()
+    assert json.loads((lab / "arm" / "config.json").read_text())["arm"]["unit"] == "kPa"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/arm"], "already there"),
+        (["fit", "{lab}/nothing.parquet", "-o", "{lab}/new"], "nothing.parquet"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/new", "--effects", "ghost"], "known are"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/new", "--widths", "a,b"], "whole numbers"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/new", "--inputs", "smell"], "'smell'"),
+        (["fit"], "Missing argument"),
+        (["compare", "{lab}", "{lab}/test.parquet"], "no arm model there"),
+        (["compare", "{lab}/arm", "{lab}/arm/config.json"], "config.json"),
+        (["collect", "dance", "-o", "{lab}/x.parquet"], "dance"),
+        (["collect", "walk", "-o", "{lab}/x.parquet", "--hidden", "ghost"], "ghost"),
+        (["fti"], "No such command"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(lab, capsys, arguments, message):
+    before = sorted(path.name for path in lab.iterdir())
+    assert run([argument.format(lab=lab) for argument in arguments]) == 2
+    err = [line for line in capsys.readouterr().err.splitlines() if "warning" not in line]
+    assert len(err) == 1
+    assert err[0].startswith("surgisoft: error: ")
+    assert message in err[0]
+    assert sorted(path.name for path in lab.iterdir()) == before
+
+
+def test_version_and_help_leave_with_zero(capsys):
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("surgisoft 0.")
+    assert run(["fit", "--help"]) == 0
+    assert "--valid" in capsys.readouterr().out
+
+
+def test_options_of_many_values_are_spread():
+    assert spread(["fit", "a", "--valid", "b", "c", "-o", "m", "d"]) == [
+        "fit", "a", "--valid", "b", "--valid", "c", "-o", "m", "d",
+    ]  # fmt: skip
+    assert spread(["--hidden", "creep", "--strength", "-1.5"]) == [
+        "--hidden", "creep", "--strength", "-1.5",
+    ]  # fmt: skip

@@ -1,0 +1,139 @@
+"""Errors by hand, floors of known noise, and the same numbers from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.floor import noise_floor
+from surgisoft.diagnosis.pictures import draw_all
+from surgisoft.errors import InputError
+from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of
+from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.network import HawNN
+
+POINTS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 30.0], [0.0, 0.0, 70.0]])
+
+
+def still_model() -> ArmModel:
+    """A model that predicts POINTS whatever the pressure."""
+    low, high = torch.zeros(2), torch.full((2,), 10.0)
+    network = HawNN(low, high, 3, hidden=(4,), directions=False)
+    network.scale.zero_()
+    network.mean.copy_(torch.tensor(POINTS).flatten())
+    spec = ArmSpec(2, 3, (0.0, 0.0), (10.0, 10.0), band=(0.1, 0.1))
+    return ArmModel(spec, network, rest_mm=torch.tensor(POINTS)).eval().requires_grad_(False)
+
+
+def recording(points: np.ndarray, pressure: np.ndarray | None = None, **more) -> Recording:
+    rows = len(points)
+    if pressure is None:
+        pressure = np.stack([np.linspace(0, 10, rows), np.full(rows, 5.0)], 1)
+    return Recording(
+        name="rec", t_s=0.1 * np.arange(rows), measured=pressure, key_points_mm=points, **more
+    )
+
+
+def test_errors_by_hand():
+    """k0 exact, k1 off by a 3-4-5 triangle, the tip off by 12 along z in half of the rows."""
+    points = np.tile(POINTS, (4, 1, 1))
+    points[:, 1] += [3.0, 4.0, 0.0]
+    points[:2, 2, 2] += 12.0
+    result, _ = compare(still_model(), [recording(points)])
+    assert result.per_key_point_mm == pytest.approx((0.0, 5.0, np.sqrt(72.0)))
+    assert result.tip_rmse_mm == pytest.approx(np.sqrt(72.0))
+    assert result.rmse_mm == pytest.approx(np.sqrt((0 + 25 + 72) / 3))
+    assert result.mse_mm2 == pytest.approx((25 + 72) / 9)
+    assert result.samples == 4
+    assert result.worst[0].error_mm == pytest.approx(12.0)
+    assert result.worst[0].key_point == 2
+
+
+def test_missing_key_points_are_left_out_and_counted():
+    points = np.tile(POINTS, (4, 1, 1))
+    points[0, 2] = np.nan
+    points[1] = np.nan
+    points[2, 2, 0] += 2.0
+    result, _ = compare(still_model(), [recording(points)])
+    assert result.tip_rmse_mm == pytest.approx(np.sqrt((4 + 0) / 2))
+    assert (result.samples, result.missing) == (3, 1)
+    with pytest.raises(InputError, match="no key point was measured"):
+        compare(still_model(), [recording(np.full((3, 3, 3), np.nan))])
+
+
+def test_bands_split_direction_and_pressure():
+    """Error only while chamber 1 falls: its two direction bands must say so."""
+    up, down = np.linspace(0, 10, 50), np.linspace(10, 0, 50)
+    pressure = np.stack([np.concatenate([up, down]), np.full(100, 5.0)], 1)
+    points = np.tile(POINTS, (100, 1, 1))
+    points[52:, 2, 0] += 1.5
+    result, _ = compare(still_model(), [recording(points, pressure)])
+    bands = {(band.axis, band.label): band for band in result.bands}
+    assert bands["direction 1", "rising"].rmse_mm < 0.2
+    assert bands["direction 1", "falling"].rmse_mm == pytest.approx(1.5 / np.sqrt(3), rel=0.05)
+    halves = [band for band in result.bands if band.axis == "p1"]
+    assert sum(band.samples for band in halves) == 100
+
+
+def test_another_arm_is_refused():
+    points = np.tile(POINTS, (3, 1, 1))
+    with pytest.raises(InputError, match="chambers: 1, but the model has 2"):
+        compare(still_model(), [recording(points, np.zeros((3, 1)))])
+    with pytest.raises(InputError, match="unit: psi, but the model has kPa"):
+        compare(still_model(), [recording(points, unit="psi")])
+
+
+def test_floor_is_what_the_lab_states_as_a_distance():
+    floor = noise_floor([recording(np.tile(POINTS, (4, 1, 1)), noise_mm=0.1)])
+    assert floor.source == "sidecar"
+    assert floor.rmse_mm == pytest.approx(np.sqrt(3) * 0.1)
+
+
+def test_floor_from_holds_finds_the_noise_under_a_drift():
+    rng = np.random.default_rng(0)
+    rows, levels = 40 * 100, np.repeat(rng.uniform(0, 10, (40, 2)), 100, axis=0)
+    drift = 0.01 * (np.arange(rows) % 100)[:, None, None]
+    points = POINTS + drift + rng.normal(0, 0.08, (rows, 3, 3))
+    measured = levels + rng.normal(0, 0.01, levels.shape)
+    floor = noise_floor([recording(points, measured, commanded=levels)])
+    assert floor.source == "holds"
+    assert floor.rmse_mm == pytest.approx(np.sqrt(3) * 0.08, rel=0.1)
+
+
+def test_floor_is_unknown_rather_than_invented():
+    points = np.tile(POINTS, (50, 1, 1))
+    assert noise_floor([recording(points)]).rmse_mm is None
+    assert compare(still_model(), [recording(points)])[0].to_json()["floor_mm"] is None
+
+
+def test_pressure_noise_from_rests_of_the_command():
+    rng = np.random.default_rng(1)
+    command = np.repeat(rng.uniform(0, 50, (60, 2)), 20, axis=0)
+    measured = command + rng.normal(0, [0.05, 0.2], command.shape)
+    noisy = recording(np.tile(POINTS, (1200, 1, 1)), measured, commanded=command)
+    assert actuation_noise(noisy) == pytest.approx([0.05, 0.2], rel=0.15)
+    spec = arm_spec([noisy])
+    assert spec.band[1] == pytest.approx(0.8, rel=0.15)
+    assert history_of([noisy]).pressure.shape == (1, 1200, 2)
+
+
+def test_commanded_actuation_must_be_there():
+    with pytest.raises(InputError, match="use --actuation measured"):
+        arm_spec([recording(np.tile(POINTS, (3, 1, 1)))], "commanded")
+
+
+def test_json_is_plain_and_pictures_are_pictures(tmp_path):
+    rng = np.random.default_rng(2)
+    result, rest = compare(
+        still_model(), [recording(POINTS + rng.normal(0, 0.1, (60, 3, 3)), noise_mm=0.1)]
+    )
+    values = json.loads(json.dumps(result.to_json()))
+    assert {"rmse_mm", "per_key_point_mm", "tip_rmse_mm", "floor_mm", "samples"} <= set(values)
+    assert values["rmse_mm"] == pytest.approx(values["floor_mm"], rel=0.1)
+    for path in draw_all(rest, still_model().backbone(), "kPa", tmp_path / "pictures"):
+        assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+        assert path.stat().st_size > 10_000

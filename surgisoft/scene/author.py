@@ -299,12 +299,19 @@ def _chosen(scene: Scene, check: SceneCheck) -> list[str]:
     ]
 
 
+def check_target(folder: Path, force: bool) -> None:
+    """Whether a scene may be written there; --force replaces a scene, nothing else."""
+    if not folder.exists():
+        return
+    if not force:
+        raise InputError(f"{folder}: exists already; choose another name or use --force")
+    if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
+        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+
+
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:
     """Write meshes and scene.toml: first into a folder beside, then moved there as a whole."""
-    if folder.exists() and not force:
-        raise InputError(f"{folder}: exists already; choose another name or use --force")
-    if folder.exists() and not (folder / FILE).exists() and any(folder.iterdir()):
-        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+    check_target(folder, force)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

@@ -15,6 +15,10 @@ BAND_NOISES = 4.0
 """Half width of the dead band in standard deviations of the pressure at rest."""
 
 
+STILL_SHARE = 0.1
+"""A chamber that moved less than this share of the widest range counts as still."""
+
+
 def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
     """(T, m) measured or commanded actuation, in the recording's unit."""
     if actuation not in ACTUATIONS:
@@ -71,6 +75,7 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
     signal = np.concatenate([actuation_of(recording, actuation) for recording in recordings])
     low, high = signal.min(0), signal.max(0)
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
+    low, high = _with_room(low, high)
     span = high - low
     band = np.clip(BAND_NOISES * noise, BAND_SHARE[0] * span, BAND_SHARE[1] * span)
     first = recordings[0]
@@ -85,6 +90,21 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
         length_mm=first.arm.length_mm,
         diameter_mm=first.arm.diameter_mm,
         gravity=None if first.gravity is None else tuple(first.gravity.tolist()),
+    )
+
+
+def _with_room(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges (m,) in which a chamber that hardly moved is as wide as the widest one.
+
+    Its little motion is mostly noise: scaled to the full input range of a network it would be
+    taken for signal.
+    """
+    span = high - low
+    still = span < STILL_SHARE * span.max()
+    middle = (high + low) / 2
+    return (
+        np.where(still, middle - span.max() / 2, low),
+        np.where(still, middle + span.max() / 2, high),
     )
 
 

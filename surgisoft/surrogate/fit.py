@@ -40,6 +40,8 @@ SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that only prepares the next, or comes after an effect."""
 EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
+STILL_SHARE = 0.15
+"""Share of its range that a chamber has to move, or the fit notes that it did not."""
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
 
@@ -140,6 +142,7 @@ def fit(
     data = Data.split(train, valid, config.seed)
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
     result = FitResult(None, [], excitation(train, low, high, band), [], 0.0)
+    result.warnings.extend(_still_chambers(train, spec))
     if config.network == "recurrent":
         _fit_recurrent(data, spec, config, result, progress)
     else:
@@ -156,6 +159,18 @@ def fit(
     result.model.eval().requires_grad_(False)
     result.seconds = time.perf_counter() - start
     return result
+
+
+def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
+    """A note for each chamber that hardly moved in the training recordings."""
+    pressure = train.rows(train.pressure)
+    moved = (pressure.amax(0) - pressure.amin(0)).tolist()
+    return [
+        f"chamber {number} hardly moved ({came:.3g} {spec.unit} in all): "
+        "what it does cannot be learned from these recordings"
+        for number, (came, span) in enumerate(zip(moved, spec.span, strict=True), 1)
+        if came < STILL_SHARE * span or came == 0
+    ]
 
 
 def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> None:

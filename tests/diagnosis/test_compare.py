@@ -121,6 +121,15 @@ def test_pressure_noise_from_rests_of_the_command():
     assert history_of([noisy]).pressure.shape == (1, 1200, 2)
 
 
+def test_a_chamber_that_only_shows_noise_is_not_blown_up():
+    rng = np.random.default_rng(3)
+    measured = np.stack([np.linspace(0, 50, 200), 2 + rng.normal(0, 0.1, 200)], 1)
+    spec = arm_spec([recording(np.tile(POINTS, (200, 1, 1)), measured)])
+    assert (spec.low[0], spec.high[0]) == (0.0, 50.0)
+    assert spec.high[1] - spec.low[1] == pytest.approx(50.0)
+    assert (spec.high[1] + spec.low[1]) / 2 == pytest.approx(2.0, abs=0.2)
+
+
 def test_commanded_actuation_must_be_there():
     with pytest.raises(InputError, match="use --actuation measured"):
         arm_spec([recording(np.tile(POINTS, (3, 1, 1)))], "commanded")

@@ -6,6 +6,7 @@ saved takes its random numbers along.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,8 +46,19 @@ class Stream:
 def streams(seed: int, count: int, first: int = 0, device: str | torch.device = "cpu") -> Stream:
     """Streams `first` to `first + count - 1` of a seed."""
     place = torch.arange(first, first + count, dtype=torch.int64, device=device)
-    root = _mix(torch.tensor([seed], dtype=torch.int64, device=device))
+    root = _mix(torch.tensor([_wrapped(seed)], dtype=torch.int64, device=device))
     return Stream(_mix(root + _GAMMA * (place + 1)), torch.zeros_like(place))
+
+
+def joined(parts: Sequence[Stream]) -> Stream:
+    """The streams of all parts, one after the other."""
+    key, count = torch.cat([p.key for p in parts]), torch.cat([p.count for p in parts])
+    return Stream(key, count)
+
+
+def _wrapped(seed: int) -> int:
+    """A whole number of any size as a signed one of 64 bits."""
+    return (seed + 2**63) % 2**64 - 2**63
 
 
 def _mix(z: Tensor) -> Tensor:

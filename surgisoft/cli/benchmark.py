@@ -1,5 +1,6 @@
 """`surgisoft benchmark`: long studies whose results are committed."""
 
+import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +41,8 @@ def modelling(
     command = f"surgisoft benchmark modelling --seeds {seeds}"
     if points:
         command += f" --points {points}"
-    text = f"# Modelling results\n\nPrinted by `{command}`.\n\n{table}"
+    today = datetime.date.today().isoformat()
+    text = f"# Modelling results\n\nPrinted by `{command}` on {today}.\n\n{table}"
     if output:
         write_text(output, text)
     print(text)

@@ -44,11 +44,11 @@ def new(
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
     from surgisoft.cli.arms import reach_of
-    from surgisoft.scene.author import NoMounts, author, write_scene
+    from surgisoft.scene.author import NoMounts, author, check_target, write_scene
     from surgisoft.scene.spec import TOOLS, MountSpec
 
     request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
-    _check_target(output, force)
+    check_target(output, force)
     blank = {tool: MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in TOOLS}
     reaches = {tool: reach_of(mount) for tool, mount in blank.items()}
     try:
@@ -163,14 +163,6 @@ def _request(meshes, unit, lesion, direction, diameter, clearance):
         diameter,
         limits=LimitsSpec(clearance_mm=clearance),
     )
-
-
-def _check_target(folder: Path, force: bool) -> None:
-    """Say before the work what would stop it after."""
-    from surgisoft.errors import InputError
-
-    if folder.exists() and not force:
-        raise InputError(f"{folder}: exists already; choose another name or use --force")
 
 
 def _name(folder: Path) -> str:

@@ -63,7 +63,7 @@ class Comparison:
     missing: int
     """Rows without any."""
     bands: tuple[Band, ...]
-    """The error by pressure, direction, rate and dwell."""
+    """The error by pressure and direction; by rate and dwell where time was recorded."""
     worst: tuple[Moment, ...]
     """The worst moments, each from another stretch of time."""
 
@@ -81,6 +81,7 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
     seen = ~np.isnan(square).all(axis=1)
     if not seen.any():
         raise InputError("no key point was measured in any row of the recordings")
+    timed = any(recording.kind == "continuous" for recording in recordings)
     with np.errstate(invalid="ignore"):
         per_point = np.sqrt([_nanmean(square[:, k]) for k in range(square.shape[1])])
     return (
@@ -92,7 +93,7 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
             floor=noise_floor(recordings),
             samples=int(seen.sum()),
             missing=int((~seen).sum()),
-            bands=tuple(_bands(rest, square, model.spec.unit)),
+            bands=tuple(_bands(rest, square, model.spec.unit, timed)),
             worst=tuple(_worst(rest, recordings)),
         ),
         rest,
@@ -104,7 +105,7 @@ def _nanmean(values: np.ndarray) -> float:
     return float(seen.mean()) if len(seen) else float("nan")
 
 
-def _bands(rest: Residuals, square: np.ndarray, unit: str):
+def _bands(rest: Residuals, square: np.ndarray, unit: str, timed: bool):
     for chamber in range(rest.pressure.shape[1]):
         yield from _cut(f"p{chamber + 1}", unit, rest.pressure[:, chamber], square)
     for chamber in range(rest.pressure.shape[1]):
@@ -112,6 +113,8 @@ def _bands(rest: Residuals, square: np.ndarray, unit: str):
             rows = rest.direction[:, chamber] == sign
             if rows.any():
                 yield Band(f"direction {chamber + 1}", word, *_rmse(square[rows]))
+    if not timed:
+        return
     rate = np.abs(rest.rate).max(axis=1)
     yield from _cut("rate", f"{unit}/s", rate, square)
     yield from _cut("dwell", "s", rest.dwell_s, square)

@@ -1,5 +1,6 @@
 """Pictures of a comparison: hysteresis loops, the body in space, the error over time."""
 
+import itertools
 from pathlib import Path
 
 import matplotlib as mpl
@@ -13,8 +14,10 @@ mpl.use("Agg")
 from matplotlib import pyplot as plt
 
 MEASURED, PREDICTED = "#222222", "#d1495b"
-LOOP_ROWS = 400
+LOOP_ROWS = 160
 """Most rows that one picture of loops shows; more would hide each other."""
+LADDER_ROWS = 400
+"""Rows of the ladder's picture, in which one chamber moves alone."""
 POSTURES = 7
 """Bodies that the picture in space shows."""
 
@@ -51,7 +54,7 @@ def ladder_loops(rests: dict[str, Residuals], unit: str):
     )
     for column, (label, rest) in enumerate(rests.items()):
         chamber = int(np.argmax(_lone_motion(rest)))
-        rows = _stretch(rest, chamber)
+        rows = _stretch(rest, chamber, LADDER_ROWS)
         along = _main_direction(rest.measured_mm[rows, -1])
         measured, predicted = (
             points[rows, -1] @ along for points in (rest.measured_mm, rest.predicted_mm)
@@ -78,7 +81,7 @@ def _lone_motion(rest: Residuals) -> np.ndarray:
     span = np.where(span > 0, span, 1)
     scores = []
     for chamber in range(rest.pressure.shape[1]):
-        moves = np.ptp(rest.pressure[_stretch(rest, chamber)], axis=0) / span
+        moves = np.ptp(rest.pressure[_stretch(rest, chamber, LADDER_ROWS)], axis=0) / span
         scores.append(2 * moves[chamber] - moves.sum())
     return np.array(scores)
 
@@ -86,7 +89,8 @@ def _lone_motion(rest: Residuals) -> np.ndarray:
 def loops(rest: Residuals, unit: str, title: str = ""):
     """Tip against the actuation of each chamber, measured and predicted.
 
-    For each chamber the stretch of rows in which it moves most and the others least.
+    For each chamber the stretch of rows in which it moves most and the others least. Below, the
+    best polynomial in all pressures is taken out of both: what is left has memory, or noise.
     """
     chambers = rest.pressure.shape[1]
     figure, axes = plt.subplots(
@@ -96,16 +100,17 @@ def loops(rest: Residuals, unit: str, title: str = ""):
     for chamber in range(chambers):
         rows = _stretch(rest, chamber)
         along = _main_direction(rest.measured_mm[rows, -1])
-        measured = rest.measured_mm[rows, -1] @ along
-        predicted = rest.predicted_mm[rows, -1] @ along
+        measured, predicted = rest.measured_mm[:, -1] @ along, rest.predicted_mm[:, -1] @ along
+        static = _static(rest.pressure, measured)
         pressure = rest.pressure[rows, chamber]
-        line = np.polyval(np.polyfit(pressure, predicted, 3), pressure)
         for row, (offset, what) in enumerate(
-            ((0, "tip, main direction [mm]"), (line, "the same less a cubic [mm]"))
+            ((0 * static, "tip, main direction [mm]"), (static, "less what pressure explains [mm]"))
         ):
             axis = axes[row, chamber]
-            axis.plot(pressure, measured - offset, ".-", c=MEASURED, lw=0.7, ms=3, label="measured")
-            axis.plot(pressure, predicted - offset, "-", c=PREDICTED, lw=1.0, label="predicted")
+            shown = (measured - offset)[rows]
+            axis.plot(pressure, shown, ".-", c=MEASURED, lw=0.7, ms=3, label="measured")
+            shown = (predicted - offset)[rows]
+            axis.plot(pressure, shown, "-", c=PREDICTED, lw=1.0, label="predicted")
             axis.set_xlabel(f"chamber {chamber + 1} [{unit}]")
             axis.grid(alpha=0.25)
             if chamber == 0:
@@ -114,22 +119,39 @@ def loops(rest: Residuals, unit: str, title: str = ""):
     return figure
 
 
-def _stretch(rest: Residuals, chamber: int) -> np.ndarray:
-    """Rows of one run, at most LOOP_ROWS, in which one chamber moves most and others least."""
+def _stretch(rest: Residuals, chamber: int, longest: int = LOOP_ROWS) -> np.ndarray:
+    """Rows of one run, at most `longest`, in which one chamber moves most and others least."""
     best, score = None, -np.inf
     span = np.ptp(rest.pressure, axis=0)
     span = np.where(span > 0, span, 1)
     for run in np.unique(rest.run):
         rows = np.flatnonzero((rest.run == run) & ~np.isnan(rest.measured_mm[:, -1, 0]))
-        for start in range(0, max(1, len(rows) - LOOP_ROWS // 2), LOOP_ROWS // 2):
-            part = rows[start : start + LOOP_ROWS]
+        for start in range(0, max(1, len(rows) - longest // 2), longest // 2):
+            part = rows[start : start + longest]
             if len(part) < 4:
                 continue
             moves = np.ptp(rest.pressure[part], axis=0) / span
             now = 2 * moves[chamber] - moves.sum()
             if now > score + 1e-9:
                 best, score = part, now
-    return best if best is not None else np.arange(min(LOOP_ROWS, len(rest.run)))
+    return best if best is not None else np.arange(min(longest, len(rest.run)))
+
+
+def _static(pressure: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(S,) least-squares polynomial in the actuation (S, m), as high as the rows allow."""
+    middle, half = pressure.mean(axis=0), np.ptp(pressure, axis=0) / 2
+    x = (pressure - middle) / np.where(half > 0, half, 1)
+    terms = [np.ones(len(x))]
+    for degree in (1, 2, 3):
+        more = [
+            np.prod(x[:, list(picked)], axis=1)
+            for picked in itertools.combinations_with_replacement(range(x.shape[1]), degree)
+        ]
+        if 10 * (len(terms) + len(more)) > len(x):
+            break
+        terms += more
+    design, seen = np.stack(terms, 1), ~np.isnan(values)
+    return design @ np.linalg.lstsq(design[seen], values[seen], rcond=None)[0]
 
 
 def _main_direction(points: np.ndarray) -> np.ndarray:

@@ -74,7 +74,7 @@ def polar_patch(circles: list[np.ndarray], centre: np.ndarray) -> tuple[np.ndarr
     vertices = np.concatenate((centre[None], *circles))
     j = np.arange(count)
     fan = np.stack((0 * j, 1 + j, 1 + (j + 1) % count), axis=1)
-    return vertices, np.concatenate((fan, 1 + _strips(len(circles), count)))
+    return vertices, np.concatenate((fan, 1 + _strips(len(circles), count)[:, ::-1]))
 
 
 def view_cone(eye: np.ndarray, axis: np.ndarray, half_rad: float, length_mm: float) -> list:

@@ -14,7 +14,7 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene, rounded_mount
 from surgisoft.scene.mesh import ROLES, Body, Mesh
-from surgisoft.scene.meshio import MM_PER_UNIT, read_parts, recognise_unit, write_ply
+from surgisoft.scene.meshio import MM_PER_UNIT, Part, read_parts, recognise_unit, write_ply
 from surgisoft.scene.placement import Pair, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
@@ -141,7 +141,34 @@ def prepare(request: Request) -> Prepared:
 
 
 def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
-    """Every part repaired; a part beyond repair is left out if another one is a body."""
+    """Every part repaired; where one is beyond repair, all parts taken as one surface.
+
+    If that is beyond repair too, the broken parts are left out, unless nothing is left.
+    """
+    found, failures, done = _repaired(path, parts, scale)
+    if failures and len(parts) > 1:
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        whole = Part(
+            path.stem,
+            np.concatenate([part.vertices for part in parts]),
+            np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
+        )
+        together, broken, done_together = _repaired(path, [whole], scale)
+        if not broken:
+            notes.append(f"{path.name}: its {len(parts)} parts make up one surface")
+            found, failures, done = together, [], done_together
+    if not found:
+        raise failures[0]
+    usual = " (an STL repeats every corner)" if path.suffix.lower() == ".stl" else ""
+    for what, count in done.items():
+        note = usual if what == "duplicate vertices joined" else ""
+        notes.append(f"{path.name}: {what}: {count}{note}")
+    notes += [f"left out: {error}" for error in failures]
+    return found
+
+
+def _repaired(path, parts, scale) -> tuple[list[tuple[str, Mesh]], list[InputError], dict]:
+    """Named closed bodies of the parts, what was beyond repair, and the repairs' counts."""
     found, failures = [], []
     done: dict[str, int] = {}
     for part in parts:
@@ -155,14 +182,7 @@ def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
             done[fix.done] = done.get(fix.done, 0) + fix.count
         name = path.stem if len(parts) == 1 else Path(part.name).stem
         found += [(name, mesh) for mesh in repaired.bodies]
-    if not found:
-        raise failures[0]
-    usual = " (an STL repeats every corner)" if path.suffix.lower() == ".stl" else ""
-    for what, count in done.items():
-        note = usual if what == "duplicate vertices joined" else ""
-        notes.append(f"{path.name}: {what}: {count}{note}")
-    notes += [f"left out: {error}" for error in failures]
-    return found
+    return found, failures, done
 
 
 def _area(mesh: Mesh) -> float:
@@ -299,12 +319,19 @@ def _chosen(scene: Scene, check: SceneCheck) -> list[str]:
     ]
 
 
+def check_target(folder: Path, force: bool) -> None:
+    """Whether a scene may be written there; --force replaces a scene, nothing else."""
+    if not folder.exists():
+        return
+    if not force:
+        raise InputError(f"{folder}: exists already; choose another name or use --force")
+    if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
+        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+
+
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:
     """Write meshes and scene.toml: first into a folder beside, then moved there as a whole."""
-    if folder.exists() and not force:
-        raise InputError(f"{folder}: exists already; choose another name or use --force")
-    if folder.exists() and not (folder / FILE).exists() and any(folder.iterdir()):
-        raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+    check_target(folder, force)
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

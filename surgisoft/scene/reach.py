@@ -147,13 +147,13 @@ def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
         if not len(todo):
             break
         here = commands[todo]
-        jacobian = np.empty((len(todo), 3, count))
-        for p in range(count):
-            inward = np.where(here[:, p] + step[p] > reach.bounds[1, p], -step[p], step[p])
-            moved = here.copy()
-            moved[:, p] += inward
-            shifted, _, _ = _miss(reach, moved, targets_mm[todo])
-            jacobian[:, :, p] = (shifted - miss[todo]) / inward[:, None] * reach.span[p]
+        inward = np.where(here + step > reach.bounds[1], -step, step)
+        moved = here[:, None, :] + inward[:, :, None] * np.eye(count)
+        shifted, _, _ = _miss(
+            reach, moved.reshape(-1, count), np.repeat(targets_mm[todo], count, axis=0)
+        )
+        change = shifted.reshape(-1, count, 3) - miss[todo][:, None, :]
+        jacobian = np.swapaxes(change / (inward / reach.span)[:, :, None], 1, 2)
         # along the axis nothing can be missed: only what moves the axis sideways counts
         along = np.einsum("mi,mip->mp", axis[todo], jacobian)
         jacobian -= axis[todo][:, :, None] * along[:, None, :]

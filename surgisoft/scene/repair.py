@@ -156,7 +156,7 @@ def _edges(faces):
 def _open_edges(faces) -> int:
     """Number of edges that do not lie between exactly two faces."""
     edges, _ = _edges(faces)
-    _, count = np.unique(edges, axis=0, return_counts=True)
+    _, count = np.unique(edges @ [faces.max(initial=0) + 1, 1], return_counts=True)
     return int(np.sum(count != 2))
 
 
@@ -276,8 +276,8 @@ def _wind_alike(faces, what, log):
 def _boundary_loops(faces):
     """Closed loops of boundary edges as vertex lists, run against the faces."""
     directed = np.stack((faces, np.roll(faces, -1, axis=1)), axis=-1).reshape(-1, 2)
-    key = np.sort(directed, axis=1)
-    _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
+    key = np.sort(directed, axis=1) @ [faces.max() + 1, 1]
+    _, first, count = np.unique(key, return_index=True, return_counts=True)
     step: dict[int, list[int]] = {}
     for a, b in directed[first[count == 1]]:
         step.setdefault(int(b), []).append(int(a))

@@ -107,8 +107,7 @@ class ArmModel(nn.Module):
 
         def advance(stage: Stage, signal: Tensor) -> Tensor:
             for name, effect in self.stage(stage):
-                memory[name] = effect.advance(memory[name], signal, dt)
-                signal = effect.apply(signal, memory[name])
+                memory[name], signal = effect.step(memory[name], signal, dt)
             return signal
 
         chamber = advance("line", pressure)

@@ -1,7 +1,9 @@
 """The scene file: exact round trips, and one line for every way to get it wrong."""
 
 import dataclasses
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,3 +212,15 @@ def test_body_turns_about_x_then_y_then_z():
 
 def test_camera_is_handed_on_in_radians():
     assert CameraSpec(fov_deg=60.0).camera().fov_rad == pytest.approx(math.pi / 3)
+
+
+def test_the_manual_names_every_field_with_its_default():
+    manual = (Path(__file__).resolve().parents[2] / "docs" / "scenes.md").read_text()
+    for kind in (BodySpec, LesionSpec, MountSpec, LaserSpec, CameraSpec, LimitsSpec):
+        for field in dataclasses.fields(kind):
+            default = field.default
+            if default is dataclasses.MISSING:
+                assert f"| `{field.name}` | | " in manual
+            else:
+                written = json.dumps(list(default) if isinstance(default, tuple) else default)
+                assert f"| `{field.name}` | `{written}` | " in manual

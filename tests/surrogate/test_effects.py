@@ -46,11 +46,12 @@ def test_stepping_is_scanning(name, seed):
     memory = effect.rest(x[:, 0])
     scanned = effect.scan(memory, x, dt)
     for t in range(50):
+        stepped, answer = effect.step(memory, x[:, t], dt[:, t])
         memory = effect.advance(memory, x[:, t], dt[:, t])
+        assert torch.equal(stepped, memory)
+        assert torch.equal(answer, effect.apply(x[:, t], memory))
         assert torch.allclose(memory, scanned[:, t], rtol=1e-5, atol=1e-4)
-        assert torch.allclose(
-            effect.apply(x[:, t], memory), effect.apply(x, scanned)[:, t], atol=1e-3
-        )
+        assert torch.allclose(answer, effect.apply(x, scanned)[:, t], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -104,7 +105,9 @@ def test_strength_acts_as_written():
 
 
 def plays_after(history: list[float], chamber: int) -> torch.Tensor:
+    """(T, L, J) plays while one chamber moves, along lines that rise or fall with it throughout."""
     effect = stirred("hysteresis")
+    effect.bent.data.zero_()
     x = torch.zeros(1, len(history), 3)
     x[0, :, chamber] = torch.tensor(history)
     return effect.scan(effect.rest(x[:, 0]), x, torch.zeros(1, len(history)))[0]

@@ -55,6 +55,11 @@ class Effect(nn.Module, ABC):
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """The signal after the effect, same shape; any leading dimensions."""
 
+    def step(self, memory: Tensor, signal: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """`advance`, then `apply`: (memory, signal) after one step."""
+        memory = self.advance(memory, signal, dt)
+        return memory, self.apply(signal, memory)
+
     def memory_parameters(self) -> list[nn.Parameter]:
         """Parameters that the memory depends on: they are fitted through whole runs."""
         return []

@@ -6,7 +6,7 @@ remember every reversal that no larger one has wiped out. In a soft arm friction
 and the strain of a wall line is moved by several chambers at once; as in a vector hysteron model
 (Mayergoyz 2003, ch. 3), plays therefore run along several lines l of the actuation space,
 
-    u_l = sum_i a_li x_i + sum_{i<=j} b_lij x_i x_j,      x = actuation scaled to [-1, 1],
+    u_l = sum_i a_li x_i + sum_ij b_lij x_i x_j,      x = actuation scaled to [-1, 1],
 
 whose mixture a, b is fitted with the rest. Superposed (Kuhnen 2003, eq. 8) they give
 
@@ -43,10 +43,9 @@ class Hysteresis(Effect):
         self.register_buffer("origin", rest)
         self.register_buffer("radius", torch.tensor(self.radii))
         self.register_buffer("use", torch.ones(chambers))
-        self.register_buffer("pairs", torch.triu_indices(chambers, chambers))
         lines = first_lines(chambers)
         self.linear = nn.Parameter(lines)
-        self.bent = nn.Parameter(lines.new_zeros(len(lines), self.pairs.shape[1]))
+        self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
         shape = (chambers, len(lines), len(self.radii))
         self.weight = nn.Parameter(torch.zeros(shape))
         self.slope = nn.Parameter(torch.zeros(shape))
@@ -54,8 +53,8 @@ class Hysteresis(Effect):
     def lines(self, signal: Tensor) -> Tensor:
         """(..., L) inputs of the lines' plays from the actuation (..., m)."""
         x = (signal - self.centre) / self.half_range * self.use
-        products = x[..., self.pairs[0]] * x[..., self.pairs[1]]
-        return x @ self.linear.T + products @ self.bent.T
+        products = (x.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2)
+        return x @ self.linear.T + products @ self.bent.flatten(1).T
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.linear, self.bent]
@@ -66,8 +65,17 @@ class Hysteresis(Effect):
 
     def advance(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
         """(B, L, J) plays after the actuation (B, m); dt does not matter."""
-        u = self.lines(signal).unsqueeze(-1)
-        return torch.minimum(torch.maximum(memory, u - self.radius), u + self.radius)
+        return self._follow(memory, self.lines(signal))
+
+    def step(self, memory: Tensor, signal: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """Plays and effective actuation after the actuation (B, m), its lines computed once."""
+        u = self.lines(signal)
+        memory = self._follow(memory, u)
+        return memory, self._superpose(signal, u, memory)
+
+    def _follow(self, memory: Tensor, u: Tensor) -> Tensor:
+        u = u.unsqueeze(-1)
+        return torch.clamp(memory, u - self.radius, u + self.radius)
 
     def scan(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
         """(R, T, L, J) plays along the actuation (R, T, m), from plays (R, L, J) before it."""
@@ -76,12 +84,14 @@ class Hysteresis(Effect):
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m) and plays (..., L, J)."""
-        u = self.lines(signal)
+        return self._superpose(signal, self.lines(signal), memory)
+
+    def _superpose(self, signal: Tensor, u: Tensor, memory: Tensor) -> Tensor:
         lag = memory - u.unsqueeze(-1)
         away = (u - self.lines(self.origin)).unsqueeze(-1)
-        both = torch.cat([lag.flatten(-2), (lag * away).flatten(-2)], dim=-1)
-        table = torch.cat([self.weight.flatten(1), self.slope.flatten(1)], dim=1)
-        return signal + self.half_range * (both @ table.T)
+        shift = lag.flatten(-2) @ self.weight.flatten(1).T
+        shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
+        return signal + self.half_range * shift
 
     def config(self) -> dict:
         return {"radii": list(self.radii)}

@@ -1,0 +1,251 @@
+"""From mesh files to scenes: what comes out holds before the referee, what cannot be is said."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from surgisoft.cli import run
+from surgisoft.cli.arms import reaches_of
+from surgisoft.errors import InputError
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.check import REASONS, check_scene, held_arms, reach_patch, sentence
+from surgisoft.scene.collision import Referee
+from surgisoft.scene.folder import open_scene, rounded_mount
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.meshio import write_ply
+from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
+from tests.scene.shapes import ball, box, lumpy
+
+
+def moved(mesh, *shift):
+    return Mesh(mesh.vertices_mm + np.array(shift), mesh.faces)
+
+
+def new(folder, *arguments):
+    return run(["scene", "new", *map(str, arguments), "-o", str(folder)])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A lumpy organ in metres, inside out, as an STL, with a keep-out rod beside it."""
+    folder = tmp_path_factory.mktemp("author")
+    organ = lumpy(4)
+    shape = trimesh.Trimesh(organ.vertices_mm / 1000.0, organ.faces[:, ::-1], process=False)
+    shape.export(folder / "organ.stl")
+    rod = trimesh.creation.cylinder(0.008, 0.2)
+    rod.apply_translation([0.09, 0.0, 0.05])
+    rod.export(folder / "rod.obj")
+    code = new(folder / "scene", folder / "organ.stl", folder / "rod.obj")
+    return code, folder / "scene"
+
+
+def test_a_scene_comes_out_in_millimetres_and_outwards(made):
+    code, folder = made
+    assert code == 0
+    scene = open_scene(folder)
+    assert [(body.name, body.role) for body in scene.bodies] == [
+        ("organ", "organ"),
+        ("rod", "keep-out"),
+    ]
+    assert scene.organ.mesh.is_watertight
+    assert scene.organ.mesh.volume_mm3 == pytest.approx(lumpy(4).volume_mm3, rel=1e-4)
+    assert {mount.tool for mount in scene.spec.mounts} == {"laser", "endoscope"}
+
+
+def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
+    """The verdict again, from the scene's numbers alone and by other ways: rays by trimesh."""
+    scene = open_scene(made[1])
+    reaches = reaches_of(scene)
+    verdict = check_scene(scene, reaches)
+    assert verdict.good
+    assert verdict.work.covered == 1.0
+    organ = scene.organ.world_mesh
+    tree = trimesh.Trimesh(organ.vertices_mm, organ.faces, process=False)
+    cut, ring = verdict.work.cut, scene.ring
+    assert len(ring.points_mm) == 72
+    tips = cut.lines_mm[:, -1]
+    hits, ray, _ = tree.ray.intersects_location(tips, cut.directions, multiple_hits=False)
+    np.testing.assert_allclose(hits[np.argsort(ray)], ring.points_mm, atol=0.05)
+    length = np.linalg.norm(ring.points_mm - tips, axis=1)
+    assert np.all((length >= 20.0) & (length <= 60.0))
+    cosine = np.einsum("ij,ij->i", -cut.directions, ring.normals)
+    assert np.degrees(np.arccos(cosine)).max() <= 60.0
+    # the arm keeps its length from the mount's own base
+    base = scene.spec.mount("laser").pose()[:3, 3]
+    np.testing.assert_allclose(cut.lines_mm[:, 1], np.tile(base, (72, 1)), atol=1e-9)
+    arc = np.linalg.norm(np.diff(cut.lines_mm[:, 1:], axis=1), axis=2).sum(axis=1)
+    assert np.all((arc > 69.5) & (arc < 70.0 * 1.15 + 0.1))
+    # neighbours are near enough that nothing fits in between
+    assert cut.step_mm.max() < 2.0 * verdict.work.clearance_mm.min()
+
+
+def test_the_same_meshes_give_the_same_scene(made, tmp_path):
+    source = made[1].parent
+    assert new(tmp_path / "again", source / "organ.stl", source / "rod.obj") == 0
+    assert (tmp_path / "again" / FILE).read_text().splitlines()[1:] == (
+        made[1] / FILE
+    ).read_text().splitlines()[1:]
+
+
+def test_both_arms_and_their_shafts_clear_each_other(made):
+    scene = open_scene(made[1])
+    arms = held_arms(scene, reaches_of(scene))
+    rest = {
+        tool: ArmShape(arm.lines(arm.reach.rest[None])[0][0], 7.5) for tool, arm in arms.items()
+    }
+    for tool, arm in arms.items():
+        far = rest[tool].centreline_mm[0]
+        np.testing.assert_allclose(np.linalg.norm(far - arm.pose[:3, 3]), 100.0)
+    clearance = Referee(scene.bodies).clearance(rest)
+    assert clearance.least_mm >= scene.spec.limits.clearance_mm
+
+
+def scene_with(made, folder, **changes):
+    """The made scene with other values, in a folder of its own."""
+    scene = open_scene(made[1])
+    for body in scene.bodies:
+        write_ply(body.mesh, folder / f"{body.name}.ply")
+    save_spec(dataclasses.replace(scene.spec, **changes), folder / FILE)
+    return folder
+
+
+def test_a_mount_moved_into_the_organ_is_found(made, tmp_path):
+    scene = open_scene(made[1])
+    laser = dataclasses.replace(scene.spec.mount("laser"), position_mm=(0.0, 0.0, 0.0))
+    folder = scene_with(made, tmp_path, mounts=(laser, scene.spec.mount("endoscope")))
+    verdict = check_scene(open_scene(folder), reaches_of(scene))
+    assert not verdict.good
+    assert "laser touches organ" in sentence(verdict)
+    assert run(["scene", "check", str(folder)]) == 1
+
+
+def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
+    scene = open_scene(made[1])
+    low = scene.organ.world_mesh.vertices_mm[np.argmin(scene.organ.world_mesh.vertices_mm[:, 2])]
+    folder = scene_with(made, tmp_path, lesion=LesionSpec("organ", tuple(low.tolist())))
+    verdict = check_scene(open_scene(folder), reaches_of(scene))
+    assert not verdict.good
+    assert verdict.work.covered == 0.0
+    assert {REASONS[code] for code in verdict.work.reason} <= {"out of reach", "beam blocked"}
+
+
+def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
+    folder = scene_with(made, tmp_path, lesion=LesionSpec("organ", (0.0, 0.0, 300.0)))
+    assert run(["scene", "check", str(folder)]) == 1
+    assert "BAD lesion on the surface" in capsys.readouterr().out
+
+
+def test_the_patch_agrees_with_the_ring(made):
+    """The map's circle of the lesion's own diameter says what the referee says of the ring."""
+    scene = open_scene(made[1])
+    patch = reach_patch(scene, reaches_of(scene), 48)
+    far = np.linalg.norm(patch.flat_mm, axis=1)
+    on_ring = np.abs(far - 10.0) < 0.1
+    assert on_ring.sum() == 48
+    assert np.all(patch.reason[on_ring] == 0)
+    assert far.max() == pytest.approx(16.0, abs=0.2)
+
+
+def test_a_map_is_drawn(made, tmp_path):
+    assert run(["scene", "check", str(made[1]), "--map", str(tmp_path / "map.png")]) == 0
+    from PIL import Image
+
+    colours = np.asarray(Image.open(tmp_path / "map.png").convert("RGB")).reshape(-1, 3)
+    green = np.abs(colours.astype(int) - [42, 157, 74]).sum(axis=1) < 30
+    assert green.sum() > 500  # the ring's points that can be cut
+
+
+def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):
+    write_ply(ball(60.0, 3), tmp_path / "ball.ply")
+    write_ply(moved(box((200.0, 200.0, 10.0)), 0.0, 0.0, 72.0), tmp_path / "lid.ply")
+    arguments = (tmp_path / "ball.ply", tmp_path / "lid.ply", "--unit", "mm", "--lesion", 0, 0, 60)
+    assert new(tmp_path / "scene", *arguments) == 1
+    said = capsys.readouterr().out
+    assert "No scene was written" in said
+    assert "the best covers 0 %" in said
+    assert not (tmp_path / "scene").exists()
+
+
+def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path):
+    write_ply(ball(60.0, 3), tmp_path / "ball.ply")
+    write_ply(moved(box((200.0, 200.0, 10.0)), 0.0, 0.0, 72.0), tmp_path / "lid.ply")
+    arguments = (tmp_path / "ball.ply", f"{tmp_path / 'lid.ply'}:support", "--lesion", 60, 0, -20)
+    assert new(tmp_path / "scene", *arguments) == 0
+    scene = open_scene(tmp_path / "scene")
+    assert scene.spec.body("lid").role == "support"
+    np.testing.assert_allclose(scene.spec.lesion.centre_mm, [56.9, 0.0, -19.0], atol=0.6)
+
+
+BAD = [
+    (("nowhere.stl",), "there is no such file"),
+    (("ball.ply", "--unit", "inch"), "unknown unit 'inch'"),
+    (("ball.ply:knife",), "role 'knife'"),
+    (("ball.ply:support",), "expected the organ first"),
+    (("ball.ply", "--diameter", "0"), "--diameter is 0"),
+    (("ball.ply", "--diameter", "150"), "no ring of 150 mm"),
+    (("ball.ply", "--lesion", "0", "0", "60", "--lesion-direction", "0", "0", "1"), "both"),
+    (("ball.ply", "--lesion-direction", "0", "0", "0"), "not zero"),
+    (("ball.ply", "--lesion", "nan", "0", "0"), "finite"),
+    (("half.ply",), "too large to guess shut"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "says"), BAD, ids=[says for _, says in BAD])
+def test_a_bad_wish_is_one_line_and_writes_nothing(arguments, says, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    organ = ball(60.0, 2)
+    write_ply(organ, tmp_path / "ball.ply")
+    write_ply(
+        Mesh(organ.vertices_mm, organ.faces[organ.triangles_mm[:, :, 2].mean(1) < 0]),
+        tmp_path / "half.ply",
+    )
+    assert new("scene", *arguments) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "half.ply"]
+
+
+def test_an_existing_folder_is_kept(made, tmp_path, capsys):
+    write_ply(ball(60.0, 2), tmp_path / "ball.ply")
+    assert new(made[1], tmp_path / "ball.ply") == 2
+    assert "exists already" in capsys.readouterr().err
+    (tmp_path / "papers").mkdir()
+    (tmp_path / "papers" / "thesis.txt").write_text("years of work")
+    assert new(tmp_path / "papers", tmp_path / "ball.ply", "--force") == 2
+    assert "is no scene" in capsys.readouterr().err
+    assert (tmp_path / "papers" / "thesis.txt").exists()
+
+
+def test_a_scene_without_its_mesh_is_one_line(made, tmp_path):
+    folder = scene_with(made, tmp_path)
+    (folder / "rod.ply").unlink()
+    with pytest.raises(InputError, match=r"bodies\[1\]\.mesh: there is no file 'rod\.ply'"):
+        open_scene(folder)
+
+
+def test_the_scenes_hash_sees_values_and_meshes_but_not_comments(made, tmp_path):
+    folder = scene_with(made, tmp_path)
+    first = open_scene(folder).content_hash
+    (folder / FILE).write_text("# a comment\n" + (folder / FILE).read_text())
+    assert open_scene(folder).content_hash == first
+    mesh = open_scene(folder).organ.mesh
+    write_ply(moved(mesh, 1e-9, 0.0, 0.0), folder / "organ.ply")
+    assert open_scene(folder).content_hash != first
+
+
+def test_a_rounded_mount_stands_where_it_stood():
+    mount = MountSpec("laser", (1.234567, -2.0, 3.0), (0.3, -0.4, -0.5), roll_deg=-77.123)
+    pose = mount.pose()
+    again = MountSpec("laser", **rounded_mount(pose[:3, 3], pose[:3, :3])).pose()
+    np.testing.assert_allclose(again[:3, 3], pose[:3, 3], atol=0.005)
+    np.testing.assert_allclose(again[:3, :3], pose[:3, :3], atol=2e-4)
+
+
+def test_a_public_liver_becomes_a_scene(shared, tmp_path, capsys):
+    for name in ("openhelp_liver", "liver_collision"):
+        assert new(tmp_path / name, shared / "meshes" / f"{name}.stl") == 0
+        assert "unit mm" in capsys.readouterr().out
+        assert run(["scene", "check", str(tmp_path / name)]) == 0

@@ -1,0 +1,133 @@
+"""Rings on surfaces against closed forms, nearest points against brute force."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from surgisoft.errors import InputError
+from surgisoft.scene.lesion import (
+    circle_on,
+    closest_in_triangles,
+    lesion_ring,
+    nearest_on_surface,
+)
+from surgisoft.scene.site import directed_site, good_sites, pointed_site
+from surgisoft.scene.spec import LesionSpec
+from tests.scene.shapes import ball, box, lumpy, mesh_of
+
+FINE = ball(50.0, 5)
+
+
+@given(seed=st.integers(0, 1000))
+def test_nearest_points_agree_with_trimesh(seed):
+    rng = np.random.default_rng(seed)
+    points, triangles = rng.normal(size=(200, 3)), rng.normal(size=(200, 3, 3))
+    mine = np.linalg.norm(closest_in_triangles(points, triangles) - points, axis=1)
+    theirs = trimesh.triangles.closest_point(triangles, points)
+    np.testing.assert_allclose(mine, np.linalg.norm(theirs - points, axis=1), atol=1e-12)
+
+
+@given(seed=st.integers(0, 1000), diameter=st.floats(5.0, 60.0))
+def test_a_circle_on_a_ball_lies_on_ball_and_cylinder(seed, diameter):
+    direction = np.random.default_rng(seed).normal(size=3)
+    points, faces = nearest_on_surface(FINE, 60.0 * direction[None] / np.linalg.norm(direction))
+    ring = circle_on(FINE, points[0], int(faces[0]), diameter, 48)
+    axis = ring.normal
+    away = ring.points_mm - points[0]
+    flat = away - (away @ axis)[:, None] * axis
+    np.testing.assert_allclose(np.linalg.norm(flat, axis=1), 0.5 * diameter, atol=1e-9)
+    # edges of 1.8 mm: facets lie at most 1.8^2 / 8 r = 0.01 mm inside the ball
+    np.testing.assert_allclose(np.linalg.norm(ring.points_mm, axis=1), 50.0, atol=0.02)
+    np.testing.assert_allclose(axis, points[0] / 50.0, atol=0.02)
+
+
+def test_a_circle_on_a_flat_side_is_that_circle():
+    side = box((80.0, 80.0, 80.0))
+    ring = circle_on(side, np.array([5.0, -3.0, 40.0]), _face(side, [5.0, -3.0, 40.0]), 20.0, 36)
+    np.testing.assert_allclose(ring.points_mm[:, 2], 40.0, atol=1e-12)
+    np.testing.assert_allclose(np.hypot(*(ring.points_mm[:, :2] - [5, -3]).T), 10.0)
+    np.testing.assert_allclose(ring.normals, [[0.0, 0.0, 1.0]] * 36, atol=1e-12)
+
+
+def _face(mesh, point):
+    return int(nearest_on_surface(mesh, np.array([point]))[1][0])
+
+
+@pytest.mark.parametrize(
+    ("place", "fits"),
+    [((0.0, 0.0, 40.0), True), ((29.9, 0.0, 40.0), True), ((30.5, 0.0, 40.0), False)],
+)
+def test_a_ring_that_hangs_over_an_edge_is_none(place, fits):
+    side = box((80.0, 80.0, 80.0))
+    assert (circle_on(side, np.array(place), _face(side, place), 20.0) is not None) == fits
+
+
+def test_the_ring_stays_on_its_sheet_of_a_thin_plate():
+    """Two millimetres thick: the far side must not draw the ring, nor cancel the normal."""
+    plate = box((80.0, 80.0, 2.0))
+    ring = circle_on(plate, np.array([0.0, 0.0, -1.0]), _face(plate, [0.0, 0.0, -1.0]), 20.0)
+    np.testing.assert_allclose(ring.points_mm[:, 2], -1.0, atol=1e-12)
+    np.testing.assert_allclose(ring.normal, [0.0, 0.0, -1.0], atol=1e-12)
+
+
+def test_a_lesion_off_the_surface_is_told_where_it_is():
+    with pytest.raises(InputError, match=r"lies 10 mm off .* \(0\.0, 0\.0, 50\.0\)"):
+        lesion_ring(FINE, LesionSpec("liver", (0.0, 0.0, 60.0)))
+    with pytest.raises(InputError, match="hangs over an edge"):
+        lesion_ring(box((80.0, 80.0, 80.0)), LesionSpec("box", (40.0, 40.0, 0.0)))
+
+
+def test_a_path_of_ones_own_is_followed_evenly():
+    side = box((80.0, 80.0, 80.0))
+    square = ((-10.0, -10.0, 40.0), (10.0, -10.0, 40.0), (10.0, 10.0, 40.0), (-10.0, 10.0, 40.0))
+    ring = lesion_ring(side, LesionSpec("box", (0.0, 0.0, 40.0), 20.0, square), 80)
+    np.testing.assert_allclose(np.abs(ring.points_mm[:, :2]).max(axis=1), 10.0)
+    steps = np.linalg.norm(np.roll(ring.points_mm, -1, axis=0) - ring.points_mm, axis=1)
+    np.testing.assert_allclose(steps, 1.0)
+    lifted = tuple((x, y, 45.0) for x, y, _ in square)
+    with pytest.raises(InputError, match="leaves the surface"):
+        lesion_ring(side, LesionSpec("box", (0.0, 0.0, 40.0), 20.0, lifted))
+
+
+def test_pointing_finds_the_nearest_body():
+    near, far = ball(30.0), ball(30.0)
+    far = type(far)(far.vertices_mm + np.array([100.0, 0.0, 0.0]), far.faces)
+    site = pointed_site([near, far], np.array([100.0, 0.0, 35.0]), 15.0)
+    assert site.body == 1
+    np.testing.assert_allclose(site.point_mm, [100.0, 0.0, 30.0], atol=0.1)
+
+
+@given(seed=st.integers(0, 1000))
+def test_a_direction_finds_the_side_that_faces_it(seed):
+    direction = np.random.default_rng(seed).normal(size=3)
+    direction /= np.linalg.norm(direction)
+    site = directed_site([FINE], direction, 20.0)
+    np.testing.assert_allclose(site.point_mm, 50.0 * direction, atol=0.05)
+
+
+def test_a_direction_through_a_hole_takes_the_outermost_point():
+    torus = mesh_of(trimesh.creation.torus(60.0, 25.0))
+    site = directed_site([torus], np.array([0.0, 0.0, 1.0]), 20.0)
+    assert site.point_mm[2] == pytest.approx(25.0)
+
+
+def test_a_ring_that_does_not_fit_where_pointed_tells_what_fits():
+    side = box((80.0, 80.0, 80.0))
+    with pytest.raises(InputError, match=r"20 mm does not lie .*a ring of 9 mm does"):
+        pointed_site([side], np.array([35.2, 0.0, 40.0]), 20.0)
+
+
+def test_good_sites_are_open_and_the_same_each_time():
+    organ = lumpy(4)
+    lid = type(organ)(
+        box((300.0, 300.0, 10.0)).vertices_mm + np.array([0.0, 0.0, 70.0]), box().faces
+    )
+    sites = good_sites([organ, lid], 20.0)
+    again = good_sites([organ, lid], 20.0)
+    assert [tuple(site.point_mm) for site in sites] == [tuple(site.point_mm) for site in again]
+    # under the lid nothing above the organ is open
+    assert sites[0].ring.normal[2] < 0.9
+    with pytest.raises(InputError, match="no ring of 200 mm"):
+        good_sites([organ], 200.0)

@@ -16,8 +16,14 @@ from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.paths import PATHS
 from surgisoft.tasks.solver import least_squares
 from surgisoft.tasks.streams import Stream
-from surgisoft.tasks.tree import tree_map
+from surgisoft.tasks.tree import rows, tree_map
 from surgisoft.tasks.world import World
+from surgisoft.tasks.world_arm import ArmPart
+
+STUCK_MM = 1e-3
+"""A solver that leaves more than this tries again (mm)."""
+OFFSETS_KPA = (1.0, -1.0)
+"""Where it begins then, beside the present pressures (kPa): beyond every dead band."""
 
 
 @dataclass(frozen=True)
@@ -149,15 +155,30 @@ class Follow:
         }
 
     def script(self, state: TaskState) -> dict[str, Tensor]:
-        """Damped least squares for the pressures that put the point on the next target."""
+        """Damped least squares for the pressures that put the point on the next target.
+
+        The direction of change makes the arm jump where a chamber turns round, so where the solver
+        is stuck it tries again from pressures that turn all chambers one way or the other.
+        """
         with torch.inference_mode(False):
             part = tree_map(torch.clone, state.world.arms["arm"])
             target = self.target_mm(tree_map(torch.clone, state), 1)
-            low, high = self.arm.within_reach(part, self.dt_s)
+            best, error = self._solved(part, target, 0.0)
+            stuck = (error > STUCK_MM).nonzero()[:, 0]
+            for offset in OFFSETS_KPA if len(stuck) else ():
+                tried, missed = self._solved(rows(part, stuck), target[stuck], offset)
+                better = missed < error[stuck]
+                best = best.index_copy(0, stuck, tried.where(better[:, None], best[stuck]))
+                error = error.index_copy(0, stuck, missed.where(better, error[stuck]))
+            return {"arm": self.arm.action_for(part, best, self.dt_s)}
 
-            def residual(pressure: Tensor) -> Tensor:
-                points = self.arm.foresee(part, pressure, self.dt_s)
-                return (self.marker(points) - target)[:, : self._directions]
+    def _solved(self, part: ArmPart, target: Tensor, offset: float) -> tuple[Tensor, Tensor]:
+        """Pressures (B, m) kPa for targets (B, 3) mm, sought from `offset` kPa off, and errors."""
+        low, high = self.arm.within_reach(part, self.dt_s)
 
-            wanted = least_squares(residual, part.pressure, low, high)
-            return {"arm": self.arm.action_for(part, wanted, self.dt_s)}
+        def residual(pressure: Tensor) -> Tensor:
+            points = self.arm.foresee(part, pressure, self.dt_s)
+            return (self.marker(points) - target)[:, : self._directions]
+
+        pressure = least_squares(residual, part.pressure + offset, low, high)
+        return pressure, residual(pressure).norm(dim=1)

@@ -6,6 +6,7 @@ import torch
 
 from surgisoft.errors import unknown_name
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_plane import laser_plane
 from surgisoft.tasks.track import track_circle, track_square
 
@@ -13,6 +14,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "track_circle": track_circle,
     "track_square": track_square,
     "laser_plane": laser_plane,
+    "circle_ablation": CircleAblation,
 }
 """Name -> builder(config=None, device="cpu"); without a config the task's own."""
 

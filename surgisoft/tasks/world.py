@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.scene.folder import Scene
+from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.default import default_arm
 from surgisoft.surrogate.model import ArmModel
@@ -155,13 +155,14 @@ def lone_arm(
 
 
 def scene_world(
-    scene: Scene,
+    scene: Scene | str | Path,
     config: WorldConfig | None = None,
     device: str | torch.device = "cpu",
     engine: str | None = None,
 ) -> World:
-    """The two arms of a scene, named `laser` and `endoscope`, among its bodies."""
+    """The two arms of a scene (or its folder), named `laser` and `endoscope`, among its bodies."""
     config = config or WorldConfig()
+    scene = scene if isinstance(scene, Scene) else open_scene(scene)
     arms = {}
     for mount in scene.spec.mounts:
         pose = torch.tensor(mount.pose(), dtype=torch.float32)

@@ -24,6 +24,10 @@ BEAM_BEYOND_MM = 50.0
 """The beam is followed so far beyond the greatest distance at which the laser works (mm)."""
 
 
+PATH_POINTS = 360
+"""Points of the ring's path as the laser follows it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scenery:
     """A batch of surroundings at one instant; what a world does not have is None."""
@@ -51,7 +55,11 @@ class SceneryConfig:
 
 
 class Surroundings:
-    """A scene with its engines; built once, asked every step, holds no state."""
+    """A scene with its engines; built once, asked every step, holds no state.
+
+    `spec` is the scene's file; `path_mm` (360, 3) the ring's closed path and `centre_mm` (3,) its
+    middle, world frame, mm.
+    """
 
     def __init__(
         self,
@@ -78,8 +86,11 @@ class Surroundings:
         )
         tissue = Tissue(spec.laser.absorption_per_mm)
         self.ablation = AblationMap(patch, waist, tissue, config.depth_mm, device)
-        look = scene.ring_of(count=config.view_points)
-        row = {"dtype": torch.float32, "device": self.device}
+        look, row = scene.ring_of(count=config.view_points), {"dtype": torch.float32}
+        row["device"] = self.device
+        self.spec = spec
+        self.path_mm = torch.tensor(scene.ring_of(count=PATH_POINTS).points_mm, **row)
+        self.centre_mm = torch.tensor(ring.centre_mm, **row)
         self.ring_mm = torch.tensor(look.points_mm, **row)
         self.ring_normals = torch.tensor(look.normals, **row)
 

@@ -109,7 +109,7 @@ class CircleAblation:
         return TaskState(self.world.step(state.world, actions, power, in_place), cut)
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Each arm's body, the beam's miss now and ahead, the lesion's from the camera, the other."""
+        """Each arm's body and the other's tip; misses of the beam and of the camera's axis."""
         arms, scenery, cut = state.world.arms, state.world.scenery, state.goal
         laser, eye, count = arms["laser"], arms["endoscope"], len(cut.walked)
         ahead = [self.target_mm(cut, k) for k in range(self.config.preview + 1)]

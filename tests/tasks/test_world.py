@@ -161,6 +161,22 @@ def test_geometry_is_the_referees(theatre, phantom):
         np.testing.assert_allclose(hit.point_mm, scenery.hit.point_mm[i].numpy(), atol=1e-3)
 
 
+def test_the_accelerators_engine_gives_the_same_world(theatre, phantom):
+    """The torch engine, here on the CPU, beside the compiled one."""
+    other = scene_world(phantom, theatre.config, engine="torch")
+    one, two = theatre.start(streams(7, 3)), other.start(streams(7, 3))
+    for action in actions_of(theatre, 3, 4, seed=2):
+        one, two = theatre.step(one, action, 20.0), other.step(two, action, 20.0)
+    for name in ("least_mm", "self_mm"):
+        a, b = (getattr(state.scenery.clearance, name) for state in (one, two))
+        torch.testing.assert_close(a, b, rtol=0, atol=0.3)
+    assert torch.equal(one.scenery.hit.struck, two.scenery.hit.struck)
+    torch.testing.assert_close(
+        one.scenery.hit.point_mm, two.scenery.hit.point_mm, rtol=0, atol=1e-3
+    )
+    assert torch.equal(one.scenery.view.visible, two.scenery.view.visible)
+
+
 def test_energy_on_the_organ_is_power_times_time(theatre):
     """At both ends of a step on the organ: all of the step's energy; at one end: half of it."""
     state = theatre.start(streams(11, 16))

@@ -20,6 +20,10 @@ MANY = {"--valid", "--effects", "--hidden"}
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
 def _version(value: bool) -> None:
     if value:
         from surgisoft import __version__
@@ -58,13 +62,16 @@ def _fail(message: str) -> int:
     return 2
 
 
-def _usage(error: TyperException) -> int:
+def _usage(error: TyperException, many: list[str]) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         print(error.format_message())
         return 2
     context = getattr(error, "ctx", None)
     where = context.command_path if context else "surgisoft"
-    return _fail(f"{error.format_message().rstrip('.')}; see '{where} --help'")
+    message = error.format_message().rstrip(".")
+    if message.startswith("Missing argument") and many:
+        message += f" ({', '.join(many)} took every value after it: put arguments before options)"
+    return _fail(f"{message}; see '{where} --help'")
 
 
 def run(arguments: list[str] | None = None) -> int:
@@ -77,15 +84,17 @@ def run(arguments: list[str] | None = None) -> int:
     except InputError as error:
         return _fail(str(error))
     except TyperException as error:
-        return _usage(error)
+        return _usage(error, sorted(MANY.intersection(arguments)))
     except (KeyboardInterrupt, typer.Abort):
         print("surgisoft: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
+    if code == INTERRUPTED:
+        print("surgisoft: interrupted", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

@@ -40,7 +40,9 @@ def collect(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="New recording, .parquet or .csv.")
     ],
-    seed: Annotated[int, typer.Option(min=0, help="Which specimen of the arm was cast.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31, help="Which specimen of the arm was cast.")
+    ] = 0,
     take: Annotated[
         int, typer.Option(min=0, help="Another take: same arm, other noise and random schedule.")
     ] = 0,
@@ -63,7 +65,10 @@ def collect(
         typer.Option(help="Direction of weight in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
-        float, typer.Option("--roll-deg", help="Turn of the base about its axis, in degrees.")
+        float,
+        typer.Option(
+            "--roll-deg", min=-360, max=360, help="Turn of the base about its axis, in degrees."
+        ),
     ] = 0.0,
     noise_scale: Annotated[
         float, typer.Option(help="Factor on all sensor and camera noise.")

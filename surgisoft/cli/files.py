@@ -1,8 +1,36 @@
 """Files that commands write: whole or not at all."""
 
+import json
 import os
 import tempfile
 from pathlib import Path
+
+from surgisoft.errors import InputError
+
+
+def check_free(path: Path | None, field: str) -> None:
+    """Raise unless a JSON file may be written there: nothing yet, or an older one of its kind.
+
+    An older one has the named field.
+    """
+    if path is None or not path.exists():
+        return
+    try:
+        old = json.loads(path.read_text())
+        same = isinstance(old, dict) and field in old
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        raise InputError(f"{path}: already there and no older result; choose another file")
+
+
+def check_folder(path: Path | None) -> None:
+    """Raise unless a folder is there or can be made."""
+    if path is None:
+        return
+    above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise InputError(f"{path}: cannot be written, {above} is no writable folder")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -42,15 +42,17 @@ def fit(
         Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
     ] = "measured",
     epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 200,
-    seed: Annotated[int, typer.Option(help="Seed of weights and order of rows.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31, help="Seed of weights and order of rows.")
+    ] = 0,
     threads: Annotated[
-        int, typer.Option(min=1, help="Threads; more than one only pays on idle cores.")
+        int, typer.Option(min=1, max=256, help="Threads; more than one only pays on idle cores.")
     ] = 1,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing model.")] = False,
 ) -> None:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings.
 
-    Grows from pressure to direction to effects, keeps each only where held-out data rewards it,
+    Grows from pressure to effects to direction, keeps each only where held-out data rewards it,
     and says which inputs the recordings cannot support.
     """
     import torch

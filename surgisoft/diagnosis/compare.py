@@ -71,7 +71,11 @@ class Comparison:
         """Plain values: `rmse_mm`, `per_key_point_mm`, `tip_rmse_mm`, `floor_mm`, `samples` ..."""
         values = asdict(self)
         floor = values.pop("floor")
-        return {**values, "floor_mm": floor["rmse_mm"], "floor_source": floor["source"]}
+        values |= {"floor_mm": floor["rmse_mm"], "floor_source": floor["source"]}
+        for name in ("rmse_mm", "tip_rmse_mm", "mse_mm2"):
+            values[name] = _known(values[name])
+        values["per_key_point_mm"] = [_known(value) for value in self.per_key_point_mm]
+        return values
 
 
 def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, Residuals]:
@@ -79,6 +83,8 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
     rest = residuals(model, recordings)
     square = np.square(rest.error_mm)
     seen = ~np.isnan(square).all(axis=1)
+    if not np.isfinite(rest.predicted_mm).all():
+        raise InputError("the model predicts values that are not finite; fit it again")
     if not seen.any():
         raise InputError("no key point was measured in any row of the recordings")
     timed = any(recording.kind == "continuous" for recording in recordings)
@@ -98,6 +104,11 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
         ),
         rest,
     )
+
+
+def _known(value: float) -> float | None:
+    """The value; None where nothing was measured, which JSON can say and NaN it cannot."""
+    return None if np.isnan(value) else value
 
 
 def _nanmean(values: np.ndarray) -> float:

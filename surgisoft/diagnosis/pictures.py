@@ -23,16 +23,18 @@ POSTURES = 7
 
 
 def draw_all(
-    rest: Residuals, backbone: Backbone, unit: str, folder: Path, title: str = ""
+    rest: Residuals, backbone: Backbone | None, unit: str, folder: Path, title: str = ""
 ) -> list[Path]:
-    """Write loops.png, body.png and error.png into a folder; returns their paths."""
+    """Write loops.png, body.png and error.png into a folder; returns their paths.
+
+    Without a backbone (an arm of one key point) there is no body to draw.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
-    for name, figure in (
-        ("loops", loops(rest, unit, title)),
-        ("body", body(rest, backbone, title)),
-        ("error", error_over_time(rest, title)),
-    ):
+    figures = [("loops", loops(rest, unit, title)), ("error", error_over_time(rest, title))]
+    if backbone is not None:
+        figures.insert(1, ("body", body(rest, backbone, title)))
+    for name, figure in figures:
         drawn.append(save(figure, folder / f"{name}.png"))
     return drawn
 
@@ -156,7 +158,9 @@ def _static(pressure: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _main_direction(points: np.ndarray) -> np.ndarray:
     """(3,) unit vector along which points (S, 3) spread most."""
-    centred = np.nan_to_num(points - np.nanmean(points, axis=0))
+    seen = ~np.isnan(points)
+    mean = np.nansum(points, axis=0) / np.maximum(seen.sum(axis=0), 1)
+    centred = np.nan_to_num(points - mean)
     return np.linalg.svd(centred, full_matrices=False)[2][0]
 
 
@@ -183,7 +187,8 @@ def body(rest: Residuals, backbone: Backbone, title: str = ""):
     axis.set_ylabel("y [mm]")
     axis.set_zlabel("z [mm]")
     axis.set_aspect("equal")
-    axis.legend(frameon=False, loc="upper left")
+    if len(whole):
+        axis.legend(frameon=False, loc="upper left")
     axis.set_title(title or "Body, measured and predicted")
     return figure
 
@@ -207,7 +212,8 @@ def error_over_time(rest: Residuals, title: str = ""):
         1, 2, figsize=(11, 3.8), layout="constrained", width_ratios=(3, 1)
     )
     left.plot(error[:, -1], c=PREDICTED, lw=0.6, label="tip")
-    left.plot(np.nanmean(error, axis=1), c=MEASURED, lw=0.6, label="mean of the key points")
+    seen = np.maximum((~np.isnan(error)).sum(axis=1), 1)
+    left.plot(np.nansum(error, axis=1) / seen, c=MEASURED, lw=0.6, label="mean of the key points")
     for edge in np.flatnonzero(np.diff(rest.run)):
         left.axvline(edge + 0.5, c="#bbbbbb", lw=0.6)
     left.set_xlabel("row (runs are divided by lines)")

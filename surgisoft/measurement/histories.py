@@ -15,6 +15,15 @@ BAND_NOISES = 4.0
 """Half width of the dead band in standard deviations of the pressure at rest."""
 
 
+STILL_SHARE = 0.1
+"""A chamber that moved less than this share of the widest range is scaled as if it had moved all of
+it: its motion may be noise for the greater part."""
+OUTSIDE_SHARE = 0.03
+"""How far beyond the fitted range, as a share of it, an actuation may go without a note."""
+IDLE_SHARE = 0.02
+"""A chamber that moved no more than this share of the widest range stood still: it is ignored."""
+
+
 def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
     """(T, m) measured or commanded actuation, in the recording's unit."""
     if actuation not in ACTUATIONS:
@@ -71,6 +80,9 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
     signal = np.concatenate([actuation_of(recording, actuation) for recording in recordings])
     low, high = signal.min(0), signal.max(0)
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
+    still = high - low <= IDLE_SHARE * (high - low).max()
+    idle = [float(x) if s else None for x, s in zip(signal.mean(0), still, strict=True)]
+    low, high = _with_room(low, high)
     span = high - low
     band = np.clip(BAND_NOISES * noise, BAND_SHARE[0] * span, BAND_SHARE[1] * span)
     first = recordings[0]
@@ -82,9 +94,45 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
         unit=first.unit,
         actuation=actuation,
         band=tuple(band.tolist()),
+        idle=tuple(idle),
         length_mm=first.arm.length_mm,
         diameter_mm=first.arm.diameter_mm,
         gravity=None if first.gravity is None else tuple(first.gravity.tolist()),
+    )
+
+
+def outside_range(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
+    """A note for each chamber that recordings move where the model was not fitted."""
+    signal = np.concatenate([actuation_of(recording, spec.actuation) for recording in recordings])
+    notes = []
+    for chamber in range(spec.chambers):
+        came = (float(signal[:, chamber].min()), float(signal[:, chamber].max()))
+        room = OUTSIDE_SHARE * spec.span[chamber]
+        low, high = spec.low[chamber] - room, spec.high[chamber] + room
+        what = f"range {spec.low[chamber]:.4g} to {spec.high[chamber]:.4g}"
+        if spec.idle[chamber] is not None:
+            low, high = spec.idle[chamber] - room, spec.idle[chamber] + room
+            what = f"place, where it stood still at {spec.idle[chamber]:.4g}"
+        if came[0] < low or came[1] > high:
+            notes.append(
+                f"chamber {chamber + 1} goes from {came[0]:.4g} to {came[1]:.4g} {spec.unit}, "
+                f"outside its fitted {what} {spec.unit}: errors there say little about the model"
+            )
+    return notes
+
+
+def _with_room(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges (m,) in which a chamber that hardly moved is as wide as the widest one.
+
+    Its little motion is mostly noise: scaled to the full input range of a network it would be
+    taken for signal.
+    """
+    span = high - low
+    still = span < STILL_SHARE * span.max()
+    middle = (high + low) / 2
+    return (
+        np.where(still, middle - span.max() / 2, low),
+        np.where(still, middle + span.max() / 2, high),
     )
 
 

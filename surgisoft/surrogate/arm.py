@@ -26,6 +26,9 @@ class ArmSpec:
     """Which actuation the model takes: `measured` or `commanded`."""
     band: tuple[float, ...] = ()
     """Half width of the dead band of the direction of change in each chamber, in `unit`."""
+    idle: tuple[float | None, ...] = ()
+    """Actuation at which a chamber stood still while the data was recorded, in `unit`: the model
+    ignores such a chamber. None for each chamber that moved."""
     length_mm: float | None = None
     """Length at rest, mm."""
     diameter_mm: float | None = None
@@ -34,11 +37,14 @@ class ArmSpec:
     """Unit vector of weight in the base frame, where the recordings say it."""
 
     def __post_init__(self):
-        for name in ("low", "high", "band"):
+        for name in ("low", "high", "band", "idle"):
             value = getattr(self, name)
             if name == "band" and not value:
                 value = tuple(0.0 for _ in range(self.chambers))
                 object.__setattr__(self, "band", value)
+            if name == "idle" and not value:
+                value = (None,) * self.chambers
+                object.__setattr__(self, "idle", value)
             if len(value) != self.chambers:
                 raise InputError(
                     f"arm: '{name}' has {len(value)} values, expected one for each of "

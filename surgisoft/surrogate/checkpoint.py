@@ -40,6 +40,9 @@ def _network_config(network) -> dict:
 def claim_folder(folder: str | Path, force: bool = False) -> Path:
     """The folder to write to, which must be free or may be replaced; nothing is touched yet."""
     folder = Path(folder)
+    above = next(parent for parent in folder.absolute().parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
         raise InputError(f"{folder}: already there; choose another name or pass --force")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():

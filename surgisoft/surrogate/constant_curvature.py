@@ -66,6 +66,8 @@ class ConstantCurvature(nn.Module):
     def set_rest(self, rest: Tensor) -> None:
         """Lengths from the key points at rest, (n, 3) in mm, base frame."""
         steps = rest.diff(dim=0).norm(dim=-1)
+        if not float(steps.sum()) > 0:
+            raise InputError("constant curvature: all key points coincide, expected a chain")
         self.length.copy_(steps.sum())
         self.fraction.data.copy_(torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum())
         self.base_mm.data.copy_(rest[0])

@@ -1,6 +1,6 @@
 """Fit an arm model to histories: from simple to rich, and no further than held-out runs reward.
 
-A model grows in stages (pressure, then direction, then each effect). Each stage starts as the very
+A model grows in stages (pressure, then each effect, then direction). Each stage starts as the very
 function that the stage before ended with - new weights are zero - and is kept only where it
 lowers the error on held-out data by more than chance; so the result is never worse there than the
 simpler model. Training follows Chen et al. 2025, sec. III-A: motion-range weighted MSE, validation
@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import torch
+from scipy import stats
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
@@ -40,6 +41,12 @@ SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that only prepares the next, or comes after an effect."""
 EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
+STILL_SHARE = 0.15
+"""Share of its range that a chamber has to move, or the fit notes that it did not."""
+LEAST_BLOCKS = 5
+"""Fewest blocks of held-out time that can decide whether a stage is kept."""
+LARGEST_MM = 1e5
+"""Largest coordinate that is taken for a measurement, mm."""
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
 
@@ -81,6 +88,8 @@ class StageReport:
     seconds: float
     kept: bool
     reason: str = ""
+    simpler_rmse_mm: float | None = None
+    """Held-out RMSE of the simpler model trained just as long, mm."""
 
 
 @dataclass
@@ -114,11 +123,14 @@ class FitResult:
             f"{stage.name:20s} held-out RMSE {stage.valid_rmse_mm:8.4f} mm  "
             f"{stage.epochs:4d} epochs {stage.seconds:6.1f} s  "
             f"{'kept' if stage.kept else 'left out'}"
+            + (f" (without it {stage.simpler_rmse_mm:.4f} mm)" if stage.simpler_rmse_mm else "")
             for stage in self.stages
         ]
         lines += [f"note: {warning}" for warning in self.warnings]
         error = self.model.validation
-        points = " ".join(f"{value:.4f}" for value in error["per_key_point_mm"])
+        points = " ".join(
+            "-" if value is None else f"{value:.4f}" for value in error["per_key_point_mm"]
+        )
         lines.append(
             f"held-out RMSE {error['rmse_mm']:.4f} mm over {error['rows']} rows; "
             f"key points base to tip: {points} mm"
@@ -140,6 +152,7 @@ def fit(
     data = Data.split(train, valid, config.seed)
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
     result = FitResult(None, [], excitation(train, low, high, band), [], 0.0)
+    result.warnings.extend(_still_chambers(train, spec))
     if config.network == "recurrent":
         _fit_recurrent(data, spec, config, result, progress)
     else:
@@ -153,9 +166,26 @@ def fit(
             _stage(candidate, name, epochs, config, data, result, progress)
         rows = data.judging_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
+    if not math.isfinite(result.model.validation["rmse_mm"]):
+        raise InputError("the fit did not come to a finite error; check the recordings' key points")
+    for number, value in enumerate(result.model.validation["per_key_point_mm"]):
+        if value is None:
+            result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
     result.seconds = time.perf_counter() - start
     return result
+
+
+def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
+    """A note for each chamber that hardly moved in the training recordings."""
+    pressure = train.rows(train.pressure)
+    moved = (pressure.amax(0) - pressure.amin(0)).tolist()
+    return [
+        f"chamber {number} hardly moved ({came:.3g} {spec.unit} in all): "
+        "what it does cannot be learned from these recordings"
+        for number, (came, span) in enumerate(zip(moved, spec.span, strict=True), 1)
+        if came < STILL_SHARE * span
+    ]
 
 
 def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> None:
@@ -177,9 +207,18 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
     for name in config.effects:
         if name not in EFFECTS:
             raise unknown_name("effect", name, EFFECTS)
+    if config.effects and config.network != "haw_nn":
+        raise InputError(f"effects are for haw_nn; the {config.network} baseline takes none")
     for history in (train, valid):
         if history is None:
             continue
+        if not torch.isfinite(history.pressure).all():
+            raise InputError("an actuation is beyond all measure; check the recordings for it")
+        if float(history.key_points.nan_to_num().abs().max()) > LARGEST_MM:
+            raise InputError(
+                f"a key point lies farther than {LARGEST_MM:g} mm from the base; check the "
+                "recordings' units and outliers"
+            )
         seen = int((~history.key_points.isnan()).all(-1).any(-1).sum())
         if seen < LEAST_ROWS:
             raise InputError(
@@ -274,12 +313,13 @@ def _stage(
     begin = time.perf_counter()
     done = train_model(candidate, data, name, epochs, config, result.loss, progress)
     after = _square(candidate, data)
-    kept, reason = True, ""
+    kept, reason, simpler_rmse = True, "", None
     if result.model is not None:
         simpler = copy.deepcopy(result.model)
         train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
-        block = data.judging_rows(simpler).block
-        kept, reason = _better(_square(simpler, data), after, block)
+        before = _square(simpler, data)
+        simpler_rmse = math.sqrt(float(before.sum(-1).nanmean()))
+        kept, reason = _better(before, after, data.judging_rows(simpler).block)
         if not kept:
             result.warnings.append(f"{name} left out: {reason}")
         result.model = simpler
@@ -288,7 +328,7 @@ def _stage(
     result.model.rest_mm.copy_(rest_shape(data.train))
     rmse = math.sqrt(float(after.sum(-1).nanmean()))
     seconds = time.perf_counter() - begin
-    result.stages.append(StageReport(name, rmse, done, seconds, kept, reason))
+    result.stages.append(StageReport(name, rmse, done, seconds, kept, reason, simpler_rmse))
 
 
 def _square(model: ArmModel, data: Data) -> Tensor:
@@ -298,16 +338,26 @@ def _square(model: ArmModel, data: Data) -> Tensor:
 
 
 def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:
-    """Whether the squared error (S, n, 3) fell by more than twice its standard error by blocks."""
+    """Whether the squared error (S, n, 3) fell beyond chance, with its blocks as the samples.
+
+    One-sided at 2.5 % by Student's t over the blocks: with few blocks the bar is high.
+    """
     gain = (before - after).nanmean(dim=(1, 2)).nan_to_num()
     blocks = int(block.max()) + 1
     total = torch.zeros(blocks).index_add(0, block, gain)
     mean = float(gain.mean())
+    if blocks < LEAST_BLOCKS:
+        return False, (
+            f"the held-out data is too short to decide ({len(gain)} rows, {blocks} blocks of time, "
+            f"at least {LEAST_BLOCKS} needed); give more with --valid"
+        )
     error = float((total - total.mean()).square().sum().sqrt()) / len(gain)
-    if mean > 2 * error:
+    error *= math.sqrt(blocks / (blocks - 1))
+    if mean > float(stats.t.ppf(0.975, blocks - 1)) * error:
         return True, ""
-    share = mean / max(float(before.nanmean()), 1e-12)
+    scale = max(float(before.nanmean()), 1e-12)
+    advice = "; more held-out data (--valid) may decide it" if mean > error else ""
     return False, (
-        f"the held-out squared error changes by {-share:+.1%} (standard error "
-        f"{error / max(float(before.nanmean()), 1e-12):.1%}), which is no gain beyond chance"
+        f"the held-out squared error changes by {-mean / scale:+.1%} (standard error "
+        f"{error / scale:.1%}), which is no gain beyond chance{advice}"
     )

@@ -34,7 +34,7 @@ def train_recurrent(
     starts = [
         (run, start)
         for run in range(train.runs)
-        for start in range(0, max(int(train.valid[run].sum()) - window, 0) + 1, window // 4)
+        for start in range(0, max(int(train.valid[run].sum()) - window, 0) + 1, max(1, window // 4))
     ]
     starts = torch.tensor(starts)
     batch = max(1, min(32, len(starts) // 4))

@@ -55,11 +55,19 @@ class ArmModel(nn.Module):
         rest = torch.zeros(spec.key_points, 3) if rest_mm is None else rest_mm.float()
         self.register_buffer("rest_mm", rest)
         self.register_buffer("band", torch.tensor(spec.band, dtype=torch.float32))
+        still = torch.tensor([value is not None for value in spec.idle])
+        self.register_buffer("still", still, persistent=False)
+        idle = torch.tensor([value or 0.0 for value in spec.idle])
+        self.register_buffer("idle", idle, persistent=False)
         self.register_buffer("rest", torch.tensor(spec.rest, dtype=torch.float32))
 
     def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
         """The effects of one stage, by name, in order."""
         return [(name, effect) for name, effect in self.effects.items() if effect.stage == stage]
+
+    def chambers(self, pressure: Tensor) -> Tensor:
+        """Chamber pressure (..., m) with the still chambers at where they stood."""
+        return torch.where(self.still, self.idle, pressure)
 
     @property
     def remembers(self) -> bool:
@@ -79,9 +87,11 @@ class ArmModel(nn.Module):
             pressure = self.rest.expand(batch, -1)
         memory = {}
         signal = pressure
-        for name, effect in self.stage("line") + self.stage("material"):
-            memory[name] = effect.rest(signal)
-            signal = effect.apply(signal, memory[name])
+        for stage in ("line", "material"):
+            for name, effect in self.stage(stage):
+                memory[name] = effect.rest(signal)
+                signal = effect.apply(signal, memory[name])
+            signal = self.chambers(signal)
         if self.remembers:
             memory[NETWORK] = self.network.rest(pressure)
         if self.stage("body") or self.stage("sensor"):
@@ -110,7 +120,7 @@ class ArmModel(nn.Module):
                 memory[name], signal = effect.step(memory[name], signal, dt)
             return signal
 
-        chamber = advance("line", pressure)
+        chamber = self.chambers(advance("line", pressure))
         anchor, direction = directions.advance(state.anchor, state.direction, chamber, self.band)
         effective = advance("material", chamber)
         if self.remembers:
@@ -124,6 +134,7 @@ class ArmModel(nn.Module):
         chamber = history.pressure
         for name, effect in self.stage("line"):
             chamber = effect.apply(chamber, effect.scan(start[name], chamber, dt))
+        chamber = self.chambers(chamber)
         _, direction = directions.trace(chamber, self.band, self.rest)
         memory, signal = {}, chamber
         for name, effect in self.stage("material"):

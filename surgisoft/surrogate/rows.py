@@ -138,7 +138,9 @@ def validated_error(target: Tensor, predicted: Tensor) -> dict:
     square = (predicted - target).square().sum(-1)
     return {
         "rmse_mm": math.sqrt(float(square.nanmean())),
-        "per_key_point_mm": [math.sqrt(float(x)) for x in square.nanmean(0)],
+        "per_key_point_mm": [
+            None if math.isnan(x) else math.sqrt(x) for x in square.nanmean(0).tolist()
+        ],
         "rows": len(target),
     }
 

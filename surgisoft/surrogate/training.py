@@ -31,7 +31,7 @@ MEMORY_STEPS = 3
 """Steps through windows after each epoch of rows."""
 MEMORY_FIRST = 3
 """Epochs of rows before the memory is touched."""
-MEMORY_RATE = 3.0
+MEMORY_RATE = 10.0
 """Learning rate of memory parameters, times that of the others."""
 
 

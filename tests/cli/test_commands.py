@@ -71,6 +71,20 @@ def test_a_folder_holds_config_weights_and_report(lab):
         (["fit"], "Missing argument"),
         (["compare", "{lab}", "{lab}/test.parquet"], "no arm model there"),
         (["compare", "{lab}/arm", "{lab}/arm/config.json"], "config.json"),
+        (
+            ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/test.parquet"],
+            "no older result",
+        ),
+        (
+            ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/arm/config.json"],
+            "no older result",
+        ),
+        (
+            ["compare", "{lab}/arm", "{lab}/test.parquet", "--report", "{lab}/test.parquet/x"],
+            "no writable folder",
+        ),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "no writable folder"),
+        (["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"], "took every"),
         (["collect", "dance", "-o", "{lab}/x.parquet"], "dance"),
         (["collect", "walk", "-o", "{lab}/x.parquet", "--hidden", "ghost"], "ghost"),
         (["fti"], "No such command"),

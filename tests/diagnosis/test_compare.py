@@ -10,7 +10,7 @@ from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.floor import noise_floor
 from surgisoft.diagnosis.pictures import draw_all
 from surgisoft.errors import InputError
-from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of
+from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of, outside_range
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
@@ -119,6 +119,46 @@ def test_pressure_noise_from_rests_of_the_command():
     spec = arm_spec([noisy])
     assert spec.band[1] == pytest.approx(0.8, rel=0.15)
     assert history_of([noisy]).pressure.shape == (1, 1200, 2)
+
+
+def test_a_chamber_that_only_shows_noise_is_not_blown_up():
+    rng = np.random.default_rng(3)
+    measured = np.stack([np.linspace(0, 50, 200), 2 + rng.normal(0, 0.1, 200)], 1)
+    spec = arm_spec([recording(np.tile(POINTS, (200, 1, 1)), measured)])
+    assert (spec.low[0], spec.high[0]) == (0.0, 50.0)
+    assert spec.high[1] - spec.low[1] == pytest.approx(50.0)
+    assert (spec.high[1] + spec.low[1]) / 2 == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_still_chamber_is_ignored_and_its_motion_noted():
+    """An input without motion has no learned effect: the model must not make one up."""
+    rng = np.random.default_rng(4)
+    measured = np.stack([np.linspace(0, 50, 200), 3 + rng.normal(0, 0.02, 200)], 1)
+    still = recording(np.tile(POINTS, (200, 1, 1)), measured)
+    spec = arm_spec([still])
+    assert spec.idle[0] is None
+    assert spec.idle[1] == pytest.approx(3.0, abs=0.01)
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    model = ArmModel(spec, HawNN(low, high, 3, hidden=(8,)), rest_mm=torch.tensor(POINTS))
+    moved = measured + np.array([0.0, 20.0])
+    one, other = (
+        model.predict(history_of([recording(still.key_points_mm, values)]))
+        for values in (measured, moved)
+    )
+    assert torch.equal(one, other)
+    assert outside_range(spec, [still]) == []
+    notes = outside_range(spec, [recording(still.key_points_mm, moved)])
+    assert len(notes) == 1
+    assert "chamber 2 goes from 22.9" in notes[0]
+
+
+def test_a_tip_that_was_never_seen_is_null_not_nan():
+    points = np.tile(POINTS, (40, 1, 1))
+    points[:, 2] = np.nan
+    values = compare(still_model(), [recording(points)])[0].to_json()
+    assert values["tip_rmse_mm"] is None
+    assert values["per_key_point_mm"] == [pytest.approx(0), pytest.approx(0), None]
+    json.dumps(values, allow_nan=False)
 
 
 def test_commanded_actuation_must_be_there():

@@ -144,6 +144,45 @@ def test_too_few_rows_are_refused():
         fit(short, None, SPEC, QUICK)
 
 
+@pytest.mark.parametrize(("value", "message"), [(1e30, "farther than"), (1e200, "farther than")])
+def test_absurd_key_points_are_refused(walks, value, message):
+    points = walks[1].key_points.double().clone()
+    points[0, 3, 1, 2] = value
+    broken = pack(list(walks[1].t_s), list(walks[1].pressure), list(points))
+    with pytest.raises(InputError, match=message):
+        fit(broken, None, SPEC, QUICK)
+
+
+def test_an_absurd_actuation_is_refused(walks):
+    pressure = walks[1].pressure.double().clone()
+    pressure[0, 3, 1] = 1e300
+    broken = pack(list(walks[1].t_s), list(pressure), list(walks[1].key_points))
+    with pytest.raises(InputError, match="beyond all measure"):
+        fit(broken, None, SPEC, QUICK)
+
+
+def test_too_little_held_out_data_decides_nothing(walks):
+    """Forty rows are two blocks of time: no stage may be kept on them."""
+    valid = history([walk(40, np.random.default_rng(8))])
+    config = FitConfig(hidden=(16,), epochs=20, effects=("hysteresis",))
+    result = fit(walks[0], valid, SPEC, config)
+    assert not result.model.effects
+    assert any("too short to decide" in warning for warning in result.warnings)
+
+
+def test_recurrent_baseline_takes_runs_of_one_row():
+    rng = np.random.default_rng(9)
+    short = history([walk(1, rng) for _ in range(60)])
+    result = fit(short, None, SPEC, FitConfig(network="recurrent", epochs=2))
+    assert np.isfinite(result.model.validation["rmse_mm"])
+
+
+def test_effects_are_refused_where_they_would_be_ignored(walks):
+    config = FitConfig(network="recurrent", effects=("hysteresis",))
+    with pytest.raises(InputError, match="takes none"):
+        fit(walks[0], walks[1], SPEC, config)
+
+
 def test_truth_is_not_made_of_plays():
     """The test's own arm: relays only, so that the model's form is not simply found again."""
     path = np.array([[0.0, 0, 0], [30, 0, 0], [0, 0, 0]])

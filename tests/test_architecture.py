@@ -15,6 +15,8 @@ MAY_IMPORT = {
     "measurement/rig": {"measurement"},
     "diagnosis": {"surrogate", "measurement"},
     "studies": {"surrogate", "measurement", "diagnosis"},
+    "tasks": set(),
+    "tasks/world": {"scene", "surrogate"},
     "replay": {"scene"},
     "cli": {"scene", "surrogate", "measurement", "diagnosis", "studies", "replay"},
 }
@@ -26,6 +28,7 @@ GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
 ONLY_IN = {
     "rerun": "replay",
     "pettingzoo": "tasks/parallel",
+    "gymnasium": "tasks/",
     "rsl_rl": "agents",
     "fcl": "scene/collision",
 }

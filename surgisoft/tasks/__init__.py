@@ -1,0 +1,1 @@
+"""Worlds, tasks, and adapters that hand them to PettingZoo and Gymnasium."""

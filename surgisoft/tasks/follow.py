@@ -1,0 +1,184 @@
+"""A point of one arm follows a closed path: the tip, or where its beam meets a plane.
+
+State, action and reward are those of Chen et al. (2025, sec. IV-A) for tracking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.paths import PATHS
+from surgisoft.tasks.solver import least_squares
+from surgisoft.tasks.streams import Stream
+from surgisoft.tasks.tree import rows, tree_map
+from surgisoft.tasks.world import World
+from surgisoft.tasks.world_arm import ArmPart
+
+STUCK_MM = 1e-3
+"""A solver that leaves more than this tries again (mm)."""
+OFFSETS_KPA = (1.0, -1.0)
+"""Where it begins then, beside the present pressures (kPa): beyond every dead band."""
+
+
+@dataclass(frozen=True)
+class FollowConfig:
+    """A path, how it is walked, and what following it is worth."""
+
+    path: str = "circle"
+    """`circle` or `square`."""
+    size_mm: float = 20.0
+    """Diameter or edge, mm."""
+    loop_s: float = 20.0
+    """Time for once around, s."""
+    loops: int = 1
+    """Times around."""
+    approach_s: float = 3.0
+    """Time at the beginning in which the target waits where the path begins, s."""
+    any_start: bool = True
+    """Whether an episode begins anywhere on the path and runs either way round."""
+    preview: int = 2
+    """Coming targets that the arm knows, one a step."""
+    fine_mm: float = 0.1
+    """Scale of the second reward term, mm."""
+    fine_weight: float = 1.0
+    """Weight of the second reward term; 0: the paper's reward."""
+
+    def __post_init__(self):
+        if self.path not in PATHS:
+            raise unknown_name("path", self.path, PATHS)
+        for name in ("size_mm", "loop_s", "loops", "preview", "fine_mm"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """How a batch of episodes goes round."""
+
+    start: Tensor
+    """(B,) 0..1: share of the path where it begins."""
+    way: Tensor
+    """(B,) +1 or -1: which way round."""
+
+
+class Follow:
+    """One arm in empty space, one of whose points follows a path."""
+
+    agents = ("arm",)
+
+    def __init__(
+        self,
+        name: str,
+        world: World,
+        config: FollowConfig,
+        marker: Callable[[Tensor], Tensor],
+        centre_mm: Tensor,
+        directions: int,
+    ):
+        """marker: key points (B, n, 3) mm to the point that follows (B, 3) mm, world frame.
+
+        The path lies about centre_mm (3,), level; the solver holds the first `directions`
+        coordinates of the point (2 where the third is fixed).
+        """
+        self.name, self.world, self.config = name, world, config
+        self.arm, self.marker, self.centre = world.arms["arm"], marker, centre_mm
+        self.dt_s = world.config.dt_s
+        self.approach = round(config.approach_s / self.dt_s)
+        self.loop = round(config.loop_s / self.dt_s)
+        self.steps = self.approach + self.loop * config.loops
+        self._directions = directions
+        self._rest = self.arm.model.rest_mm.to(centre_mm)
+
+    def goal(self, stream: Stream) -> tuple[Stream, Round]:
+        stream, draw = stream.uniform(0.0, 1.0, 2)
+        if not self.config.any_start:
+            return stream, Round(torch.zeros_like(draw[:, 0]), torch.ones_like(draw[:, 0]))
+        return stream, Round(draw[:, 0], torch.where(draw[:, 1] < 0.5, 1.0, -1.0))
+
+    def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
+        """(B, 3) mm, world frame: where the point should be `ahead` steps from now."""
+        walked = (state.world.steps + ahead - self.approach).clamp(min=0).float() / self.loop
+        share = state.goal.start + state.goal.way * walked
+        flat = self.config.size_mm * PATHS[self.config.path](share)
+        return self.centre + torch.nn.functional.pad(flat, (0, 1))
+
+    def error_mm(self, state: TaskState) -> Tensor:
+        """(B,) mm: distance of the true point from its target."""
+        point = self.marker(state.world.arms["arm"].points_mm)
+        return (point - self.target_mm(state)).norm(dim=1)
+
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
+        return replace(state, world=self.world.step(state.world, actions, in_place=in_place))
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """Body, errors now and ahead, commands and pressures, direction of change, time.
+
+        Errors in mm through asinh: as they are within 1 mm, by their logarithm beyond.
+        """
+        part = state.world.arms["arm"]
+        point = self.marker(part.seen_mm)
+        errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
+        half = 0.5 * (self.arm.high - self.arm.low)
+        parts = [
+            (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+            *(error.asinh() for error in errors),
+            (part.command - self.arm.low) / half - 1.0,
+            (part.seen_kPa - self.arm.low) / half - 1.0,
+            part.arm.direction,
+            2.0 * state.world.steps[:, None] / self.steps - 1.0,
+        ]
+        return {"arm": torch.cat(parts, 1)}
+
+    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
+        """track: exp(-e), e in mm (Chen et al. 2025, sec. IV-A); fine: the same, finer scale."""
+        error, config = self.error_mm(state), self.config
+        terms = {"track": (-error).exp()}
+        if config.fine_weight:
+            terms["fine"] = config.fine_weight * (-error / config.fine_mm).exp()
+        return {"arm": terms}
+
+    def ended(self, state: TaskState) -> Tensor:
+        return torch.zeros_like(state.world.failed)
+
+    def measures(self, state: TaskState) -> dict[str, Tensor]:
+        """The error on the path; nan while the target waits."""
+        return {
+            "error_mm": self.error_mm(state).masked_fill(
+                state.world.steps <= self.approach, float("nan")
+            )
+        }
+
+    def script(self, state: TaskState) -> dict[str, Tensor]:
+        """Damped least squares for the pressures that put the point on the next target.
+
+        The direction of change makes the arm jump where a chamber turns round, so where the solver
+        is stuck it tries again from pressures that turn all chambers one way or the other.
+        """
+        with torch.inference_mode(False):
+            part = tree_map(torch.clone, state.world.arms["arm"])
+            target = self.target_mm(tree_map(torch.clone, state), 1)
+            best, error = self._solved(part, target, 0.0)
+            stuck = (error > STUCK_MM).nonzero()[:, 0]
+            for offset in OFFSETS_KPA if len(stuck) else ():
+                tried, missed = self._solved(rows(part, stuck), target[stuck], offset)
+                better = missed < error[stuck]
+                best = best.index_copy(0, stuck, tried.where(better[:, None], best[stuck]))
+                error = error.index_copy(0, stuck, missed.where(better, error[stuck]))
+            return {"arm": self.arm.action_for(part, best, self.dt_s)}
+
+    def _solved(self, part: ArmPart, target: Tensor, offset: float) -> tuple[Tensor, Tensor]:
+        """Pressures (B, m) kPa for targets (B, 3) mm, sought from `offset` kPa off, and errors."""
+        low, high = self.arm.within_reach(part, self.dt_s)
+
+        def residual(pressure: Tensor) -> Tensor:
+            points = self.arm.foresee(part, pressure, self.dt_s)
+            return (self.marker(points) - target)[:, : self._directions]
+
+        pressure = least_squares(residual, part.pressure + offset, low, high)
+        return pressure, residual(pressure).norm(dim=1)

@@ -1,0 +1,73 @@
+"""Random numbers of many environments: each has its own stream, whatever stands beside it.
+
+A stream is a key and a count; its numbers are a hash of both. Nothing is drawn in turns from a
+shared generator, so that a batch of N is N batches of one, on any device, and a state that is
+saved takes its random numbers along.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_GAMMA = -0x61C8864680B583EB
+_MIX_1 = -0x40A7B892E31B1A47
+_MIX_2 = -0x6B2FB644ECCEEE15
+"""The constants of SplitMix64 as signed integers (Steele, Lea & Flood 2014, fig. 17)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """A batch of streams."""
+
+    key: Tensor
+    """(B,) int64: which stream."""
+    count: Tensor
+    """(B,) int64: numbers drawn so far."""
+
+    def uniform(self, low: float, high: float, *shape: int) -> "tuple[Stream, Tensor]":
+        """The streams further on, and (B, *shape) float32 numbers even in [low, high)."""
+        size = math.prod(shape)
+        place = self.count[:, None] + torch.arange(1, size + 1, device=self.key.device)
+        bits = _mix(self.key[:, None] + _GAMMA * place)
+        share = _shifted(bits, 40).to(torch.float32) * 2.0**-24
+        values = low + (high - low) * share.reshape(len(self.key), *shape)
+        return Stream(self.key, self.count + size), values
+
+    def normal(self, *shape: int) -> "tuple[Stream, Tensor]":
+        """The streams further on, and (B, *shape) float32 standard normals (Box & Muller 1958)."""
+        after, draws = self.uniform(0.0, 1.0, 2, *shape)
+        radius = (-2.0 * (1.0 - draws[:, 0]).log()).sqrt()
+        return after, radius * (2.0 * math.pi * draws[:, 1]).cos()
+
+
+def streams(seed: int, count: int, first: int = 0, device: str | torch.device = "cpu") -> Stream:
+    """Streams `first` to `first + count - 1` of a seed."""
+    place = torch.arange(first, first + count, dtype=torch.int64, device=device)
+    root = _mix(torch.tensor([_wrapped(seed)], dtype=torch.int64, device=device))
+    return Stream(_mix(root + _GAMMA * (place + 1)), torch.zeros_like(place))
+
+
+def joined(parts: Sequence[Stream]) -> Stream:
+    """The streams of all parts, one after the other."""
+    key, count = torch.cat([p.key for p in parts]), torch.cat([p.count for p in parts])
+    return Stream(key, count)
+
+
+def _wrapped(seed: int) -> int:
+    """A whole number of any size as a signed one of 64 bits."""
+    return (seed + 2**63) % 2**64 - 2**63
+
+
+def _mix(z: Tensor) -> Tensor:
+    """The finaliser of SplitMix64 (Steele, Lea & Flood 2014, fig. 17) on int64 that wrap."""
+    z = (z ^ _shifted(z, 30)) * _MIX_1
+    z = (z ^ _shifted(z, 27)) * _MIX_2
+    return z ^ _shifted(z, 31)
+
+
+def _shifted(z: Tensor, bits: int) -> Tensor:
+    """Shift to the right that fills with zeros."""
+    return (z >> bits) & ((1 << (64 - bits)) - 1)

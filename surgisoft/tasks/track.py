@@ -1,0 +1,63 @@
+"""The tip of one arm follows a circle or a square (Chen et al. 2025, sec. V, simulation)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from surgisoft.tasks.follow import Follow, FollowConfig
+from surgisoft.tasks.streams import streams
+from surgisoft.tasks.world import World, WorldConfig, lone_arm
+from surgisoft.tasks.world_arm import Randomisation
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """A path for the tip, level above the base."""
+
+    follow: FollowConfig = field(default_factory=FollowConfig)
+    """The path and how it is walked."""
+    mean_kPa: float = 20.0
+    """Pressure of all chambers with which the tip is at the path's middle, kPa."""
+    world: WorldConfig = field(default_factory=WorldConfig)
+    """The world and its randomisation."""
+
+
+def track_circle(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
+    """A circle of 20 mm diameter."""
+    return _track("track_circle", config or TrackConfig(), device)
+
+
+def track_square(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
+    """A square of 15 mm edge."""
+    square = TrackConfig(FollowConfig(path="square", size_mm=15.0))
+    return _track("track_square", config or square, device)
+
+
+def tip(points_mm: Tensor) -> Tensor:
+    """(B, 3) mm: the last of the key points (B, n, 3) mm."""
+    return points_mm[:, -1]
+
+
+def _track(name: str, config: TrackConfig, device) -> Follow:
+    world = level_world(config.world, config.mean_kPa, device)
+    centre = tip(points_at_start(world))[0]
+    return Follow(name, world, config.follow, tip, centre, directions=3)
+
+
+def level_world(config: WorldConfig, mean_kPa: float, device) -> World:
+    """The default arm alone, with mean_kPa in every chamber at the start."""
+    chambers = lone_arm(config, device=device).arms["arm"].chambers
+    return lone_arm(config, start_kPa=(mean_kPa,) * chambers, device=device)
+
+
+def points_at_start(world: World) -> Tensor:
+    """(1, n, 3) mm: key points of the world's only arm at the start, with nothing randomised."""
+    plain = Randomisation(history=0, start_kPa=0.0)
+    arm = world.arms["arm"]
+    config = replace(world.config, randomisation=plain)
+    start = tuple(arm.first.tolist())
+    still = lone_arm(config, arm.model, start, world.device)
+    return still.start(streams(0, 1, device=world.device)).arms["arm"].points_mm

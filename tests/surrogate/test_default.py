@@ -1,0 +1,35 @@
+"""The arm that ships, against the virtual rig that it was fitted to."""
+
+import json
+from importlib.resources import files
+
+import numpy as np
+import torch
+
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.default import default_arm
+
+
+def test_it_tells_a_walk_on_the_rig_that_it_has_never_seen():
+    """Root mean square over 80 settled points and all key points; one point moves by 30 mm."""
+    rig = VirtualRig(0)
+    recording, _ = rig.record(make_protocol("walk", rig.limits, 80, seed=5))
+    model = default_arm()
+    history = history_of([recording], model.spec.actuation)
+    with torch.no_grad():
+        predicted = model.predict(history)[history.valid]
+    measured = history.key_points[history.valid]
+    error = (predicted - measured).square().sum(-1).mean().sqrt().item()
+    moved = np.ptp(measured[:, -1].numpy(), axis=0).max()
+    assert moved > 10.0
+    assert error < 0.4
+
+
+def test_its_folder_says_how_well_it_was_validated():
+    folder = files("surgisoft") / "assets" / "default_arm"
+    report = json.loads((folder / "report.json").read_text())
+    kept = [stage["valid_rmse_mm"] for stage in report["stages"] if stage["kept"]]
+    assert default_arm().validation["rmse_mm"] == kept[-1] < 0.2
+    assert "surgisoft fit" in (folder / "SOURCE.md").read_text()

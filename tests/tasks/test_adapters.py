@@ -1,0 +1,154 @@
+"""PettingZoo's and Gymnasium's own checkers, and what they do not check."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+import surgisoft
+from surgisoft.errors import InputError
+from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.parallel import parallel_env
+from surgisoft.tasks.registry import TASKS
+from surgisoft.tasks.single import ONE_ARM, BatchedEnv, SingleEnv
+from surgisoft.tasks.track import TrackConfig
+
+SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
+every_task = pytest.mark.parametrize("name", TASKS)
+one_arm = pytest.mark.parametrize("name", ONE_ARM)
+
+
+@every_task
+def test_pettingzoo_api(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(parallel_env(name), num_cycles=300)
+
+
+@every_task
+def test_pettingzoo_seeds(name):
+    parallel_seed_test(lambda: parallel_env(name), num_cycles=50)
+
+
+@every_task
+def test_pettingzoo_runs_alike_for_many_steps(name):
+    """The library's own seed test stops after one step."""
+
+    def run():
+        env = surgisoft.parallel_env(name)
+        rng, heard = np.random.default_rng(0), []
+        for seed in (7, None):
+            env.reset(seed=seed)
+            for _ in range(60):
+                shapes = {agent: env.action_space(agent).shape for agent in env.agents}
+                actions = {a: rng.uniform(-3, 3, s).astype("f4") for a, s in shapes.items()}
+                seen, rewards, *_, infos = env.step(actions)
+                heard.append((*seen.values(), *rewards.values(), str(infos)))
+            heard.append((env.state(),))
+        return heard
+
+    for one, other in zip(run(), run(), strict=True):
+        for a, b in zip(one, other, strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_agents_leave_when_the_time_is_out():
+    env = parallel_env("track_circle", config=SHORT)
+    env.reset(seed=0)
+    still = {"arm": np.zeros(3, np.float32)}
+    for _ in range(14):
+        *_, truncated, _ = env.step(still)
+        assert truncated == {"arm": False}
+        assert env.agents == ["arm"]
+    *_, truncated, _ = env.step(still)
+    assert truncated == {"arm": True}
+    assert env.agents == []
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    env.reset()
+    assert env.agents == ["arm"]
+
+
+def test_a_reset_without_a_seed_is_another_episode():
+    env = parallel_env("track_circle")
+    first, _ = env.reset(seed=0)
+    second, _ = env.reset()
+    again, _ = env.reset(seed=0)
+    assert np.array_equal(first["arm"], again["arm"])
+    assert not np.array_equal(first["arm"], second["arm"])
+    one, _ = parallel_env("track_circle").reset()
+    other, _ = parallel_env("track_circle").reset()
+    assert not np.array_equal(one["arm"], other["arm"])
+
+
+@one_arm
+def test_gymnasium_checker(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # The checker would rather have actions in -1..1; ours are in kPa.
+        warnings.filterwarnings("ignore", message=".*symmetric and normalized.*")
+        check_env(gymnasium.make(f"surgisoft/{name}-v0").unwrapped, skip_render_check=True)
+
+
+@one_arm
+def test_the_batched_environments_are_the_single_ones(name):
+    """Environment i of a batch with seed s is the single one with seed s + i."""
+    many = gymnasium.make_vec(f"surgisoft/{name}-v0", num_envs=3)
+    assert isinstance(many.unwrapped, BatchedEnv)
+    singles = [gymnasium.make(f"surgisoft.tasks.single:surgisoft/{name}-v0") for _ in range(3)]
+    seen, _ = many.reset(seed=20)
+    for i, env in enumerate(singles):
+        np.testing.assert_allclose(env.reset(seed=20 + i)[0], seen[i], atol=1e-4)
+    rng = np.random.default_rng(1)
+    for _ in range(25):
+        actions = rng.uniform(-3, 3, (3, 3)).astype(np.float32)
+        seen, rewards, *_ = many.step(actions)
+        for i, env in enumerate(singles):
+            one, reward, *_ = env.step(actions[i])
+            np.testing.assert_allclose(one, seen[i], atol=2e-4)
+            assert reward == pytest.approx(rewards[i], rel=2e-3, abs=1e-5)
+
+
+def test_finished_environments_begin_anew_in_the_same_step():
+    many = BatchedEnv("track_circle", 4, SHORT)
+    many.reset(seed=0)
+    still = np.zeros((4, 3), np.float32)
+    for _ in range(14):
+        _, _, terminated, truncated, info = many.step(still)
+        assert not terminated.any()
+        assert not truncated.any()
+        assert "final_obs" not in info
+    seen, _, terminated, truncated, info = many.step(still)
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["_final_obs"].all()
+    assert (info["final_obs"][:, -1] == 1.0).all(), "time observed at the end"
+    assert (seen[:, -1] == -1.0).all(), "time observed at the beginning"
+
+
+def test_a_nan_action_ends_one_environment_only():
+    many = BatchedEnv("track_circle", 3)
+    many.reset(seed=0)
+    actions = np.zeros((3, 3), np.float32)
+    actions[1] = np.nan
+    seen, rewards, terminated, _, info = many.step(actions)
+    assert terminated.tolist() == [False, True, False]
+    assert np.isfinite(seen).all()
+    assert np.isfinite(rewards).all()
+    assert np.isfinite(info["final_obs"]).all()
+    assert not many.step(np.zeros((3, 3), np.float32))[2].any()
+
+
+def test_wrong_use_is_one_line():
+    env = parallel_env("track_circle")
+    with pytest.raises(InputError, match="step before reset"):
+        env.step({})
+    env.reset()
+    with pytest.raises(InputError, match="no action for arm"):
+        env.step({"laser": np.zeros(3)})
+    with pytest.raises(InputError, match=r"shape \(1, 2\), expected \(1, 3\)"):
+        env.step({"arm": np.zeros(2)})
+    with pytest.raises(InputError, match="step before reset"):
+        SingleEnv("track_circle").step(np.zeros(3))

@@ -1,0 +1,138 @@
+"""The two-arm task: the scripted solver cuts the ring; each part of the interlock holds."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.tree import rows
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """The same ring in a third of the time."""
+    return CircleAblation(CircleAblationConfig(cut_s=15.0))
+
+
+@pytest.fixture(scope="module")
+def cut(quick):
+    """States and outcomes of two scripted episodes to the end of both."""
+    episodes = Episodes(quick)
+    states, outcomes = [episodes.seeded(0, 2)], []
+    with torch.inference_mode():
+        over = torch.zeros(2, dtype=torch.bool)
+        while not over.all() and len(outcomes) < 300:
+            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
+            states.append(state)
+            outcomes.append(outcome)
+            over |= outcome.done
+    return states, outcomes
+
+
+def test_the_script_cuts_the_whole_ring(cut):
+    _, outcomes = cut
+    done = torch.stack([outcome.terminated for outcome in outcomes])
+    ends = done.int().argmax(0)
+    assert done.any(0).all(), "ends by itself, before the time is out"
+    for i, end in enumerate(ends.tolist()):
+        last = {name: value[i].item() for name, value in outcomes[end].measures.items()}
+        assert last["success"] == 1.0
+        assert last["largest_gap_mm"] == 0.0
+        errors = torch.stack([o.measures["beam_error_mm"][i] for o in outcomes[: end + 1]])
+        assert errors.nanmean() < 0.05
+        assert min(o.measures["clearance_mm"][i] for o in outcomes[: end + 1]) > 1.0
+
+
+def test_the_dose_lies_on_the_ring(quick, cut):
+    """Distance of the cut samples from the ring's circle, on the dose map itself."""
+    states, _ = cut
+    ablation = quick.surroundings.ablation
+    deep = states[-1].world.scenery.dose.dose[0].numpy() >= ablation.cut_dose
+    offset = np.abs(ablation.patch.offset_mm[deep])
+    assert deep.sum() > 100
+    assert np.quantile(offset, 0.99) < 0.6
+    energy = states[-1].world.scenery.dose.delivered_j
+    fired = torch.stack([state.goal.fired for state in states[1:]]).sum(0)
+    assert (energy <= 20.0 * 0.1 * fired + 1e-3).all()
+    assert (energy >= 20.0 * 0.1 * (fired - 1)).all()
+
+
+def test_the_beam_waits_until_the_ring_is_seen(cut):
+    states, _ = cut
+    for before, after in pairwise(states):
+        seen = before.world.scenery.view.fraction >= 0.95
+        assert (after.goal.fired <= seen).all()
+        assert torch.equal(after.goal.walked, before.goal.walked + after.goal.fired)
+    assert not states[1].goal.fired.any(), "at rest the endoscope looks elsewhere"
+    assert states[60].goal.fired.all()
+
+
+@pytest.mark.parametrize("what", ["view", "aim", "blocked"])
+def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
+    """A state in which the beam fires, changed in one respect."""
+    state = rows(cut[0][80], torch.tensor([0]))
+    still = {name: torch.zeros(1, 3) for name in quick.agents}
+    assert quick.advance(state, still, False).goal.fired.all()
+    scenery, goal = state.world.scenery, state.goal
+    if what == "view":
+        low = replace(scenery.view, fraction=torch.tensor([0.94]))
+        scenery = replace(scenery, view=low)
+    elif what == "blocked":
+        scenery = replace(scenery, hit=replace(scenery.hit, struck=torch.tensor([4])))
+    else:
+        goal = replace(goal, walked=goal.walked + 3)
+    changed = replace(state, goal=goal, world=replace(state.world, scenery=scenery))
+    after = quick.advance(changed, still, False)
+    assert not after.goal.fired.any()
+    assert torch.equal(after.goal.walked, goal.walked)
+
+
+def test_the_target_runs_along_the_scenes_ring(quick):
+    """Against a closed polygon walked in numpy, both ways round and over the seam."""
+    goal = rows(Episodes(quick).seeded(3, 1).goal, torch.tensor([0]))
+    path = quick.surroundings.path_mm.double().numpy()
+    closed = np.vstack((path, path[:1]))
+    for way in (1.0, -1.0):
+        for walked in (0, 1, 37, 149):
+            cut = replace(goal, walked=torch.tensor([walked]), way=torch.tensor([way]))
+            share = (goal.start.item() + way * walked / 150) % 1.0
+            expected = [np.interp(share * 360, np.arange(361), axis) for axis in closed.T]
+            np.testing.assert_allclose(quick.target_mm(cut)[0], expected, atol=2e-3)
+
+
+def test_the_miss_is_the_distance_from_the_axis(quick):
+    aim = quick.aims["laser"]
+    points = Episodes(quick).seeded(0, 1).world.arms["laser"].points_mm
+    tip, along = points[:, -1], aim.arm.backbone.tip_direction(points)
+    side = torch.linalg.cross(along, torch.tensor([[0.0, 0.0, 1.0]]))
+    side = side / side.norm()
+    miss = aim.miss(points, tip + 30.0 * along + 2.5 * side)
+    torch.testing.assert_close(miss, 2.5 * side, rtol=0, atol=1e-4)
+    behind = aim.miss(points, tip - 3.0 * along + 4.0 * side)
+    assert behind.norm().item() == pytest.approx(5.0, abs=1e-4)
+
+
+def test_a_collision_ends_the_episode_and_is_no_success(quick):
+    state = Episodes(quick).seeded(0, 2)
+    scenery = state.world.scenery
+    bodies = scenery.clearance.bodies_mm.clone()
+    bodies[1, 0, 0] = -0.5
+    hit = replace(scenery, clearance=replace(scenery.clearance, bodies_mm=bodies))
+    state = replace(state, world=replace(state.world, scenery=hit))
+    assert quick.ended(state).tolist() == [False, True]
+    assert quick.measures(state)["success"].tolist() == [0.0, 0.0]
+    for terms in quick.rewards(state).values():
+        assert terms["contact"].tolist() == [0.0, -1.0]
+
+
+def test_bad_config_is_one_line():
+    with pytest.raises(InputError, match="cut_s is nan"):
+        CircleAblationConfig(cut_s=math.nan)
+    with pytest.raises(InputError, match="there is no such scene"):
+        CircleAblation(CircleAblationConfig(scene="no/such/scene"))

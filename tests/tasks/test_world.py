@@ -1,0 +1,292 @@
+"""The batched core: numbers by hand, a batch of N against N of one, resets, what goes wrong."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.collision import Referee
+from surgisoft.scene.folder import open_scene
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.network import HawNN
+from surgisoft.tasks.pneumatics import Pneumatics
+from surgisoft.tasks.streams import streams
+from surgisoft.tasks.tree import rows, tree_map
+from surgisoft.tasks.world import Mounted, World, WorldConfig, lone_arm, scene_world
+from surgisoft.tasks.world_arm import Randomisation
+
+STILL = Randomisation(history=0, start_kPa=0.0)
+LIVELY = Randomisation(
+    history=2, start_kPa=5.0, mount_mm=1.0, mount_rad=0.02, gain=0.05, noise_mm=0.1, noise_kPa=0.1,
+    delay=2,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def phantom():
+    return open_scene(Path(__file__).resolve().parents[2] / "scenes" / "phantom_liver")
+
+
+@pytest.fixture(scope="module")
+def theatre(phantom):
+    return scene_world(phantom, WorldConfig(randomisation=LIVELY))
+
+
+def actions_of(world, count, steps, seed=0):
+    """Random actions, each step a mapping of (count, m) kPa; some beyond the pumps' limits."""
+    rng = torch.Generator().manual_seed(seed)
+    size = {name: (count, arm.chambers) for name, arm in world.arms.items()}
+    return [
+        {name: 3.0 * torch.randn(shape, generator=rng) for name, shape in size.items()}
+        for _ in range(steps)
+    ]
+
+
+def leaves(tree):
+    found = []
+    tree_map(lambda value: found.append(value) or value, tree)
+    return found
+
+
+def assert_close(one, other):
+    for a, b in zip(leaves(one), leaves(other), strict=True):
+        assert a.dtype == b.dtype
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=2e-4, equal_nan=True)
+
+
+def test_pressure_by_hand():
+    """Commands +3 (clipped from 5) and -1 kPa from 20 kPa; tau = 0.2 s, dt = 0.1 s."""
+    world = lone_arm(WorldConfig(randomisation=STILL), start_kPa=(20.0, 20.0, 20.0))
+    state = world.start(streams(0, 1))
+    state = world.step(state, {"arm": torch.tensor([[5.0, -1.0, 0.0]])})
+    share = 1.0 - math.exp(-0.5)
+    arm = state.arms["arm"]
+    assert arm.command[0].tolist() == [23.0, 19.0, 20.0]
+    expected = [20.0 + 3.0 * share, 20.0 - share, 20.0]
+    assert arm.pressure[0].tolist() == pytest.approx(expected, abs=1e-5)
+    state = world.step(state, {"arm": torch.zeros(1, 3)})
+    share = 1.0 - math.exp(-1.0)
+    expected = [20.0 + 3.0 * share, 20.0 - share, 20.0]
+    assert state.arms["arm"].pressure[0].tolist() == pytest.approx(expected, abs=1e-5)
+    assert state.steps.tolist() == [2]
+
+
+def test_pressure_stays_within_the_arms_limits():
+    world = lone_arm(WorldConfig(randomisation=STILL))
+    state = world.start(streams(0, 2))
+    for _ in range(40):
+        state = world.step(state, {"arm": torch.tensor([[3.0] * 3, [-3.0] * 3])})
+    spec = default_arm().spec
+    assert state.arms["arm"].command[0].tolist() == pytest.approx(spec.high)
+    assert state.arms["arm"].command[1].tolist() == pytest.approx(spec.low)
+    assert state.arms["arm"].pressure[0].tolist() == pytest.approx(spec.high, abs=1e-3)
+
+
+def test_the_body_is_the_models_body():
+    """The same pressures given to the arm model alone, moved to the world by hand."""
+    model, turn = default_arm(), math.radians(90.0)
+    pose = frames.pose_from(frames.rotation_from_axis_angle([1.0, 0, 0], turn), [10.0, 20.0, 30.0])
+    mounted = Mounted(model, torch.tensor(pose), (10.0, 0.0, 5.0), shaft_mm=50.0)
+    world = World(
+        {"arm": mounted}, WorldConfig(randomisation=STILL, pneumatics=Pneumatics(tau_s=0))
+    )
+    state = world.start(streams(0, 1))
+    alone = model.initial_state(1)
+    alone, _ = model.step(alone, torch.tensor([[10.0, 0.0, 5.0]]), 1.0)
+    for change in ([1.0, 2.0, -2.0], [-2.0, 2.0, 0.5]):
+        state = world.step(state, {"arm": torch.tensor([change])})
+        alone, points = model.step(alone, torch.tensor([change]), 0.1)
+    x, y, z = points[0].T
+    by_hand = torch.stack((x + 10.0, -z + 20.0, y + 30.0), 1)
+    arm = state.arms["arm"]
+    torch.testing.assert_close(arm.points_mm[0], by_hand, rtol=0, atol=1e-4)
+    torch.testing.assert_close(arm.line_mm[0, 0], torch.tensor([10.0, 70.0, 30.0]))
+    torch.testing.assert_close(arm.line_mm[0, -1], by_hand[-1], rtol=0, atol=1e-4)
+    aim = model.backbone().tip_direction(points)[0]
+    by_hand = torch.stack((aim[0], -aim[2], aim[1]))
+    torch.testing.assert_close(arm.tip_direction[0], by_hand, rtol=0, atol=1e-5)
+
+
+def test_late_actions_come_late():
+    vary = replace(STILL, delay=3)
+    world = lone_arm(WorldConfig(randomisation=vary, pneumatics=Pneumatics(tau_s=0.0)))
+    state = world.start(streams(1, 64))
+    delay = state.arms["arm"].delay
+    assert sorted(delay.unique().tolist()) == [0, 1, 2, 3]
+    seen = []
+    for change in (1.0, 0.0, 0.0, 0.0):
+        state = world.step(state, {"arm": torch.full((64, 3), change)})
+        seen.append(state.arms["arm"].pressure[:, 0])
+    expected = [(delay <= step).float() for step in range(4)]
+    torch.testing.assert_close(torch.stack(seen), torch.stack(expected))
+
+
+def test_a_batch_of_n_is_n_batches_of_one(theatre):
+    """Two arms, all randomisation on, the laser cutting; the streams are bit for bit the same."""
+    count, steps = 5, 12
+    actions = actions_of(theatre, count, steps)
+    together = theatre.start(streams(4, count))
+    for action in actions:
+        together = theatre.step(together, action, 20.0)
+    for i in range(count):
+        alone = theatre.start(streams(4, 1, first=i))
+        for action in actions:
+            alone = theatre.step(alone, {name: a[i : i + 1] for name, a in action.items()}, 20.0)
+        assert torch.equal(alone.stream.count[0], together.stream.count[i])
+        assert_close(alone, rows(together, torch.tensor([i])))
+
+
+def test_geometry_is_the_referees(theatre, phantom):
+    state = theatre.start(streams(7, 6))
+    for action in actions_of(theatre, 6, 10, seed=2):
+        state = theatre.step(state, action)
+    referee, scenery = Referee(phantom.bodies), state.scenery
+    for i in range(6):
+        shapes = {name: ArmShape(part.line_mm[i].numpy(), 7.5) for name, part in state.arms.items()}
+        least = referee.clearance(shapes).least_mm
+        assert scenery.clearance.least_mm[i].item() == pytest.approx(least, abs=0.3)
+        laser = state.arms["laser"]
+        hit = referee.cast(
+            laser.tip_mm[i].numpy(), laser.tip_direction[i].numpy(), 110.0, shapes, own="laser"
+        )
+        assert int(hit.struck) == scenery.hit.struck[i].item()
+        np.testing.assert_allclose(hit.point_mm, scenery.hit.point_mm[i].numpy(), atol=1e-3)
+
+
+def test_the_accelerators_engine_gives_the_same_world(theatre, phantom):
+    """The torch engine, here on the CPU, beside the compiled one."""
+    other = scene_world(phantom, theatre.config, engine="torch")
+    one, two = theatre.start(streams(7, 3)), other.start(streams(7, 3))
+    for action in actions_of(theatre, 3, 4, seed=2):
+        one, two = theatre.step(one, action, 20.0), other.step(two, action, 20.0)
+    for name in ("least_mm", "self_mm"):
+        a, b = (getattr(state.scenery.clearance, name) for state in (one, two))
+        torch.testing.assert_close(a, b, rtol=0, atol=0.3)
+    assert torch.equal(one.scenery.hit.struck, two.scenery.hit.struck)
+    torch.testing.assert_close(
+        one.scenery.hit.point_mm, two.scenery.hit.point_mm, rtol=0, atol=1e-3
+    )
+    assert torch.equal(one.scenery.view.visible, two.scenery.view.visible)
+
+
+def test_energy_on_the_organ_is_power_times_time(theatre):
+    """At both ends of a step on the organ: all of the step's energy; at one end: half of it."""
+    state = theatre.start(streams(11, 16))
+    expected, organ = torch.zeros(16), theatre.surroundings.organ
+    on = state.scenery.hit.on_organ & (state.scenery.hit.body == organ)
+    for action in actions_of(theatre, 16, 15, seed=5):
+        state = theatre.step(state, action, 8.0)
+        now = state.scenery.hit.on_organ & (state.scenery.hit.body == organ)
+        expected += 8.0 * 0.1 * 0.5 * (on.float() + now.float())
+        on = now
+    assert expected.max() > 1.0
+    torch.testing.assert_close(state.scenery.dose.delivered_j, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_masked_reset_leaves_the_others_alone(theatre, in_place):
+    actions = actions_of(theatre, 4, 6, seed=3)
+    state = theatre.start(streams(2, 4))
+    for action in actions:
+        state = theatre.step(state, action, 20.0)
+    before = tree_map(torch.clone, state)
+    mask = torch.tensor([False, True, False, True])
+    after = theatre.reset(state, mask, in_place)
+    kept, fresh = torch.tensor([0, 2]), torch.tensor([1, 3])
+    for a, b in zip(leaves(rows(after, kept)), leaves(rows(before, kept)), strict=True):
+        assert torch.equal(a.nan_to_num(), b.nan_to_num())
+    if not in_place:
+        for a, b in zip(leaves(state), leaves(before), strict=True):
+            assert torch.equal(a, b), "a reset changed the state it was given"
+    assert after.steps.tolist() == [6, 0, 6, 0]
+    assert after.scenery.dose.dose[fresh].abs().max() == 0.0
+    again = theatre.start(rows(before.stream, fresh))
+    assert_close(rows(after, fresh), again)
+    first = theatre.start(streams(2, 4))
+    assert not torch.equal(first.arms["laser"].pressure[1], after.arms["laser"].pressure[1])
+
+
+@pytest.mark.parametrize("name", ["laser", "endoscope"])
+def test_a_diverged_environment_poisons_nobody(theatre, name):
+    actions = actions_of(theatre, 5, 8, seed=6)
+    good = bad = theatre.start(streams(3, 5))
+    for i, action in enumerate(actions):
+        good = theatre.step(good, action, 20.0)
+        if i == 2:
+            spoilt = action[name].clone()
+            spoilt[3, 1] = math.nan
+            action = {**action, name: spoilt}
+        bad = theatre.step(bad, action, 20.0)
+    assert bad.failed.tolist() == [False, False, False, True, False]
+    others = torch.tensor([0, 1, 2, 4])
+    for a, b in zip(leaves(rows(bad, others)), leaves(rows(good, others)), strict=True):
+        assert torch.equal(a, b)
+    healed = theatre.reset(bad, bad.failed)
+    assert not healed.failed.any()
+    for value in leaves(healed):
+        assert value.isfinite().all()
+
+
+def test_the_same_seed_gives_the_same_run(theatre):
+    def run(seed):
+        state = theatre.start(streams(seed, 3))
+        for i, action in enumerate(actions_of(theatre, 3, 9)):
+            state = theatre.step(state, action, 20.0)
+            if i == 4:
+                state = theatre.reset(state, torch.tensor([True, False, True]))
+        return state
+
+    for a, b in zip(leaves(run(5)), leaves(run(5)), strict=True):
+        assert torch.equal(a, b)
+    assert not torch.equal(run(5).arms["laser"].points_mm, run(6).arms["laser"].points_mm)
+
+
+def test_states_cross_the_border_of_inference_mode(theatre):
+    """Stepped and reset inside, then outside, with and without giving up the dose."""
+    action = actions_of(theatre, 2, 1)[0]
+    with torch.inference_mode():
+        state = theatre.start(streams(0, 2))
+        state = theatre.step(state, action, 20.0, in_place=True)
+        state = theatre.reset(state, torch.tensor([True, False]), in_place=True)
+    state = theatre.step(state, action, 20.0, in_place=True)
+    state = theatre.reset(state, torch.tensor([False, True]), in_place=True)
+    assert state.steps.tolist() == [1, 0]
+
+
+def test_dose_in_place_is_the_dose(theatre):
+    plain = given = theatre.start(streams(8, 4))
+    for action in actions_of(theatre, 4, 6):
+        plain = theatre.step(plain, action, 20.0)
+        given = theatre.step(given, action, 20.0, in_place=True)
+    assert torch.equal(plain.scenery.dose.dose, given.scenery.dose.dose)
+
+
+def test_an_arm_that_is_not_driven_in_kpa_is_refused():
+    spec = ArmSpec(1, 2, (0.0,), (90.0,), unit="deg")
+    network = HawNN(torch.tensor([0.0]), torch.tensor([90.0]), 2, (4,))
+    with pytest.raises(InputError, match="driven in deg, expected a model in kPa"):
+        World({"arm": Mounted(ArmModel(spec, network), torch.eye(4))})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: WorldConfig(dt_s=0.0), "dt_s is 0.0"),
+        (lambda: WorldConfig(samples=1), "samples is 1"),
+        (lambda: Pneumatics(step_kPa=-1.0), "step_kPa is -1.0"),
+        (lambda: Pneumatics(tau_s=math.nan), "tau_s is nan"),
+        (lambda: Randomisation(noise_mm=-0.1), "noise_mm is -0.1"),
+        (lambda: lone_arm(start_kPa=(1.0,)), "1 pressures to start with, expected 3"),
+    ],
+)
+def test_bad_numbers_are_one_line(make, message):
+    with pytest.raises(InputError, match=message):
+        make()

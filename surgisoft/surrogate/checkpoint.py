@@ -22,6 +22,9 @@ from surgisoft.surrogate.recurrent import RecurrentArm
 FORMAT = 1
 """Version of the folder's layout."""
 
+OWN_FILES = ("config.json", "weights.safetensors", "report.json")
+"""What a model's folder is made of; a replaced model leaves other files where they are."""
+
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
@@ -71,6 +74,10 @@ def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, 
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
         fresh.chmod(0o755)
         if folder.exists():
+            for kept in folder.iterdir():
+                if kept.name not in OWN_FILES:
+                    copy = shutil.copytree if kept.is_dir() else shutil.copy2
+                    copy(kept, fresh / kept.name)
             old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
             os.replace(folder, old / "old")
             os.replace(fresh, folder)

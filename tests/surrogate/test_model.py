@@ -138,6 +138,9 @@ def test_saving_never_half_writes_nor_overwrites(tmp_path):
         save_model(arm, tmp_path / "arm", report={"bad": object()}, force=True)
     assert (tmp_path / "arm" / "weights.safetensors").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+    (tmp_path / "arm" / "NOTES.md").write_text("mine")
+    save_model(arm, tmp_path / "arm", force=True)
+    assert (tmp_path / "arm" / "NOTES.md").read_text() == "mine"
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("keep me")
     with pytest.raises(InputError, match="no model"):

@@ -33,6 +33,8 @@ from surgisoft.scene.spec import (
 
 FAR_OFF = 20.0
 """A mesh whose middle lies this many times its size from the origin is moved there."""
+SAID_FROM_MM = 1.0
+"""A lesion that is moved farther than this onto the surface is told so (mm)."""
 COARSE_RING = 36
 """Ring points while mounts are searched."""
 
@@ -206,7 +208,10 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     operable = [m for m, role in zip(meshes, prepared.roles, strict=True) if role != "support"]
     if request.lesion is not None:
         point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
-        return [pointed_site(operable, point, request.diameter_mm)]
+        said = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
+        if prepared.mm_per_unit != 1.0 or prepared.shift_mm.any():
+            said += f" (in the scene {', '.join(f'{x:.4g}' for x in point)} mm)"
+        return [pointed_site(operable, point, request.diameter_mm, said)]
     if request.lesion_direction is not None:
         return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
     return good_sites(meshes, request.diameter_mm)
@@ -252,7 +257,7 @@ def author(
             scene = _scene(request, prepared, site, bodies, pair, mounts, name)
             check = check_scene(scene, reaches)
             if check.good:
-                return Authored(scene, check, (*prepared.notes, *_chosen(scene, check)))
+                return Authored(scene, check, (*prepared.notes, *_chosen(scene, check, site)))
             lacks.append((check.work.covered if check.work else 0.0, sentence(check)))
         if lack is not None:
             lacks.append((lack.covered, lack.sentence))
@@ -308,10 +313,12 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
     return Scene(spec, Path(), bodies)
 
 
-def _chosen(scene: Scene, check: SceneCheck) -> list[str]:
+def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
+    moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"
     return [
+        *([moved] if site.moved_mm > SAID_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
         f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "

@@ -1,6 +1,6 @@
 """Where on an organ a lesion goes: where the user points, else the most open and even place."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,11 @@ OPEN_CONE_RAD = np.radians(60.0)
 SITES = 6
 """Places handed on for the search of mounts."""
 
+FAR_POINT_MM = 20.0
+"""A point farther than this from every surface is a slip, not a place on it (mm)..."""
+FAR_POINT = 0.1
+"""... unless it is within this share of the body's largest side."""
+
 
 @dataclass(frozen=True, eq=False)
 class Site:
@@ -28,15 +33,30 @@ class Site:
     """(3,) on the surface."""
     ring: Ring
     """The ring about it."""
+    moved_mm: float = 0.0
+    """How far it lies from the point that was pointed at (mm)."""
 
 
-def pointed_site(bodies: list[Mesh], point_mm: np.ndarray, diameter_mm: float) -> Site:
-    """The surface point nearest to `point_mm` (3,), on whichever body it lies."""
+def pointed_site(
+    bodies: list[Mesh], point_mm: np.ndarray, diameter_mm: float, said: str | None = None
+) -> Site:
+    """The surface point nearest to `point_mm` (3,), on whichever body it lies.
+
+    An InputError where none is near; `said` is the point as the user wrote it.
+    """
     nearest = [nearest_on_surface(mesh, point_mm[None]) for mesh in bodies]
     away = [float(np.linalg.norm(points[0] - point_mm)) for points, _ in nearest]
     body = int(np.argmin(away))
     points, faces = nearest[body]
-    return _with_ring(bodies, body, points[0], int(faces[0]), diameter_mm)
+    most = max(FAR_POINT_MM, FAR_POINT * float(np.ptp(bodies[body].bounds_mm, axis=0).max()))
+    if away[body] > most:
+        said = said or f"the point {tuple(point_mm.round(3).tolist())} mm"
+        raise InputError(
+            f"{said} lies {away[body]:.4g} mm from the nearest surface; expected at most "
+            f"{most:.4g} mm: give it in the first file's own frame and unit, or check --unit"
+        )
+    site = _with_ring(bodies, body, points[0], int(faces[0]), diameter_mm)
+    return replace(site, moved_mm=away[body])
 
 
 def directed_site(bodies: list[Mesh], direction: np.ndarray, diameter_mm: float) -> Site:

@@ -1,6 +1,7 @@
 """From mesh files to scenes: what comes out holds before the referee, what cannot be is said."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -168,17 +169,25 @@ def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):
     assert not (tmp_path / "scene").exists()
 
 
-def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path):
+def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path, capsys):
     write_ply(ball(60.0, 3), tmp_path / "ball.ply")
     write_ply(moved(box((200.0, 200.0, 10.0)), 0.0, 0.0, 72.0), tmp_path / "lid.ply")
     arguments = (tmp_path / "ball.ply", f"{tmp_path / 'lid.ply'}:support", "--lesion", 60, 0, -20)
     assert new(tmp_path / "scene", *arguments) == 0
+    # sqrt(60^2 + 20^2) - 60 = 3.246 mm outside the ball, whose facets lie up to 0.15 mm within
+    said = re.search(r"given lies (\S+) mm off the surface: moved", capsys.readouterr().out)
+    assert 3.2 < float(said[1]) < 3.5
     scene = open_scene(tmp_path / "scene")
     assert scene.spec.body("lid").role == "support"
     np.testing.assert_allclose(scene.spec.lesion.centre_mm, [56.9, 0.0, -19.0], atol=0.6)
 
 
 BAD = [
+    (("ball.ply", "--lesion", "0", "0", "81"), "--lesion 0 0 81 lies 21 mm from the nearest"),
+    (
+        ("ball.ply", "--unit", "cm", "--lesion", "0", "0", "81"),
+        "in the scene 0, 0, 810 mm) lies 210 mm",
+    ),
     (("nowhere.stl",), "there is no such file"),
     (("ball.ply", "--unit", "inch"), "unknown unit 'inch'"),
     (("ball.ply:knife",), "role 'knife'"),

@@ -32,6 +32,8 @@ PROBE_WIDTH_MM = 1e-3
 """Width of the sliver that stands for a ray; without width FCL misses one hit in six (mm)."""
 MOST_CONTACTS = 100_000
 """Upper limit of contacts asked of one FCL query; never reached by a ray or a capsule."""
+ROUNDING_MM = 1e-6
+"""Distances below this are rounding: FCL gives some cut surfaces a few 1e-15 instead of 0."""
 
 _HIT_COLUMNS = (
     (np.int8, ()),
@@ -249,7 +251,7 @@ class Referee:
 
     def _body_clearance(self, chain: _Chain, index: int) -> float:
         centre = _distance(chain.line(), self._objects[index])
-        for point in self._points_within(chain.shape.centreline_mm, index, centre > 0.0):
+        for point in self._points_within(chain.shape.centreline_mm, index, centre > ROUNDING_MM):
             ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
             centre = min(centre, -_distance(ball, self._objects[index]))
         return self._saturated(centre - chain.shape.radius_mm)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -41,6 +41,7 @@ coordinate = st.floats(-45, 45)
 point = st.tuples(coordinate, coordinate, coordinate)
 
 
+@example((-35.5854266720841, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0)
 @given(point, point, st.floats(0.5, 8.0))
 @settings(max_examples=60, deadline=None)
 def test_clearance_of_a_box_is_the_closed_form(start, end, radius):

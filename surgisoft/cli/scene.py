@@ -55,6 +55,8 @@ def new(
         with progress("scene new") as report:
             made = author(request, reaches, blank, _name(output), report)
     except NoMounts as error:
+        for note in error.notes:
+            print(note)
         print(f"No scene was written: {error}.")
         return 1
     write_scene(made.scene, output, force)

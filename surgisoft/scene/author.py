@@ -14,7 +14,15 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene, rounded_mount
 from surgisoft.scene.mesh import ROLES, Body, Mesh
-from surgisoft.scene.meshio import MM_PER_UNIT, Part, read_parts, recognise_unit, write_ply
+from surgisoft.scene.meshio import (
+    MM_PER_UNIT,
+    Part,
+    check_organ_size,
+    read_parts,
+    recognise_unit,
+    told_unit,
+    write_ply,
+)
 from surgisoft.scene.placement import Pair, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
@@ -98,6 +106,11 @@ class Authored:
 class NoMounts(InputError):
     """No pair of mounts exists for the lesion; the message says how close it came."""
 
+    def __init__(self, message: str, notes: tuple[str, ...] = ()):
+        """`notes` are what was recognised and repaired, which may be why."""
+        super().__init__(message)
+        self.notes = notes
+
 
 def prepare(request: Request) -> Prepared:
     """Read and repair every file; an InputError says why one cannot be used."""
@@ -118,12 +131,15 @@ def prepare(request: Request) -> Prepared:
         size = float(np.ptp(corners, axis=0).max())
         if size == 0.0:
             raise InputError(f"{path}: all vertices are one point; expected a surface")
-        unit, why = request.unit, "as told"
-        if unit is None:
+        if request.unit is None:
             guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
-            unit, why = guess.unit, guess.sentence
+            unit, told = guess.unit, guess.sentence
+        else:
+            unit, told = request.unit, told_unit(size, request.unit)
         scales.append(MM_PER_UNIT[unit])
-        notes.append(f"{path.name}: unit {why if request.unit is None else f'{unit}, {why}'}")
+        if role == "organ":
+            check_organ_size(path, size * scales[-1], told)
+        notes.append(f"{path.name}: unit {told}")
         found = _closed_bodies(path, parts, scales[-1], notes)
         for i, (name, mesh) in enumerate(sorted(found, key=lambda pair: -_area(pair[1]))):
             names.append(_free_name(name, names))
@@ -263,7 +279,7 @@ def author(
             lacks.append((lack.covered, lack.sentence))
     best = max(lacks, key=lambda lack: lack[0])[1]
     where = "the lesion" if len(sites) == 1 else f"any of {len(sites)} places for the lesion"
-    raise NoMounts(f"no mounts were found for {where}: {best}")
+    raise NoMounts(f"no mounts were found for {where}: {best}", prepared.notes)
 
 
 def _coarse(ring):
@@ -328,12 +344,17 @@ def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
 
 def check_target(folder: Path, force: bool) -> None:
     """Whether a scene may be written there; --force replaces a scene, nothing else."""
+    above = next(place for place in folder.absolute().parents if place.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
     if not folder.exists():
         return
     if not force:
         raise InputError(f"{folder}: exists already; choose another name or use --force")
     if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
         raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written, it is no writable folder")
 
 
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:

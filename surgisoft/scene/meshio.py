@@ -14,6 +14,8 @@ MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
 PLAUSIBLE_MM = (20.0, 600.0)
 """Largest side of an organ or of an organ phantom: from a gland to a whole abdomen (mm)."""
+ABSURD = 10.0
+"""Organs this many times smaller or larger than that are refused, others outside it told."""
 TYPICAL_MM = 180.0
 """Largest side of a liver (mm), Gray's Anatomy, 42nd ed., chapter 67: 15 to 20 cm across."""
 
@@ -160,6 +162,32 @@ def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
         f"{unit}, in doubt: no unit gives {size:.4g} an organ's size of {low:g} to {high:g} mm; "
         f"in {unit} it is {size * MM_PER_UNIT[unit]:.4g} mm (--unit says it)",
     )
+
+
+def told_unit(size: float, unit: str) -> str:
+    """What to say of a file whose largest side is `size` in the unit the user told.
+
+    A warning where that is not an organ's size, with the units that would give one.
+    """
+    (low, high), mm = PLAUSIBLE_MM, size * MM_PER_UNIT[unit]
+    if low <= mm <= high:
+        return f"{unit}, as told"
+    fits = [u for u, scale in MM_PER_UNIT.items() if low <= size * scale <= high]
+    advice = "".join(f"; in {u} it is {size * MM_PER_UNIT[u]:.4g} mm (--unit {u})" for u in fits)
+    return (
+        f"{unit}, as told, in doubt: {mm:.4g} mm across is not an organ's size of {low:g} to "
+        f"{high:g} mm{advice}"
+    )
+
+
+def check_organ_size(path: str | Path, size_mm: float, told: str) -> None:
+    """An InputError for an organ so far from any organ's size that its unit must be wrong."""
+    low, high = PLAUSIBLE_MM
+    if not low / ABSURD <= size_mm <= high * ABSURD:
+        raise InputError(
+            f"{path}: the organ would be {size_mm:.4g} mm across; expected {low:g} to {high:g} mm "
+            f"(unit {told})"
+        )
 
 
 def write_ply(mesh: Mesh, path: str | Path) -> None:

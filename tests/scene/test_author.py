@@ -1,6 +1,7 @@
 """From mesh files to scenes: what comes out holds before the referee, what cannot be is said."""
 
 import dataclasses
+import os
 import re
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from surgisoft.cli import run
 from surgisoft.cli.arms import reaches_of
 from surgisoft.errors import InputError
+from surgisoft.scene.author import check_target
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.check import REASONS, check_scene, held_arms, reach_patch, sentence
 from surgisoft.scene.collision import Referee
@@ -164,6 +166,7 @@ def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):
     arguments = (tmp_path / "ball.ply", tmp_path / "lid.ply", "--unit", "mm", "--lesion", 0, 0, 60)
     assert new(tmp_path / "scene", *arguments) == 1
     said = capsys.readouterr().out
+    assert "ball.ply: unit mm, as told\n" in said
     assert "No scene was written" in said
     assert "the best covers 0 %" in said
     assert not (tmp_path / "scene").exists()
@@ -190,6 +193,7 @@ BAD = [
     ),
     (("nowhere.stl",), "there is no such file"),
     (("ball.ply", "--unit", "inch"), "unknown unit 'inch'"),
+    (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; expected 20 to 600 mm"),
     (("ball.ply:knife",), "role 'knife'"),
     (("ball.ply:support",), "expected the organ first"),
     (("ball.ply", "--diameter", "0"), "--diameter is 0"),
@@ -258,3 +262,21 @@ def test_a_public_liver_becomes_a_scene(shared, tmp_path, capsys):
         assert new(tmp_path / name, shared / "meshes" / f"{name}.stl") == 0
         assert "unit mm" in capsys.readouterr().out
         assert run(["scene", "check", str(tmp_path / name)]) == 0
+
+
+def test_a_target_that_cannot_be_written_is_found_before_the_work(tmp_path, capsys):
+    """The mesh is missing as well: only the target is spoken of, so nothing was read."""
+    (tmp_path / "file").write_text("x")
+    assert new(tmp_path / "file" / "deep" / "scene", tmp_path / "nowhere.stl") == 2
+    error = capsys.readouterr().err
+    assert f"cannot be written, {tmp_path / 'file'} is no writable folder" in error
+    assert (tmp_path / "file").read_text() == "x"
+
+
+def test_a_folder_without_write_permission_is_found(tmp_path, monkeypatch):
+    """Asked of the system, as permission bits do not bind every user who runs this test."""
+    asked = []
+    monkeypatch.setattr(os, "access", lambda path, mode: bool(asked.append((path, mode))))
+    with pytest.raises(InputError, match="is no writable folder"):
+        check_target(tmp_path / "a" / "scene", False)
+    assert asked == [(tmp_path, os.W_OK | os.X_OK)]

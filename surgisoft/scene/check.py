@@ -13,7 +13,13 @@ from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.lesion import ON_SURFACE_MM, circle_on, nearest_on_surface
+from surgisoft.scene.lesion import (
+    ON_SURFACE_MM,
+    circle_on,
+    nearest_on_surface,
+    path_off_mm,
+    path_slack_mm,
+)
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import TOOLS
 from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, look_at_lesion
@@ -170,7 +176,13 @@ def _lesion_finding(scene: Scene) -> Finding:
             scene.ring_of()
         except InputError:
             value, lies = f"its ring of {lesion.diameter_mm:g} mm hangs over an edge", False
-    return Finding("lesion on the surface", value, f"{ON_SURFACE_MM:g} mm, whole ring", lies)
+            if lesion.path_mm:
+                away = path_off_mm(scene.organ.world_mesh, lesion)
+                value = f"its path_mm leaves the surface by {away:.3g} mm"
+    wanted = f"{ON_SURFACE_MM:g} mm, whole ring"
+    if lesion.path_mm:
+        wanted = f"{ON_SURFACE_MM:g} mm, path {path_slack_mm(lesion):g} mm"
+    return Finding("lesion on the surface", value, wanted, lies)
 
 
 def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:

@@ -159,15 +159,32 @@ def lesion_ring(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> Rin
     return ring
 
 
-def _path_ring(mesh, lesion, centre, face, count) -> Ring:
-    """The user's own path, evenly resampled along its length and laid on the surface."""
+def path_slack_mm(lesion: LesionSpec) -> float:
+    """How far the lesion's own path may leave the surface (mm)."""
+    return max(ON_SURFACE_MM, 0.1 * lesion.diameter_mm)
+
+
+def path_off_mm(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> float:
+    """How far the lesion's own path, resampled, leaves the mesh's surface (world frame, mm)."""
+    path = _resampled(lesion, count)
+    points, _ = nearest_on_surface(mesh, path)
+    return float(np.linalg.norm(points - path, axis=1).max())
+
+
+def _resampled(lesion: LesionSpec, count: int) -> np.ndarray:
+    """(count, 3) points evenly along the lesion's own closed path (mm)."""
     corners = np.array([*lesion.path_mm, lesion.path_mm[0]])
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
     places = np.linspace(0.0, along[-1], count, endpoint=False)
-    path = np.stack([np.interp(places, along, axis) for axis in corners.T], axis=1)
+    return np.stack([np.interp(places, along, axis) for axis in corners.T], axis=1)
+
+
+def _path_ring(mesh, lesion, centre, face, count) -> Ring:
+    """The user's own path, evenly resampled along its length and laid on the surface."""
+    path = _resampled(lesion, count)
     points, faces = nearest_on_surface(mesh, path)
     off = np.linalg.norm(points - path, axis=1)
-    if off.max() > max(ON_SURFACE_MM, 0.1 * lesion.diameter_mm):
+    if off.max() > path_slack_mm(lesion):
         raise InputError(
             f"lesion.path_mm leaves the surface of '{lesion.body}' by {off.max():.3g} mm; "
             "expected points on the surface, close enough together to follow it"

@@ -140,6 +140,32 @@ def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
     assert "BAD lesion on the surface" in capsys.readouterr().out
 
 
+def test_a_path_off_the_organ_tells_how_far(made, tmp_path, capsys):
+    """Two corners of the triangle float 20 mm and more above the organ's top."""
+    lesion = open_scene(made[1]).spec.lesion
+    x, y, z = lesion.centre_mm
+    path = (lesion.centre_mm, (x + 5.0, y, z + 40.0), (x, y + 5.0, z + 40.0))
+    folder = scene_with(made, tmp_path, lesion=dataclasses.replace(lesion, path_mm=path))
+    assert run(["scene", "check", str(folder)]) == 1
+    said = capsys.readouterr().out
+    off = float(re.search(r"its path_mm leaves the surface by (\S+) mm", said)[1])
+    assert 20.0 < off < 40.5
+    assert "path 2 mm" in said
+    assert "hangs over" not in said
+
+
+def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, capsys):
+    mounts = list(open_scene(made[1]).spec.mounts)
+    mounts[1] = dataclasses.replace(mounts[1], arm="nosuch")
+    folder = scene_with(made, tmp_path, mounts=tuple(mounts))
+    lines = (folder / FILE).read_text().splitlines()
+    line = 1 + lines.index('arm = "nosuch"')
+    assert run(["scene", "check", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert f"{folder / FILE}:{line}: mounts[1].arm: there is no arm model 'nosuch'" in error
+    assert error.count("\n") == 1
+
+
 def test_the_patch_agrees_with_the_ring(made):
     """The map's circle of the lesion's own diameter says what the referee says of the ring."""
     scene = open_scene(made[1])

@@ -11,6 +11,7 @@ import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene, rounded_mount
 from surgisoft.scene.mesh import ROLES, Body, Mesh
@@ -45,6 +46,8 @@ SAID_FROM_MM = 1.0
 """A lesion that is moved farther than this onto the surface is told so (mm)."""
 COARSE_RING = 36
 """Ring points while mounts are searched."""
+CROSSING = "surfaces cross, the outermost counts; faces buried inside"
+"""How a body is told of whose surface crosses itself."""
 
 Report = Callable[[float, float, str], None]
 
@@ -198,6 +201,8 @@ def _repaired(path, parts, scale) -> tuple[list[tuple[str, Mesh]], list[InputErr
             continue
         for fix in repaired.repairs:
             done[fix.done] = done.get(fix.done, 0) + fix.count
+        if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
+            done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem
         found += [(name, mesh) for mesh in repaired.bodies]
     return found, failures, done

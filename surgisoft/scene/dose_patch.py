@@ -14,6 +14,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.scene.buried import buried
 from surgisoft.scene.kernels import compiled
 from surgisoft.scene.mesh import Mesh
 
@@ -23,6 +24,8 @@ SPACING_WAISTS = 0.75
 """Longest edge of a sample as a share of the beam's 1/e^2 radius."""
 LEAST_FACING = -0.2
 """Faces turned away from the ring's own normal by more than this cosine are the far side."""
+SEAM_FINER = 4.0
+"""Faces that run into the solid are cut so many times finer, as a sample counts whole or not."""
 MOST_SAMPLES = 400_000
 """A patch that would need more samples than this is refused."""
 
@@ -83,7 +86,7 @@ def cut_patch(
 
     Samples have edges of at most spacing_mm; the ring is the band of width band_mm along its path,
     parted into stations of about station_mm; the patch reaches margin_mm beyond the path, and all
-    over the inside.
+    over the inside. Where the surface crosses itself, what lies inside the solid is left out.
     """
     ring, normals = np.asarray(ring_mm, float), np.asarray(ring_normals, float)
     centre = np.asarray(centre_mm, float)
@@ -96,7 +99,7 @@ def cut_patch(
         )
     reach = np.linalg.norm(ring - centre, axis=1).max() + margin_mm
     near = _faces_near(mesh, ring, reach, centre)
-    points, faces, areas = _subdivide(mesh, near, spacing_mm, reach, centre)
+    points, faces, areas = _exposed(mesh, near, spacing_mm, reach, centre)
     steps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
     along, offset = _ring_coordinates(points, ring, normals, centre, steps)
     below = normals[np.searchsorted(np.cumsum(steps), along).clip(max=len(ring) - 1)]
@@ -148,6 +151,21 @@ def _faces_near(mesh: Mesh, ring: np.ndarray, reach: float, centre: np.ndarray) 
     below = [np.argmin(frames.norm(middles[candidates] - p)) for p in ring]
     parts = np.unique(label[faces[below, 0]])
     return candidates[np.isin(label[faces[:, 0]], parts)]
+
+
+def _exposed(mesh: Mesh, faces: np.ndarray, spacing: float, reach: float, centre: np.ndarray):
+    """As `_subdivide`, without what lies buried; finer on faces that are buried in part."""
+    samples = _subdivide(mesh, faces, spacing, reach, centre)
+    hidden = buried(mesh, samples[0], mesh.face_normals[samples[1]])
+    if hidden.any():
+        seam = np.intersect1d(samples[1][hidden], samples[1][~hidden])
+        plain = ~hidden & ~np.isin(samples[1], seam)
+        fine = _subdivide(mesh, seam, spacing / SEAM_FINER, reach, centre)
+        seen = ~buried(mesh, fine[0], mesh.face_normals[fine[1]])
+        samples = tuple(
+            np.concatenate((x[plain], y[seen])) for x, y in zip(samples, fine, strict=True)
+        )
+    return samples
 
 
 def _subdivide(mesh: Mesh, faces: np.ndarray, spacing: float, reach: float, centre: np.ndarray):

@@ -17,6 +17,8 @@ OPEN_CONE_RAD = np.radians(60.0)
 SITES = 6
 """Places handed on for the search of mounts."""
 
+QUICK_RING = 12
+"""Ring points that are tried before the whole ring, when a diameter that fits is sought."""
 FAR_POINT_MM = 20.0
 """A point farther than this from every surface is a slip, not a place on it (mm)..."""
 FAR_POINT = 0.1
@@ -91,10 +93,15 @@ def _with_ring(bodies, body, point, face, diameter_mm) -> Site:
 
 
 def _largest_fitting(mesh, point, face, diameter_mm) -> float:
-    """The largest of twenty smaller diameters whose ring lies on the surface (mm); 0: none."""
+    """The largest of nineteen smaller diameters whose ring lies on the surface (mm); 0: none."""
+    most = min(diameter_mm, float(np.ptp(mesh.bounds_mm, axis=0).max()))
     for share in np.linspace(0.95, 0.05, 19):
-        if circle_on(mesh, point, face, share * diameter_mm) is not None:
-            return float(np.floor(share * diameter_mm))
+        fits = share * most
+        fits = float(np.floor(fits)) if fits >= 1.0 else fits
+        if circle_on(mesh, point, face, fits, QUICK_RING) is None:
+            continue
+        if circle_on(mesh, point, face, fits) is not None:
+            return fits
     return 0.0
 
 
@@ -121,10 +128,13 @@ def good_sites(bodies: list[Mesh], diameter_mm: float) -> list[Site]:
             break
     if not sites:
         size = np.ptp(mesh.bounds_mm, axis=0)
+        best = np.argsort(-quality, kind="stable")[:SITES]
+        fits = max(_largest_fitting(mesh, points[i], int(faces[i]), diameter_mm) for i in best)
+        advice = f"a ring of {fits:g} mm does" if fits else "no smaller one does"
         raise InputError(
             f"no ring of {diameter_mm:g} mm lies on a body of "
-            f"{' x '.join(f'{s:.3g}' for s in size)} mm: it hangs over an edge or the surface is "
-            "too rough; give a smaller --diameter or the right --unit"
+            f"{' x '.join(f'{s:.3g}' for s in size)} mm ({advice}): it hangs over an edge or the "
+            "surface is too rough; give a smaller --diameter or the right --unit"
         )
     return sites
 

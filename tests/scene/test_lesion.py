@@ -1,5 +1,7 @@
 """Rings on surfaces against closed forms, nearest points against brute force."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -129,5 +131,14 @@ def test_good_sites_are_open_and_the_same_each_time():
     assert [tuple(site.point_mm) for site in sites] == [tuple(site.point_mm) for site in again]
     # under the lid nothing above the organ is open
     assert sites[0].ring.normal[2] < 0.9
-    with pytest.raises(InputError, match="no ring of 200 mm"):
-        good_sites([organ], 200.0)
+
+
+@pytest.mark.parametrize("diameter", [60.0, 200.0])
+def test_a_ring_too_large_for_the_organ_tells_one_that_fits(diameter):
+    """On a ball of 15 mm radius a ring is at most 30 mm sin(75.5 degrees) = 29 mm wide."""
+    small = ball(15.0, 3)
+    with pytest.raises(InputError, match=f"no ring of {diameter:g} mm") as caught:
+        good_sites([small], diameter)
+    fits = float(re.search(r"a ring of (\S+) mm does", str(caught.value))[1])
+    assert 20.0 <= fits <= 29.1
+    assert good_sites([small], fits)

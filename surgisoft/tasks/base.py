@@ -60,6 +60,12 @@ class Task(Protocol):
     def measures(self, state: TaskState) -> dict[str, Tensor]:
         """What a person wants to know: name with unit -> (B,); nan where it does not apply."""
 
+    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        """(B, k, 3) mm twice, world frame: where the task's points should be, and where they are.
+
+        Most tasks have one point; a task of the whole body has its key points, the tip last.
+        """
+
     def script(self, state: TaskState) -> dict[str, Tensor]:
         """The scripted solver's actions: agent -> (B, m) kPa. It knows the true state."""
 

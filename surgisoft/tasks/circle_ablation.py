@@ -163,6 +163,10 @@ class CircleAblation:
             "success": ((ring.completion >= 1.0) & ~hit).float(),
         }
 
+    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        """The place on the ring, and where the beam ends."""
+        return self.target_mm(state.goal)[:, None], state.world.scenery.hit.point_mm[:, None]
+
     def script(self, state: TaskState) -> dict[str, Tensor]:
         """The laser aims at its next target, the endoscope at the lesion's middle."""
         arms, count = state.world.arms, len(state.goal.walked)

@@ -154,6 +154,10 @@ class Follow:
             )
         }
 
+    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        point = self.marker(state.world.arms["arm"].points_mm)
+        return self.target_mm(state)[:, None], point[:, None]
+
     def script(self, state: TaskState) -> dict[str, Tensor]:
         """Damped least squares for the pressures that put the point on the next target.
 

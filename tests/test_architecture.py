@@ -13,12 +13,23 @@ MAY_IMPORT = {
     "surrogate": set(),
     "measurement": {"surrogate"},
     "measurement/rig": {"measurement"},
-    "diagnosis": {"surrogate", "measurement"},
+    "diagnosis": {"surrogate", "measurement", "report"},
     "studies": {"surrogate", "measurement", "diagnosis"},
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
+    "agents": {"scene", "surrogate", "measurement", "tasks"},
     "replay": {"scene"},
-    "cli": {"scene", "surrogate", "measurement", "diagnosis", "studies", "replay"},
+    "report": set(),
+    "cli": {
+        "agents",
+        "tasks",
+        "scene",
+        "surrogate",
+        "measurement",
+        "diagnosis",
+        "studies",
+        "replay",
+    },
 }
 """What each part may import beside itself and the ground; the nearest folder's row counts."""
 

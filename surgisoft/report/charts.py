@@ -1,0 +1,76 @@
+"""Matplotlib figures as pictures of a page, in the colours of the reader's theme.
+
+with drawing():
+    figure, axis = plt.subplots(figsize=CHART)
+    ...
+    picture = chart(figure, "Error over dwell")
+"""
+
+import contextlib
+import io
+from collections.abc import Iterator
+
+import matplotlib as mpl
+
+from surgisoft.report.parts import Picture
+from surgisoft.report.style import DARK_INK, DARK_LINE, DARK_MUTED, INK, LINE, MUTED
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+CHART = (4.6, 3.0)
+"""Size of a chart that can be read on a telephone, inches."""
+BLUE, RED, GREEN, AMBER = "#3b82c4", "#d1495b", "#3c9a6b", "#cf9330"
+"""Colours that stand out on light and on dark paper."""
+_STYLE = {
+    "axes.edgecolor": MUTED,
+    "axes.facecolor": "none",
+    "axes.grid": True,
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 10,
+    "figure.facecolor": "none",
+    "figure.figsize": CHART,
+    "figure.constrained_layout.use": True,
+    "font.size": 9,
+    "grid.color": LINE,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "savefig.facecolor": "none",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "surgisoft",
+    "text.color": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+}
+_THEME = (
+    f"<style>:root{{--ink:{INK};--muted:{MUTED};--line:{LINE}}}@media (prefers-color-scheme:dark)"
+    f"{{:root{{--ink:{DARK_INK};--muted:{DARK_MUTED};--line:{DARK_LINE}}}}}</style>"
+)
+
+
+@contextlib.contextmanager
+def drawing() -> Iterator[None]:
+    """Draw in the style of the pages."""
+    with mpl.rc_context(_STYLE):
+        yield
+
+
+def chart(figure, alt: str, caption: str = "") -> Picture:
+    """A figure drawn inside `drawing` as an SVG picture; the figure is closed.
+
+    Ink, muted and line colours become variables that follow the reader's theme. Draw clouds of
+    points with `rasterized=True`: each point would be an element of its own.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    text = buffer.getvalue()
+    for colour, name in ((INK, "ink"), (MUTED, "muted"), (LINE, "line")):
+        text = text.replace(colour, f"var(--{name})")
+    head, tag, rest = text.partition("<defs>")
+    return Picture((head + _THEME + tag + rest).encode("utf-8"), alt, caption, "image/svg+xml")

@@ -1,0 +1,70 @@
+"""One page: title, verdict, parts; rendered to one file that needs no other."""
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from surgisoft import __version__
+from surgisoft.errors import unknown_name
+from surgisoft.report.parts import Part, Section, anchor
+from surgisoft.report.style import STYLE
+from surgisoft.toml_config import write_atomically
+
+TONES = ("plain", "good", "warn", "bad")
+LEAST_CONTENTS = 3
+"""Fewest sections that are worth a table of contents."""
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+"""Nothing is fetched, whatever somebody's text may hold."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """One report."""
+
+    title: str
+    """What was examined."""
+    verdict: str
+    """The answer in one or two sentences: it stands on top."""
+    parts: Sequence[Part]
+    """What follows, in order."""
+    about: str = ""
+    """A line under the title: the command, the files."""
+    tone: str = "plain"
+    """Colour of the verdict: plain, good, warn or bad."""
+
+    def __post_init__(self) -> None:
+        if self.tone not in TONES:
+            raise unknown_name("tone", self.tone, TONES)
+
+
+def render(page: Page) -> str:
+    """The page as one HTML document without any reference to another file."""
+    sections = [part for part in page.parts if isinstance(part, Section)]
+    contents = ""
+    if len(sections) >= LEAST_CONTENTS:
+        links = "".join(
+            f'<a href="#{anchor(section.title)}">{html.escape(section.title)}</a>'
+            for section in sections
+        )
+        contents = f"<nav>{links}</nav>"
+    about = f'<p class="about">{html.escape(page.about)}</p>' if page.about else ""
+    inner = "".join(part.to_html() for part in page.parts)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
+        f"<title>{html.escape(page.title)}</title><style>{STYLE}</style></head><body><main>"
+        f'<header><h1>{html.escape(page.title)}</h1>{about}<p class="verdict {page.tone}">'
+        f"{html.escape(page.verdict)}</p>{contents}</header>{inner}"
+        f"<footer>surgisoft {__version__}</footer></main></body></html>\n"
+    )
+
+
+def write_page(page: Page, path: Path) -> Path:
+    """Write the page to an .html file, whole or not at all; its folder is made."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, render(page).encode("utf-8"))
+    return path

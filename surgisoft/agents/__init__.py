@@ -1,0 +1,1 @@
+"""Who acts in tasks: drivers, training, and how well they do."""

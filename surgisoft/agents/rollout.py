@@ -1,0 +1,195 @@
+"""Play whole episodes with a driver, many at once, and keep what the task measures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surgisoft.agents.policies import Driver
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.tree import rows
+
+BATCH = 256
+"""Episodes that are played at once unless told otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """What a watcher sees of a batch of R episodes: the start, then every step."""
+
+    episodes: Tensor
+    """(R,) int64: number of each episode."""
+    state: TaskState
+    """The state come to. The dose map is given up with the next step: copy what is kept."""
+    actions: dict[str, Tensor] | None
+    """agent -> (R, m) kPa that led here; None at the start."""
+    outcome: Outcome | None
+    """What the step brought; None at the start."""
+    live: Tensor
+    """(R,) bool: the episode was not over before this step; the others are to be ignored."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What N episodes brought, step by step."""
+
+    task: str
+    """Name of the task."""
+    dt_s: float
+    """Time of a step, s."""
+    steps: Tensor
+    """(N,) int64: steps played."""
+    returns: dict[str, Tensor]
+    """agent -> (N,): sum of its rewards."""
+    terminated: Tensor
+    """(N,) bool: ended before the time was out."""
+    failed: Tensor
+    """(N,) bool: an arm was no longer finite."""
+    measures: dict[str, Tensor]
+    """name -> (N, T), see `Task.measures`; nan where it does not apply and after the end."""
+
+    @property
+    def episodes(self) -> int:
+        """N."""
+        return len(self.steps)
+
+    @property
+    def time_s(self) -> Tensor:
+        """(N,) s: how long each episode took."""
+        return self.steps * self.dt_s
+
+    def mean(self, name: str) -> Tensor:
+        """(N,): mean of a measure over each episode; nan where it never applied."""
+        return self.measures[name].nanmean(1)
+
+    def rms(self, name: str) -> Tensor:
+        """(N,): root of the mean square."""
+        return self.measures[name].square().nanmean(1).sqrt()
+
+    def quantile(self, name: str, share: float) -> Tensor:
+        """(N,): what the measure stays below for this share of its steps."""
+        return self.measures[name].nanquantile(share, 1)
+
+    def largest(self, name: str) -> Tensor:
+        """(N,): the largest value."""
+        return _extreme(self.measures[name], torch.amax, -torch.inf)
+
+    def smallest(self, name: str) -> Tensor:
+        """(N,): the smallest value."""
+        return _extreme(self.measures[name], torch.amin, torch.inf)
+
+    def end(self, name: str) -> Tensor:
+        """(N,): the value at the episode's last step."""
+        last = (self.steps - 1).clamp(min=0)[:, None]
+        return self.measures[name].gather(1, last)[:, 0]
+
+
+def _extreme(values: Tensor, of: Callable, empty: float) -> Tensor:
+    known = ~values.isnan()
+    found = of(values.where(known, values.new_tensor(empty)), 1)
+    return found.where(known.any(1), found.new_tensor(torch.nan))
+
+
+def rollout(
+    task: Task,
+    driver: Driver,
+    episodes: int,
+    seed: int,
+    batch: int = BATCH,
+    progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Instant], None] | None = None,
+) -> Rollout:
+    """Play episodes 0 to `episodes - 1` of a seed; the batch's size does not change what happens.
+
+    progress: called with the steps done and the most that may be to do. watch: sees every instant.
+    """
+    if episodes < 1 or batch < 1:
+        raise InputError(f"rollout: {episodes} episodes in batches of {batch}, expected 1 or more")
+    report = progress or (lambda done, total: None)
+    parts, total = [], task.steps * -(-episodes // batch)
+    for number, first in enumerate(range(0, episodes, batch)):
+        count, before = min(batch, episodes - first), number * task.steps
+        parts.append(
+            _played(
+                task, driver, seed, first, count, lambda k, n=before: report(n + k, total), watch
+            )
+        )
+    return joined(parts)
+
+
+@torch.inference_mode()
+def _played(
+    task: Task,
+    driver: Driver,
+    seed: int,
+    first: int,
+    count: int,
+    report: Callable[[int], None],
+    watch: Callable[[Instant], None] | None,
+) -> Rollout:
+    """Episodes `first` to `first + count - 1` at once; those that are over leave the batch."""
+    play, device = Episodes(task), task.world.device
+    state = play.seeded(seed, count, first)
+    at = torch.arange(count, device=device)
+    live = torch.ones(count, dtype=torch.bool, device=device)
+    steps = torch.zeros(count, dtype=torch.int64, device=device)
+    terminated, failed = torch.zeros_like(live), torch.zeros_like(live)
+    returns = {agent: torch.zeros(count, device=device) for agent in task.agents}
+    traces: dict[str, list[Tensor]] = {}
+    if watch:
+        watch(Instant(first + at, state, None, None, live))
+    for step in range(task.steps):
+        actions = driver.act(task, state, play.observe(state))
+        state, outcome = play.step(state, actions, in_place=True)
+        if watch:
+            watch(Instant(first + at, state, actions, outcome, live))
+        for name, value in outcome.measures.items():
+            row = torch.full((count,), torch.nan, device=device)
+            row[at] = value.float().masked_fill(~live, torch.nan)
+            traces.setdefault(name, []).append(row)
+        for agent, value in outcome.rewards.items():
+            returns[agent].index_add_(0, at, value.masked_fill(~live, 0.0))
+        steps.index_add_(0, at, live.long())
+        terminated[at] |= live & outcome.terminated
+        failed[at] |= live & state.world.failed
+        live = live & ~outcome.done
+        report(step + 1)
+        remaining = live.nonzero()[:, 0]
+        if not len(remaining):
+            break
+        if 2 * len(remaining) <= len(live):
+            state, at, live = rows(state, remaining), at[remaining], live[remaining]
+    report(task.steps)
+    measures = {name: _padded(torch.stack(trace), task.steps) for name, trace in traces.items()}
+    dt_s = task.world.config.dt_s
+    return Rollout(task.name, dt_s, steps, returns, terminated, failed, measures)
+
+
+def _padded(values: Tensor, length: int) -> Tensor:
+    """(T, N) to (N, length) with nan."""
+    return torch.nn.functional.pad(values.T, (0, length - len(values)), value=torch.nan)
+
+
+def joined(parts: list[Rollout]) -> Rollout:
+    """All episodes of all parts, one after the other."""
+    one = parts[0]
+    if len(parts) == 1:
+        return one
+
+    def all_of(field: str) -> dict[str, Tensor]:
+        return {
+            name: torch.cat([getattr(part, field)[name] for part in parts])
+            for name in getattr(one, field)
+        }
+
+    steps, terminated, failed = (
+        torch.cat([getattr(part, field) for part in parts])
+        for field in ("steps", "terminated", "failed")
+    )
+    return Rollout(
+        one.task, one.dt_s, steps, all_of("returns"), terminated, failed, all_of("measures")
+    )

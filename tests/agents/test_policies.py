@@ -1,0 +1,54 @@
+"""Drivers by name, and what they promise."""
+
+import pytest
+import torch
+
+from surgisoft.agents.policies import Random, open_driver
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.tree import rows
+
+
+@pytest.fixture(scope="module")
+def task():
+    return make_task("track_circle")
+
+
+def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
+    driver, state = open_driver("random", task), Episodes(task).seeded(5, 4)
+    together = driver.act(task, state, {})["arm"]
+    for i in range(4):
+        one = rows(state, torch.tensor([i]))
+        assert torch.equal(driver.act(task, one, {})["arm"][0], together[i])
+
+
+def test_scripted_is_the_tasks_own_solver(task):
+    play = Episodes(task)
+    state = play.seeded(5, 4)
+    action = open_driver("scripted", task).act(task, state, play.observe(state))
+    assert torch.equal(action["arm"], task.script(state)["arm"])
+
+
+def test_random_fills_the_pumps_range_evenly_and_anew_each_step(task):
+    play, driver = Episodes(task), Random(3)
+    state = play.seeded(0, 2000)
+    first = driver.act(task, state, {})["arm"]
+    state, _ = play.step(state, {"arm": first})
+    second = driver.act(task, state, {})["arm"]
+    limit = task.world.arms["arm"].pneumatics.step_kPa
+    for draw in (first, second):
+        assert draw.abs().max() <= limit
+        assert draw.mean().abs() < 0.1 * limit
+        assert draw.std() == pytest.approx(limit / 3**0.5, rel=0.05)
+    together = torch.stack((first.flatten(), second.flatten()))
+    assert torch.corrcoef(together)[0, 1].abs() < 0.05
+    assert torch.corrcoef(first.T)[0, 1].abs() < 0.1
+    assert not torch.equal(first, Random(4).act(task, play.seeded(0, 2000), {})["arm"])
+
+
+@pytest.mark.parametrize("name", ["skripted", "runs/nowhere"])
+def test_what_drives_nothing_is_one_line(name, task):
+    with pytest.raises(InputError, match="scripted") as error:
+        open_driver(name, task)
+    assert name in str(error.value)

@@ -30,6 +30,8 @@ class CircleAblationConfig:
 
     scene: str | Path = PHANTOM
     """Folder of the scene."""
+    arm: str | Path | None = None
+    """Arm model of both arms, `default` or a model's folder; None: those that the scene names."""
     cut_s: float = 45.0
     """Time for once around with the beam on, s."""
     fire_mm: float = 0.5
@@ -68,7 +70,7 @@ class CircleAblation:
 
     def __init__(self, config: CircleAblationConfig | None = None, device="cpu"):
         self.config = config or CircleAblationConfig()
-        self.world = scene_world(self.config.scene, self.config.world, device)
+        self.world = scene_world(self.config.scene, self.config.world, device, arm=self.config.arm)
         self.surroundings, dt_s = self.world.surroundings, self.world.config.dt_s
         self.spec = self.surroundings.spec
         self.steps = round(self.spec.limits.time_s / dt_s)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -48,6 +49,8 @@ class FollowConfig:
     """Scale of the second reward term, mm."""
     fine_weight: float = 1.0
     """Weight of the second reward term; 0: the paper's reward."""
+    arm: str | Path = "default"
+    """Arm model: `default`, or the folder of a fitted model."""
 
     def __post_init__(self):
         if self.path not in PATHS:

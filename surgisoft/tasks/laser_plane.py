@@ -36,7 +36,7 @@ class LaserPlaneConfig:
 def laser_plane(config: LaserPlaneConfig | None = None, device: str = "cpu") -> Follow:
     """A circle of 20 mm diameter on a plane 40 mm beyond the tip."""
     config = config or LaserPlaneConfig()
-    world = level_world(config.world, config.mean_kPa, device)
+    world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
     start, backbone = points_at_start(world), world.arms["arm"].backbone
     height = start[0, -1, 2] + config.distance_mm
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from surgisoft.tasks.follow import Follow, FollowConfig
 from surgisoft.tasks.streams import streams
-from surgisoft.tasks.world import World, WorldConfig, lone_arm
+from surgisoft.tasks.world import World, WorldConfig, lone_arm, named_arm
 from surgisoft.tasks.world_arm import Randomisation
 
 
@@ -42,15 +43,15 @@ def tip(points_mm: Tensor) -> Tensor:
 
 
 def _track(name: str, config: TrackConfig, device) -> Follow:
-    world = level_world(config.world, config.mean_kPa, device)
+    world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
     centre = tip(points_at_start(world))[0]
     return Follow(name, world, config.follow, tip, centre, directions=3)
 
 
-def level_world(config: WorldConfig, mean_kPa: float, device) -> World:
-    """The default arm alone, with mean_kPa in every chamber at the start."""
-    chambers = lone_arm(config, device=device).arms["arm"].chambers
-    return lone_arm(config, start_kPa=(mean_kPa,) * chambers, device=device)
+def level_world(config: WorldConfig, mean_kPa: float, arm: str | Path, device) -> World:
+    """The named arm model alone, with mean_kPa in every chamber at the start."""
+    model = named_arm(arm, device)
+    return lone_arm(config, model, (mean_kPa,) * model.spec.chambers, device)
 
 
 def points_at_start(world: World) -> Tensor:

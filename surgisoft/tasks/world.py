@@ -159,22 +159,25 @@ def scene_world(
     config: WorldConfig | None = None,
     device: str | torch.device = "cpu",
     engine: str | None = None,
+    arm: str | Path | None = None,
 ) -> World:
-    """The two arms of a scene (or its folder), named `laser` and `endoscope`, among its bodies."""
+    """The two arms of a scene (or its folder), named `laser` and `endoscope`, among its bodies.
+
+    arm: a model for both in place of the scene's own, as for `named_arm`.
+    """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
     arms = {}
     for mount in scene.spec.mounts:
         pose = torch.tensor(mount.pose(), dtype=torch.float32)
-        arms[mount.tool] = Mounted(
-            _arm_of(mount.arm, scene.folder, device), pose, shaft_mm=mount.shaft_mm
-        )
+        name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
+        arms[mount.tool] = Mounted(named_arm(name, device, folder), pose, shaft_mm=mount.shaft_mm)
     return World(arms, config, Surroundings(scene, config.scenery, device, engine), device)
 
 
-def _arm_of(name: str, folder: Path, device) -> ArmModel:
-    """`default`, or the fitted model in a folder, looked for beside the scene, then as it is."""
-    if name == "default":
+def named_arm(name: str | Path, device="cpu", folder: str | Path = ".") -> ArmModel:
+    """`default`, or the fitted model in a folder, looked for in `folder`, then as it is."""
+    if str(name) == "default":
         return default_arm(device)
-    places = (folder / name, Path(name))
+    places = (Path(folder) / name, Path(name))
     return load_model(next((place for place in places if place.is_dir()), Path(name)), device)

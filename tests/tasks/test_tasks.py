@@ -9,7 +9,12 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes
+from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.follow import FollowConfig
 from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane, on_plane
 from surgisoft.tasks.paths import circle, square
@@ -295,3 +300,20 @@ def test_bad_input_is_one_line(make, message):
     with pytest.raises(InputError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["track_circle", "laser_plane", "circle_ablation"])
+def test_another_arm_model_takes_the_default_ones_place(name, tmp_path):
+    """A saved model with six key points in place of five."""
+    spec = ArmSpec(3, 6, (0.0,) * 3, (40.0,) * 3, length_mm=70.0)
+    low, high = torch.zeros(3), torch.full((3,), 40.0)
+    model = ArmModel(spec, ConstantCurvature(low, high, key_points=6))
+    save_model(model, tmp_path / "arm")
+    kind = {"track_circle": TrackConfig, "laser_plane": LaserPlaneConfig}.get(name)
+    arm = str(tmp_path / "arm")
+    config = kind(FollowConfig(arm=arm)) if kind else CircleAblationConfig(arm=arm)
+    task = make_task(name, config)
+    for agent in task.agents:
+        assert task.world.arms[agent].key_points == 6
+    with pytest.raises(InputError, match="no arm model there"):
+        make_task(name, kind(FollowConfig(arm="no/arm")) if kind else CircleAblationConfig(arm="x"))

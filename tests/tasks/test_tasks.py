@@ -307,7 +307,8 @@ def test_another_arm_model_takes_the_default_ones_place(name, tmp_path):
     """A saved model with six key points in place of five."""
     spec = ArmSpec(3, 6, (0.0,) * 3, (40.0,) * 3, length_mm=70.0)
     low, high = torch.zeros(3), torch.full((3,), 40.0)
-    model = ArmModel(spec, ConstantCurvature(low, high, key_points=6))
+    rest = torch.tensor([[0.0, 0.0, 14.0 * k] for k in range(6)])
+    model = ArmModel(spec, ConstantCurvature(low, high, key_points=6), rest_mm=rest)
     save_model(model, tmp_path / "arm")
     kind = {"track_circle": TrackConfig, "laser_plane": LaserPlaneConfig}.get(name)
     arm = str(tmp_path / "arm")

@@ -85,6 +85,8 @@ class ArmPart:
     """(B, n, 3) mm: key points as measured."""
     seen_kPa: Tensor
     """(B, m) kPa: chamber pressure as measured."""
+    offset_mm: Tensor
+    """(B, n, 3) mm: what the key points are known to lie off the model; 0 where it is the truth."""
 
     @property
     def tip_mm(self) -> Tensor:
@@ -156,6 +158,7 @@ class Arm:
             tip_direction=self.backbone.tip_direction(points),
             seen_mm=points,
             seen_kPa=pressure,
+            offset_mm=torch.zeros_like(points),
         )
         return self._measured(stream, part)
 
@@ -166,25 +169,30 @@ class Arm:
         queue, action = self._due(part, action)
         command = self.pneumatics.command(part.command, action, self.low, self.high)
         pressure = self.pneumatics.follow(part.pressure, command, dt_s)
-        state, points = self._bent(part, pressure, dt_s)
-        part = replace(
-            part,
-            command=command,
-            pressure=pressure,
-            queue=queue,
-            arm=state,
-            points_mm=points,
-            line_mm=self._line(points, part.mount),
-            tip_direction=self.backbone.tip_direction(points),
-        )
-        return self._measured(stream, part)
+        state, points = self.bent(part, pressure, dt_s)
+        part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
+        return self._measured(stream, self.posed(part, points))
 
     def foresee(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
         """Key points (B, n, 3) mm, world frame, if the chambers had (B, m) kPa a step from now.
 
         Differentiable by the pressure; knows the episode's true gain, mount and memory.
         """
-        return self._bent(part, pressure, dt_s)[1]
+        return self.bent(part, pressure, dt_s)[1] + part.offset_mm
+
+    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
+        """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
+        state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
+        return state, frames.apply(part.mount, points)
+
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The part with its body where the key points (B, n, 3) mm, world frame, are."""
+        return replace(
+            part,
+            points_mm=points_mm,
+            line_mm=self._line(points_mm, part.mount),
+            tip_direction=self.backbone.tip_direction(points_mm),
+        )
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest pressure (B, m) kPa that the chambers can have a step from now."""
@@ -209,10 +217,6 @@ class Arm:
         queue = torch.cat((part.queue, action[:, None]), 1)
         place = (self.vary.delay - part.delay)[:, None, None].expand(-1, 1, self.chambers)
         return queue[:, 1:], queue.gather(1, place)[:, 0]
-
-    def _bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
-        state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
-        return state, frames.apply(part.mount, points)
 
     def _line(self, points: Tensor, mount: Tensor) -> Tensor:
         line = self.backbone.centreline(points)

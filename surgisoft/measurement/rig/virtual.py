@@ -160,14 +160,19 @@ class VirtualRig:
 
     def read(self) -> Sample:
         """Let one period pass and read sensors and cameras."""
+        return self.read_beside_truth()[0]
+
+    def read_beside_truth(self) -> tuple[Sample, Truth]:
+        """`read`, and what no bench can measure at that instant (T = 1); for studies only."""
         frame = self._play(self._state.target[None].copy(), 0, 1)
-        return Sample(
+        sample = Sample(
             t_s=self.time_s,
             measured=frame.measured[0],
             commanded=self._state.target.copy(),
             key_points_mm=frame.points[0],
             temp_C=float(frame.temperature[0]) if self._thermometer else None,
         )
+        return sample, Truth(frame.centres, frame.clean, frame.chamber)
 
     def record(
         self, protocol: Protocol, progress: Callable[[int, int], None] | None = None

@@ -1,0 +1,43 @@
+"""Is a gain more than chance, and whose is it? Sign flips and a bootstrap over blocks of time."""
+
+import numpy as np
+
+FLIPS = 2000
+"""Random signs of a test."""
+DRAWS = 500
+"""Bootstrap samples of blocks."""
+
+
+def studentised(gains: np.ndarray) -> np.ndarray:
+    """(C,) mean over its standard error, of gains (C, B) by block."""
+    count = gains.shape[1]
+    spread = gains.std(axis=1, ddof=1) / np.sqrt(count)
+    return gains.mean(axis=1) / np.maximum(spread, 1e-12 * np.abs(gains).max(initial=1e-30))
+
+
+def family_p_values(gains: np.ndarray, seed: int = 0) -> np.ndarray:
+    """(C,) chance of so large a gain in any of the C candidates, if none had one.
+
+    Without a gain each block's difference is as likely negative as positive, for all candidates at
+    once; the largest statistic over all of them corrects for their number (Westfall & Young 1993,
+    ch. 2; Nichols & Holmes 2002). gains: (C, B) by block.
+    """
+    rng = np.random.default_rng(seed)
+    seen = studentised(gains)
+    signs = rng.choice([-1.0, 1.0], size=(FLIPS, gains.shape[1]))
+    # The sum of squares does not change with the signs, so neither does what scales the mean.
+    count = gains.shape[1]
+    square = (gains**2).sum(axis=1)
+    mean = signs @ gains.T / count
+    variance = np.maximum(square / count - mean**2, 1e-12 * square.max(initial=1e-30))
+    largest = (mean / np.sqrt(variance / (count - 1))).max(axis=1)
+    return (1 + (largest[None] >= seen[:, None]).sum(axis=1)) / (1 + FLIPS)
+
+
+def first_shares(losses: np.ndarray, seed: int = 0) -> np.ndarray:
+    """(C,) share of bootstrap samples of blocks in which a candidate has the least loss (C, B)."""
+    rng = np.random.default_rng(seed)
+    count = losses.shape[1]
+    weights = rng.multinomial(count, np.full(count, 1.0 / count), size=DRAWS)
+    first = (weights @ losses.T).argmin(axis=1)
+    return np.bincount(first, minlength=len(losses)) / DRAWS

@@ -12,6 +12,7 @@ import os
 import re
 import tempfile
 import tomllib
+import types
 import typing
 from dataclasses import dataclass
 from pathlib import Path
@@ -169,6 +170,9 @@ def expectation(hint) -> str:
     if dataclasses.is_dataclass(base):
         return "a table"
     parts = typing.get_args(base)
+    if isinstance(base, types.UnionType):
+        known = {words.get(part, "text" if part is Path else "nothing") for part in parts}
+        return " or ".join(sorted(known, reverse=True))
     if parts[-1] is Ellipsis:
         return f"a list, each {expectation(parts[0])}"
     return f"{len(parts)} numbers" if set(parts) == {float} else f"a list of {len(parts)}"

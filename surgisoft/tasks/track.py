@@ -26,6 +26,10 @@ class TrackConfig:
     """The world and its randomisation."""
 
 
+SQUARE = TrackConfig(FollowConfig(path="square", size_mm=15.0))
+"""The square's configuration unless told otherwise."""
+
+
 def track_circle(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
     """A circle of 20 mm diameter."""
     return _track("track_circle", config or TrackConfig(), device)
@@ -33,8 +37,7 @@ def track_circle(config: TrackConfig | None = None, device: str | torch.device =
 
 def track_square(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
     """A square of 15 mm edge."""
-    square = TrackConfig(FollowConfig(path="square", size_mm=15.0))
-    return _track("track_square", config or square, device)
+    return _track("track_square", config or SQUARE, device)
 
 
 def tip(points_mm: Tensor) -> Tensor:

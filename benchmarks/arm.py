@@ -18,7 +18,7 @@ import torch
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.effects import make_effect
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
 
 OPERATIONS = 2 * (6 * 128 + 3 * 128 * 128 + 128 * 15)
@@ -46,9 +46,11 @@ def peak() -> float:
 
 def arm(effects: tuple[str, ...]) -> ArmModel:
     """An arm of the paper's size."""
-    low, high, rest = (torch.tensor(x) for x in (SPEC.low, SPEC.high, SPEC.rest))
-    made = {name: make_effect(name, low, high, rest) for name in effects}
-    return ArmModel(SPEC, HawNN(low, high, 5), made).eval().requires_grad_(False)
+    low, high = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
+    rest = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(SPEC.key_points)])
+    facts = arm_facts(SPEC, rest)
+    made = {name: make_effect(name, facts) for name in effects}
+    return ArmModel(SPEC, HawNN(low, high, 5), made, rest).eval().requires_grad_(False)
 
 
 def stepper(effects: tuple[str, ...], dp: torch.Tensor):

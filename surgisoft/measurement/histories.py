@@ -40,15 +40,23 @@ def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
 
 def history_of(recordings: list[Recording], actuation: str = "measured") -> History:
     """All runs of all recordings as one padded history."""
-    times, pressures, points = [], [], []
+    times, pressures, points, warmth = [], [], [], []
     for recording in recordings:
         signal = actuation_of(recording, actuation)
         for run in recording.runs:
             times.append(torch.from_numpy(recording.t_s[run].copy()))
             pressures.append(torch.from_numpy(signal[run].copy()))
             points.append(torch.from_numpy(recording.key_points_mm[run].copy()))
+            room = recording.temp_C
+            warmth.append(
+                torch.full((len(times[-1]),), torch.nan)
+                if room is None
+                else torch.from_numpy(room[run].copy())
+            )
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
-    return pack(times, pressures, points, tuple(float(x) for x in noise))
+    if all(room.isnan().all() for room in warmth):
+        warmth = None
+    return pack(times, pressures, points, tuple(float(x) for x in noise), warmth)
 
 
 def actuation_noise(recording: Recording, actuation: str = "measured") -> np.ndarray:

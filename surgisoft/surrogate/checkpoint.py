@@ -15,7 +15,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
 
@@ -109,13 +109,14 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
                 for key, value in config["arm"].items()
             }
         )
-        low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
+        low, high = torch.tensor(spec.low), torch.tensor(spec.high)
         network = dict(config["network"])
         kind = network.pop("kind")
         if kind not in NETWORKS:
             raise unknown_name("network", kind, NETWORKS)
+        facts = arm_facts(spec, weights["rest_mm"])
         effects = {
-            name: make_effect(name, low, high, rest, **arguments)
+            name: make_effect(name, facts, **arguments)
             for name, arguments in config["effects"].items()
         }
         model = ArmModel(

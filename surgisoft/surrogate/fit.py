@@ -20,7 +20,7 @@ from torch import Tensor
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
-from surgisoft.surrogate.effects import EFFECTS, make_effect
+from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.excitation import ChamberExcitation, excitation
 from surgisoft.surrogate.fit_recurrent import held_rows, new_recurrent, train_recurrent
 from surgisoft.surrogate.history import History
@@ -204,9 +204,15 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
     if config.inputs not in INPUTS:
         raise unknown_name("inputs", config.inputs, INPUTS)
+    known = known_effects()
     for name in config.effects:
-        if name not in EFFECTS:
-            raise unknown_name("effect", name, EFFECTS)
+        if name not in known:
+            raise unknown_name("effect", name, known)
+        if known[name].stage not in ("line", "material"):
+            raise InputError(
+                f"{name} acts on the {known[name].stage}, behind the network: "
+                f"fit without it, then 'surgisoft amend --effect {name}' adds it"
+            )
     if config.effects and config.network != "haw_nn":
         raise InputError(f"effects are for haw_nn; the {config.network} baseline takes none")
     for history in (train, valid):
@@ -274,6 +280,8 @@ def _possible(result: FitResult, name: str, config: FitConfig, support: _Support
     """Whether the recordings support a stage in any chamber; notes those that they do not."""
     if name in ("pressure", "constant curvature") or not config.check_excitation:
         return True
+    if name != "direction" and not known_effects()[name].needs_reversals:
+        return True
     use = support.use(name)
     for chamber, used in zip(support.chambers, use, strict=True):
         if not used:
@@ -283,7 +291,7 @@ def _possible(result: FitResult, name: str, config: FitConfig, support: _Support
 
 def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, train) -> ArmModel:
     """The model with one stage more, the same function as before."""
-    low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     if name == "pressure":
         network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
         normalise(network, train)
@@ -297,8 +305,8 @@ def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, tr
     if name == "direction":
         grown.network = grown.network.with_directions(use)
         return grown
-    effect = make_effect(name, low, high, rest)
-    effect.use.copy_(use)
+    effect = make_effect(name, model.facts)
+    effect.use_chambers(use)
     return ArmModel(spec, grown.network, {**grown.effects, name: effect})
 
 

@@ -22,6 +22,8 @@ class History:
     """(R, T) bool."""
     noise: tuple[float, ...] | None = None
     """Standard deviation of the measured actuation at rest, one a chamber, if known."""
+    temperature_C: Tensor | None = None
+    """(R, T) float32 temperature of the room, degrees Celsius; NaN where missing."""
 
     @property
     def runs(self) -> int:
@@ -59,6 +61,7 @@ class History:
             self.key_points[runs, :length],
             self.valid[runs, :length],
             self.noise,
+            None if self.temperature_C is None else self.temperature_C[runs, :length],
         )
 
     def to(self, device) -> "History":
@@ -69,6 +72,7 @@ class History:
             self.key_points.to(device),
             self.valid.to(device),
             self.noise,
+            None if self.temperature_C is None else self.temperature_C.to(device),
         )
 
 
@@ -77,10 +81,11 @@ def pack(
     pressure: list[Tensor],
     key_points: list[Tensor],
     noise: tuple[float, ...] | None = None,
+    temperature_C: list[Tensor] | None = None,
 ) -> History:
     """Runs of any lengths as one padded history.
 
-    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm.
+    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm, temperature_C (T,).
     """
     if not pressure:
         raise InputError("no run: expected at least one with one row; check the recordings")
@@ -103,4 +108,5 @@ def pack(
         key_points=stack(key_points, torch.float32, float("nan")),
         valid=stack([torch.ones(len(run), dtype=torch.bool) for run in pressure], torch.bool, 0),
         noise=noise,
+        temperature_C=None if temperature_C is None else stack(temperature_C, torch.float32, None),
     )

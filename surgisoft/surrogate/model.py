@@ -1,6 +1,6 @@
 """The arm model: line effects -> material effects -> network -> body effects -> sensor effects."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -9,7 +9,7 @@ from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
-from surgisoft.surrogate.effects import STAGES, Effect, Stage
+from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
@@ -27,7 +27,7 @@ class Trace:
     direction: Tensor
     """(R, T, m) direction of change."""
     memory: dict[str, Tensor]
-    """(R, T, ...) memory of each material effect."""
+    """(R, T, ...) memory of each line and material effect."""
 
 
 class ArmModel(nn.Module):
@@ -60,6 +60,11 @@ class ArmModel(nn.Module):
         idle = torch.tensor([value or 0.0 for value in spec.idle])
         self.register_buffer("idle", idle, persistent=False)
         self.register_buffer("rest", torch.tensor(spec.rest, dtype=torch.float32))
+
+    @property
+    def facts(self) -> ArmFacts:
+        """What effects may know of this arm, on the CPU."""
+        return arm_facts(self.spec, self.rest_mm)
 
     def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
         """The effects of one stage, by name, in order."""
@@ -106,21 +111,30 @@ class ArmModel(nn.Module):
             return self.network(pressure, direction, memory[NETWORK])
         return self.network(pressure, direction)
 
-    def step(self, state: ArmState, dp: Tensor, dt: Tensor | float) -> tuple[ArmState, Tensor]:
+    def step(
+        self,
+        state: ArmState,
+        dp: Tensor,
+        dt: Tensor | float,
+        temperature_C: Tensor | None = None,
+    ) -> tuple[ArmState, Tensor]:
         """Change the actuation by dp (B, m), in the arm's unit, over dt seconds.
 
+        temperature_C: (B,) of the room, degrees Celsius; None: that of the effects' reference.
         Returns the new state and the key points (B, n, 3) in mm, base frame.
         """
         pressure = state.pressure + dp
         dt = torch.as_tensor(dt, dtype=pressure.dtype, device=pressure.device).expand(len(pressure))
         memory = dict(state.memory)
+        context = Context(dt, None, temperature_C)
 
         def advance(stage: Stage, signal: Tensor) -> Tensor:
             for name, effect in self.stage(stage):
-                memory[name], signal = effect.step(memory[name], signal, dt)
+                memory[name], signal = effect.step(memory[name], signal, context)
             return signal
 
         chamber = self.chambers(advance("line", pressure))
+        context = replace(context, pressure=chamber)
         anchor, direction = directions.advance(state.anchor, state.direction, chamber, self.band)
         effective = advance("material", chamber)
         if self.remembers:
@@ -130,15 +144,15 @@ class ArmModel(nn.Module):
 
     def trace(self, history: History) -> Trace:
         """What `shape` needs in each row; every run starts from an arm at rest."""
-        dt, start = history.dt_s, self.initial_state(history.runs).memory
-        chamber = history.pressure
+        context, start = context_of(history), self.initial_state(history.runs).memory
+        memory, signal = {}, history.pressure
         for name, effect in self.stage("line"):
-            chamber = effect.apply(chamber, effect.scan(start[name], chamber, dt))
-        chamber = self.chambers(chamber)
+            memory[name] = effect.scan(start[name], signal, context)
+            signal = effect.apply(signal, memory[name])
+        chamber = signal = self.chambers(signal)
         _, direction = directions.trace(chamber, self.band, self.rest)
-        memory, signal = {}, chamber
         for name, effect in self.stage("material"):
-            memory[name] = effect.scan(start[name], signal, dt)
+            memory[name] = effect.scan(start[name], signal, context)
             signal = effect.apply(signal, memory[name])
         return Trace(chamber, direction, memory)
 
@@ -163,9 +177,10 @@ class ArmModel(nn.Module):
             points = self.shape(trace.pressure, trace.direction, trace.memory)
         outer = self.stage("body") + self.stage("sensor")
         if outer:
-            dt, start = history.dt_s, self.initial_state(history.runs).memory
+            context = replace(context_of(history), pressure=trace.pressure)
+            start = self.initial_state(history.runs).memory
             for name, effect in outer:
-                points = effect.apply(points, effect.scan(start[name], points, dt))
+                points = effect.apply(points, effect.scan(start[name], points, context))
         return points
 
     def summary(self) -> str:
@@ -177,3 +192,15 @@ class ArmModel(nn.Module):
             f"{self.spec.unit} ({self.spec.actuation}), {self.spec.key_points} key points, "
             f"effects: {effects}"
         )
+
+
+def arm_facts(spec: ArmSpec, rest_mm: Tensor) -> ArmFacts:
+    """What effects may know of the arm whose key points at rest are rest_mm, (n, 3) in mm."""
+    low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
+    rest_mm = rest_mm.detach().cpu()
+    return ArmFacts(low, high, rest, rest_mm, spec.gravity, spec.length_mm, spec.unit)
+
+
+def context_of(history: History) -> Context:
+    """(R, T) times and temperatures of a history, for the effects' memories."""
+    return Context(history.dt_s, history.t_s.float(), history.temperature_C)

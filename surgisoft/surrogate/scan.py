@@ -2,7 +2,8 @@
 
 A play operator clamps its last value into a band around the input. Clamps compose to clamps, so a
 run of T steps is a prefix scan of log2(T) passes over all runs, chambers and thresholds, and gives
-bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms").
+bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms"). First-order lags
+are affine maps of their last value, which compose to affine maps: `linear_scan`.
 """
 
 import torch
@@ -62,3 +63,22 @@ def last_nonzero(values: Tensor) -> Tensor:
     steps = steps.view(1, -1, *[1] * (values.ndim - 2)).expand_as(values)
     index = torch.where(values != 0, steps, torch.zeros_like(steps)).cummax(dim=1).values
     return torch.gather(values, 1, index)
+
+
+def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
+    """y[:, t] = factor[:, t] y[:, t-1] + addend[:, t] with y[:, -1] = start.
+
+    Shapes: factor, addend (R, T, ...) broadcast to each other, start (R, ...); answer (R, T, ...).
+    Real or complex, differentiable. Affine maps compose to affine maps, and with |factor| <= 1 no
+    intermediate grows (Blelloch 1990, "Prefix sums and their applications", sec. 1.4).
+    """
+    factor, addend = torch.broadcast_tensors(factor, addend)
+    steps = addend.shape[1]
+    shift = 1
+    while shift < steps:
+        addend = torch.cat(
+            [addend[:, :shift], addend[:, shift:] + factor[:, shift:] * addend[:, :-shift]], dim=1
+        )
+        factor = torch.cat([factor[:, :shift], factor[:, shift:] * factor[:, :-shift]], dim=1)
+        shift *= 2
+    return addend + factor * start.unsqueeze(1)

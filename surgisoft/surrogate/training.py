@@ -1,8 +1,8 @@
 """The training loop of an arm model (Chen et al. 2025, sec. III-A).
 
 Rows in random batches train what a row needs alone: the network, and how effects read their
-memory. Parameters that the memory itself depends on are trained through windows of whole runs,
-whose first memory comes from the last pass over all of them.
+memory. Parameters that the memory itself depends on, and all of the line's, are trained through
+windows of whole runs, whose first memory comes from the last pass over all of them.
 """
 
 import copy
@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from surgisoft.surrogate.effects import Context, Stage
 from surgisoft.surrogate.model import ArmModel, Trace
 from surgisoft.surrogate.network import range_weights, weighted_mse
 from surgisoft.surrogate.rows import Data, Rows, model_rows
@@ -44,6 +45,7 @@ def train(
     judging loss) to `losses`; returns the epochs done.
     """
     every = [p for effect in model.effects.values() for p in effect.memory_parameters()]
+    every += [p for _, effect in model.stage("line") for p in effect.strengths().values()]
     mine = {id(p) for p in every}
     deep = every if name in model.effects else []
     flat = [p for p in model.parameters() if id(p) not in mine]
@@ -133,23 +135,37 @@ class _Through:
             self._step(trace, self.starts[picked.unique()])
             self.schedule.step()
 
+    def _context(self, rows: Tensor, columns: Tensor) -> Context:
+        room = self.history.temperature_C
+        return Context(
+            self.history.dt_s[rows, columns],
+            self.history.t_s[rows, columns].float(),
+            None if room is None else room[rows, columns],
+        )
+
     def _step(self, trace: Trace, starts: Tensor) -> None:
         last = trace.pressure.shape[1] - 1
         rows = starts[:, :1]
         columns = starts[:, 1:] + torch.arange(self.window)
         inside = columns <= last
         columns = columns.clamp(max=last)
-        pressure, direction = trace.pressure[rows, columns], trace.direction[rows, columns]
-        dt = self.history.dt_s[rows, columns]
+        context = self._context(rows, columns)
         rest = self.model.initial_state(len(starts)).memory
-        memory, signal = {}, pressure
         first = starts[:, 1] == 0
-        for name, effect in self.model.stage("material"):
-            before = trace.memory[name][starts[:, 0], (starts[:, 1] - 1).clamp(min=0)]
-            begin = first.view(-1, *[1] * (before.ndim - 1))
-            memory[name] = effect.scan(torch.where(begin, rest[name], before), signal, dt)
-            signal = effect.apply(signal, memory[name])
-        points = self.model.shape(pressure, direction, memory)
+        memory = {}
+
+        def along(stage: Stage, signal: Tensor) -> Tensor:
+            for name, effect in self.model.stage(stage):
+                before = trace.memory[name][starts[:, 0], (starts[:, 1] - 1).clamp(min=0)]
+                begin = first.view(-1, *[1] * (before.ndim - 1))
+                start = torch.where(begin, rest[name], before)
+                memory[name] = effect.scan(start, signal, context)
+                signal = effect.apply(signal, memory[name])
+            return signal
+
+        chamber = self.model.chambers(along("line", self.history.pressure[rows, columns]))
+        along("material", chamber)
+        points = self.model.shape(chamber, trace.direction[rows, columns], memory)
         wanted = torch.where(inside[..., None, None], self.targets[rows, columns], torch.nan)
         loss = weighted_mse(points.flatten(0, 1), wanted.flatten(0, 1), self.weights)
         self.optimiser.zero_grad(set_to_none=True)

@@ -13,12 +13,13 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.history import pack
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
 
 SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
-LOW, HIGH, REST = (torch.tensor(x) for x in (SPEC.low, SPEC.high, SPEC.rest))
+LOW, HIGH = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
+FACTS = arm_facts(SPEC, torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)]))
 
 
 def model(kind: str = "haw_nn", effects: tuple[str, ...] = ("hysteresis",)) -> ArmModel:
@@ -34,7 +35,7 @@ def model(kind: str = "haw_nn", effects: tuple[str, ...] = ("hysteresis",)) -> A
         network.table.data.normal_(0, 0.4)
     if hasattr(network, "scale"):
         network.scale.fill_(20.0)
-    made = {name: make_effect(name, LOW, HIGH, REST) for name in effects}
+    made = {name: make_effect(name, FACTS) for name in effects}
     for effect in made.values():
         for parameter in effect.parameters():
             parameter.data += 0.05 * torch.randn_like(parameter)

@@ -19,36 +19,71 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.arm import centre_and_half
-from surgisoft.surrogate.effects.base import Effect, Quantity
+from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
 from surgisoft.surrogate.scan import play_scan
 
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
 """Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
 the half range (a larger radius never moves)."""
+FEW_RADII = (0.04, 0.10, 0.22, 0.44, 0.74)
+"""Radii where a diagnosis asks whether there is any play."""
 
 
 class Hysteresis(Effect):
     """Rate-independent hysteresis with minor loops."""
 
     stage = "material"
+    needs_reversals = True
 
-    def __init__(self, low: Tensor, high: Tensor, rest: Tensor, radii: tuple[float, ...] = RADII):
-        """Actuation range low, high and rest (m,) in the arm's unit; radii of the plays."""
-        super().__init__()
-        chambers = len(low)
-        self.radii = tuple(radii)
-        centre, half = centre_and_half(low, high)
+    def __init__(
+        self,
+        facts: ArmFacts,
+        radii: tuple[float, ...] = RADII,
+        ring: bool = False,
+        pairs: bool = True,
+    ):
+        """Radii of the plays, in units of half a line's range.
+
+        ring: the chambers are alike and stand in a ring, so that one chamber's weights, turned,
+        are those of all; pairs: lines along pairs of neighbours beside those along one chamber.
+        """
+        super().__init__(facts)
+        chambers = len(facts.low)
+        self.radii, self.ring, self.pairs = tuple(radii), bool(ring), bool(pairs)
+        centre, half = centre_and_half(facts.low, facts.high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
-        self.register_buffer("origin", rest)
+        self.register_buffer("origin", facts.rest.clone())
         self.register_buffer("radius", torch.tensor(self.radii))
         self.register_buffer("use", torch.ones(chambers))
         lines = first_lines(chambers)
+        if not self.pairs:
+            lines = lines[:chambers]
         self.linear = nn.Parameter(lines)
         self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
-        shape = (chambers, len(lines), len(self.radii))
-        self.weight = nn.Parameter(torch.zeros(shape))
-        self.slope = nn.Parameter(torch.zeros(shape))
+        if self.ring:
+            self.turned = nn.Parameter(torch.zeros(len(lines), len(self.radii)))
+            self.register_buffer("turns", turns(chambers, len(lines)), persistent=False)
+        else:
+            shape = (chambers, len(lines), len(self.radii))
+            self.weight = nn.Parameter(torch.zeros(shape))
+            self.slope = nn.Parameter(torch.zeros(shape))
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        if self.ring:
+            return {"turned": self.turned}
+        return {"weight": self.weight, "slope": self.slope}
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        """Alike chambers, each with lines of its own, and with those of pairs too."""
+        return [
+            cls(facts, FEW_RADII, ring=True, pairs=False),
+            cls(facts, FEW_RADII, ring=True, pairs=True),
+        ][: 1 if len(facts.low) == 1 else 2]
+
+    def use_chambers(self, use: Tensor) -> None:
+        self.use.copy_(use)
 
     def lines(self, signal: Tensor) -> Tensor:
         """(..., L) inputs of the lines' plays from the actuation (..., m)."""
@@ -63,11 +98,11 @@ class Hysteresis(Effect):
         """(B, L, J) plays centred on the lines at the actuation (B, m): no history."""
         return self.lines(signal)[..., None].expand(*signal.shape[:-1], -1, len(self.radii))
 
-    def advance(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
-        """(B, L, J) plays after the actuation (B, m); dt does not matter."""
+    def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(B, L, J) plays after the actuation (B, m); time does not matter."""
         return self._follow(memory, self.lines(signal))
 
-    def step(self, memory: Tensor, signal: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, memory: Tensor, signal: Tensor, context: Context) -> tuple[Tensor, Tensor]:
         """Plays and effective actuation after the actuation (B, m), its lines computed once."""
         u = self.lines(signal)
         memory = self._follow(memory, u)
@@ -77,7 +112,7 @@ class Hysteresis(Effect):
         u = u.unsqueeze(-1)
         return torch.clamp(memory, u - self.radius, u + self.radius)
 
-    def scan(self, memory: Tensor, signal: Tensor, dt: Tensor) -> Tensor:
+    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, L, J) plays along the actuation (R, T, m), from plays (R, L, J) before it."""
         u = self.lines(signal).unsqueeze(-1)
         return play_scan(u.expand(*u.shape[:-1], len(self.radii)), self.radius, memory)
@@ -88,22 +123,39 @@ class Hysteresis(Effect):
 
     def _superpose(self, signal: Tensor, u: Tensor, memory: Tensor) -> Tensor:
         lag = memory - u.unsqueeze(-1)
-        away = (u - self.lines(self.origin)).unsqueeze(-1)
-        shift = lag.flatten(-2) @ self.weight.flatten(1).T
-        shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
+        weight = self.turned[self.turns] if self.ring else self.weight
+        shift = lag.flatten(-2) @ weight.flatten(1).T
+        if not self.ring:
+            away = (u - self.lines(self.origin)).unsqueeze(-1)
+            shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
         return signal + self.half_range * shift
 
     def config(self) -> dict:
-        return {"radii": list(self.radii)}
+        return {"radii": list(self.radii), "ring": self.ring, "pairs": self.pairs}
 
     def quantities(self) -> list[Quantity]:
-        strength = self.weight.detach().abs().sum(-1) * self.half_range[:, None]
+        weight = (self.turned[self.turns] if self.ring else self.weight).detach()
+        # A full sweep opens each play by its radius on both sides.
+        opened = (weight * self.radius).sum(-1) * self.half_range[:, None]
+        unit = self.facts.unit
+        span = float(self.half_range.max())
+        source = "loops of pneumatic arms are narrower than half the range (Kuhnen 2003; own data)"
         return [
-            Quantity("lines", self.linear.detach().tolist(), ""),
-            Quantity("radius", list(self.radii), "half range"),
-            Quantity("weight", self.weight.detach().tolist(), ""),
-            Quantity("loop", strength.tolist(), "actuation"),
+            Quantity(f"half_loop_{unit}", value_of(opened), unit, -span, span, source),
+            Quantity("line_share", value_of(self.linear), "", -3.0, 3.0, "a mixture of shares"),
+            Quantity("radius_share", list(self.radii), "", 0.0, 1.0, "Krasnosel'skii 1989, ch. 1"),
         ]
+
+
+def turns(chambers: int, lines: int) -> Tensor:
+    """(m, L) which of the first chamber's lines each line is to each chamber of a ring."""
+    answer = []
+    for chamber in range(chambers):
+        row = [(line - chamber) % chambers for line in range(chambers)]
+        pairs = lines - chambers
+        row += [chambers + (pair - chamber) % pairs for pair in range(pairs)]
+        answer.append(row)
+    return torch.tensor(answer)
 
 
 def first_lines(chambers: int) -> Tensor:

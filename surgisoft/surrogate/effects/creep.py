@@ -1,0 +1,113 @@
+"""Creep: a held load goes on deforming the wall, over decades of time.
+
+Kelvin-Voigt elements with retardation times tau_k, spaced evenly in log(tau), each follow the load
+with delay; their shares w_k are the log-normal spectrum that Wiechert (1893) proposed for real
+solids. A narrow one is a single time, a wide one makes the power law t^n (Findley 1976, ch. 5):
+
+    z_k' = (g(x) - z_k) / tau_k,    g(x) = x |x|^(power - 1),
+    w_k ~ exp(-(log(tau_k / tau) / width)^2 / 2),   sum_k w_k = 1,
+    x_eff = x + amount sum_k w_k z_k,               x = load, 0 at rest and 1 at full actuation.
+
+The load is held between two rows, and each element is integrated exactly.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Context,
+    Effect,
+    Quantity,
+    amplitude,
+    logarithm,
+    value_of,
+)
+from surgisoft.surrogate.scan import linear_scan
+
+TIMES = torch.logspace(-0.45, 2.55, 11, dtype=torch.float64)
+"""(K,) retardation times, 0.35 to 350 s, a factor of 2 apart."""
+SMALL = 1e-3
+"""Load below which the power law is smoothed to a straight line."""
+GRID = (
+    (0.8, 0.5),
+    (2.5, 0.5),
+    (8.0, 0.5),
+    (25.0, 0.5),
+    (80.0, 0.5),
+    (4.0, 1.6),
+    (20.0, 2.0),
+    (90.0, 2.5),
+)
+"""(tau in s, width in natural logarithms) that a diagnosis tries."""
+
+
+class Creep(Effect):
+    """Retarded loads over decades of time, the same for all chambers."""
+
+    stage = "material"
+
+    def __init__(
+        self, facts: ArmFacts, tau_s: float = 10.0, width: float = 1.5, power: float = 1.0
+    ):
+        """Centre of the spectrum, s, its width in natural logarithms, and the load's power."""
+        super().__init__(facts)
+        self.register_buffer("times", TIMES.float(), persistent=False)
+        self.amount = amplitude(1)
+        self.log_tau = logarithm(tau_s)
+        self.log_width = logarithm(width)
+        self.log_power = logarithm(power)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"amount": self.amount}
+
+    def memory_parameters(self) -> list[nn.Parameter]:
+        return [self.log_power]
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        return [cls(facts, tau, width) for tau, width in GRID]
+
+    @property
+    def spectrum(self) -> Tensor:
+        """(K,) share of each retardation time."""
+        distance = (self.times.log() - self.log_tau) / self.log_width.exp()
+        return torch.softmax(-0.5 * distance.square(), dim=0)
+
+    def pull(self, signal: Tensor) -> Tensor:
+        """(..., m) the load to its power, from the actuation (..., m)."""
+        x = self.load(signal)
+        return x * (x.square() + SMALL**2).pow((self.log_power.exp() - 1) / 2)
+
+    def rest(self, signal: Tensor) -> Tensor:
+        """(B, m, K) elements that have not crept yet, as after a long time at no load."""
+        return signal.new_zeros(*signal.shape, len(self.times))
+
+    def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(B, m, K) retarded loads after the actuation (B, m)."""
+        keep = torch.exp(-context.dt_s[..., None, None] / self.times)
+        return keep * memory + (1 - keep) * self.pull(signal).unsqueeze(-1)
+
+    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(R, T, m, K) retarded loads along the actuation (R, T, m)."""
+        keep = torch.exp(-context.dt_s[..., None, None] / self.times)
+        return linear_scan(keep, (1 - keep) * self.pull(signal).unsqueeze(-1), memory)
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Effective actuation (..., m) from actuation (..., m) and retarded loads (..., m, K)."""
+        return signal + self.amount * self.reach * (memory @ self.spectrum)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        return (self.reach * (memory @ self.spectrum)).unsqueeze(0).detach()
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        rubber = "silicone rubber creeps by 2 to 30 % in ten minutes (Findley 1976, ch. 5)"
+        return [
+            Quantity("amount_share", value_of(self.amount), "", 0.0, 1.0, rubber),
+            Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.1, 2000.0, "times of TIMES"),
+            Quantity("width_log", value_of(self.log_width.exp()), "", 0.1, 6.0, "Wiechert 1893"),
+            Quantity("power", value_of(self.log_power.exp()), "", 0.5, 3.0, "Findley 1976, ch. 5"),
+        ]

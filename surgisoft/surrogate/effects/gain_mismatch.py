@@ -1,0 +1,38 @@
+"""Gain mismatch: chambers of one make push unequally.
+
+Area, wall and pressure sensor of a chamber differ from the nominal ones by a constant factor:
+
+    x_eff_i = x_i + gain_i x_i,      x = load, 0 at rest and 1 at full actuation.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude
+
+
+class GainMismatch(Memoryless):
+    """A gain for each chamber."""
+
+    stage = "material"
+
+    def __init__(self, facts: ArmFacts):
+        super().__init__(facts)
+        self.gain = amplitude(len(facts.low))
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"gain": self.gain}
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Effective actuation (..., m) from actuation (..., m)."""
+        return signal + self.gain * (signal - self.origin)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        return torch.diag_embed((signal - self.origin).detach()).movedim(-1, 0)
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        cast = "moulded chambers differ by up to a third (Marchese et al. 2015)"
+        return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]

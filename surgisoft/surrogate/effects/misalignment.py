@@ -1,0 +1,50 @@
+"""Misalignment: the cameras' frame is turned, shifted and scaled against the arm's base frame.
+
+    q = (1 + scale) R(turn) p + shift
+
+with R the rotation by the vector `turn` (Rodrigues 1840): the similarity between two frames of
+Umeyama (1991, eq. 40).
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
+from surgisoft.surrogate.rotation import rotate
+
+
+class Misalignment(Memoryless):
+    """A similarity between the frame of the arm's base and that of the measurement."""
+
+    stage = "sensor"
+
+    def __init__(self, facts: ArmFacts):
+        super().__init__(facts)
+        self.turn = amplitude(3)
+        self.shift = amplitude(3)
+        self.scale = amplitude(1)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"turn": self.turn, "shift": self.shift, "scale": self.scale}
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Measured key points (..., n, 3) from the true ones, mm."""
+        turned = rotate(signal, self.turn)
+        return turned + self.scale * turned + self.shift
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        axes = torch.eye(3, dtype=signal.dtype, device=signal.device)
+        axes = axes.view(3, *[1] * (signal.ndim - 1), 3).expand(3, *signal.shape)
+        p = signal.detach()
+        return torch.cat([torch.linalg.cross(axes, p.expand(axes.shape)), axes, p.unsqueeze(0)])
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        setup = "beyond it the base frame was set up wrongly, not a little off"
+        return [
+            Quantity("turn_rad", value_of(self.turn), "rad", -0.3, 0.3, setup),
+            Quantity("shift_mm", value_of(self.shift), "mm", -20.0, 20.0, setup),
+            Quantity("scale_share", value_of(self.scale), "", -0.1, 0.1, "a wand's calibration"),
+        ]

@@ -1,0 +1,97 @@
+"""Several processes that learn one policy: started by torchrun, gradients averaged by rsl-rl.
+
+rsl-rl itself opens nccl only; here gloo is opened on CPUs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+
+from surgisoft.errors import InputError
+
+
+@dataclass(frozen=True)
+class Processes:
+    """The processes that train together, seen from one of them."""
+
+    rank: int = 0
+    """Number of this process."""
+    count: int = 1
+    """How many there are."""
+    local: int = 0
+    """Number of this process on its machine: its GPU."""
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes the run."""
+        return self.rank == 0
+
+    @property
+    def rsl_rl(self) -> dict | None:
+        """What rsl-rl wants to know; None for a process alone."""
+        if self.count == 1:
+            return None
+        return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.count}
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in any process."""
+        if self.count == 1:
+            return flag
+        value = torch.tensor([float(flag)], device=_device())
+        dist.all_reduce(value, op=dist.ReduceOp.MAX)
+        return bool(value.item())
+
+    def of_leader(self, value: float) -> float:
+        """The leader's number, in every process."""
+        if self.count == 1:
+            return value
+        held = torch.tensor([value], dtype=torch.float64, device=_device())
+        dist.broadcast(held, src=0)
+        return held.item()
+
+    def gather(self, value) -> list | None:
+        """What each process has, in the leader; None in the others."""
+        if self.count == 1:
+            return [value]
+        answer = [None] * self.count if self.leads else None
+        dist.gather_object(value, answer, dst=0)
+        return answer
+
+    def wait(self) -> None:
+        """Until every process has come here."""
+        if self.count > 1:
+            dist.barrier()
+
+
+def _device() -> torch.device:
+    nccl = dist.get_backend() == "nccl"
+    return torch.device("cuda", torch.cuda.current_device()) if nccl else torch.device("cpu")
+
+
+@contextlib.contextmanager
+def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
+    """This process among those that torchrun started, and its device."""
+    kind = torch.device(device)
+    if kind.type not in ("cpu", "cuda"):
+        raise InputError(f"--device '{device}': expected cpu or cuda")
+    if kind.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"--device '{device}': PyTorch sees no GPU here; use --device cpu")
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Processes(), kind
+        return
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    if kind.type == "cuda":
+        kind = torch.device("cuda", local)
+        torch.cuda.set_device(kind)
+    dist.init_process_group("nccl" if kind.type == "cuda" else "gloo")
+    try:
+        yield Processes(dist.get_rank(), count, local), kind
+    finally:
+        dist.destroy_process_group()

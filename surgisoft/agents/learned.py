@@ -1,0 +1,94 @@
+"""Trained policies as drivers: from a run's folder alone, or while they are being trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from surgisoft.agents.policy_network import KiloPascals, empty_actor
+from surgisoft.agents.run_folder import BEST, LAST, RunFolder
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.base import Episodes, Task, TaskState
+
+
+class Policies:
+    """Each agent's actor, without noise."""
+
+    def __init__(self, actors: Mapping[str, KiloPascals]):
+        self.actors = dict(actors)
+
+    @torch.inference_mode()
+    def act(
+        self, task: Task, state: TaskState, observations: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """As for `Driver`; the task and its true state are not looked at."""
+        return {agent: self.actors[agent](observations[agent]) for agent in task.agents}
+
+
+class LearnedPolicy(Policies):
+    """The policies in a training run's folder."""
+
+    def __init__(self, folder: str | Path, task: Task | None = None, which: str | None = None):
+        """which: `best` (by evaluation) or `last`; None: the best one if there is one yet.
+
+        task: where they shall act, which must have the same agents, observations and actions.
+        """
+        if which not in (None, BEST, LAST):
+            raise unknown_name("checkpoint", which, (BEST, LAST))
+        self.run = RunFolder(folder)
+        if which is None:
+            which = BEST if self.run.checkpoint(BEST).is_file() else LAST
+        device = task.world.device if task else "cpu"
+        saved, plan = self.run.load(which, device), self.run.plan()
+        self.which, self.iteration = which, saved["iteration"]
+        actors = {}
+        for agent, size in self.run.agents.items():
+            actor = empty_actor(agent, size["observation"], size["chambers"], plan.preset)
+            weights = saved["agents"][agent]
+            actor.load_state_dict(weights if which == BEST else weights["actor_state_dict"])
+            kilo_pascals = KiloPascals(actor, plan.preset.action_kPa, size["step_kPa"])
+            actors[agent] = kilo_pascals.to(device).eval().requires_grad_(False)
+        super().__init__(actors)
+        if task is not None:
+            check_fits(self.run, task)
+
+
+def agent_sizes(task: Task) -> dict[str, dict]:
+    """agent -> `observation` (its width), `chambers` and `step_kPa` of a task."""
+    with torch.inference_mode():
+        play = Episodes(task)
+        seen = play.observe(play.seeded(0, 1))
+    return {
+        agent: {
+            "observation": seen[agent].shape[1],
+            "chambers": task.world.arms[agent].chambers,
+            "step_kPa": task.world.arms[agent].pneumatics.step_kPa,
+        }
+        for agent in task.agents
+    }
+
+
+def check_fits(run: RunFolder, task: Task) -> None:
+    """Raise unless the run's policies see and do what the task's agents see and do."""
+    sizes, place = agent_sizes(task), f"{run.path} was trained on {run.config['task']}"
+    if list(sizes) != list(run.agents):
+        raise InputError(
+            f"{place} with agents {', '.join(run.agents)}; task '{task.name}' has "
+            f"{', '.join(sizes)}"
+        )
+    for agent, size in sizes.items():
+        if size != run.agents[agent]:
+            raise InputError(
+                f"{place}, where '{agent}' has {_words(run.agents[agent])}; in task "
+                f"'{task.name}' as given here it has {_words(size)}"
+            )
+
+
+def _words(size: dict) -> str:
+    return (
+        f"{size['observation']} observations, {size['chambers']} chambers and steps of "
+        f"{size['step_kPa']} kPa"
+    )

@@ -1,0 +1,122 @@
+"""One PPO of rsl-rl for each agent, on one world, and the loop that turns both at once."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+from torch import Tensor
+
+from surgisoft.agents.distributed import Processes
+from surgisoft.agents.policy_network import network_config, noise_config
+from surgisoft.agents.presets import Preset
+from surgisoft.agents.vec_env import STATE, JointEnv
+
+
+def algorithm_config(agent: str, preset: Preset, processes: Processes) -> dict:
+    """rsl-rl's configuration of one agent; a fresh one each time, for rsl-rl writes into it."""
+    return {
+        "obs_groups": {"actor": [agent], "critic": [STATE]},
+        "num_steps_per_env": preset.rollout,
+        "actor": {
+            "class_name": "MLPModel",
+            **network_config(preset),
+            "distribution_cfg": noise_config(preset),
+        },
+        "critic": {"class_name": "MLPModel", **network_config(preset)},
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": preset.epochs,
+            "num_mini_batches": preset.batches,
+            "gamma": preset.gamma,
+            "lam": preset.lam,
+            "clip_param": preset.clip,
+            "entropy_coef": preset.entropy,
+            "learning_rate": preset.learning_rate,
+            "schedule": "fixed" if preset.desired_kl is None else "adaptive",
+            "desired_kl": preset.desired_kl,
+        },
+        "multi_gpu": processes.rsl_rl,
+    }
+
+
+def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
+    """Agent -> its PPO: an actor of its own, a critic that sees the joint state."""
+    seen, answer, device = env.get_observations().clone(), {}, env.task.world.device
+    for agent in env.task.agents:
+        view = SimpleNamespace(
+            num_envs=env.num_envs, num_actions=env.task.world.arms[agent].chambers
+        )
+        config = algorithm_config(agent, preset, processes)
+        with contextlib.redirect_stdout(io.StringIO()):
+            ppo = PPO.construct_algorithm(seen.select(agent, STATE), view, config, str(device))
+        with torch.no_grad():
+            # Before it has learned anything a policy asks for next to nothing.
+            ppo.get_policy().mlp[-1].weight.mul_(0.01)
+            ppo.get_policy().mlp[-1].bias.zero_()
+        ppo.train_mode()
+        answer[agent] = ppo
+    return answer
+
+
+def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:
+    """The actions' deviation after a share 0..1 of the training, where it is scheduled."""
+    if preset.last_noise is not None:
+        first, last = math.log(preset.noise), math.log(preset.last_noise)
+        with torch.no_grad():
+            ppo.get_policy().distribution.log_std_param.fill_(first + progress * (last - first))
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Means over the steps of a rollout."""
+
+    rewards: dict[str, float]
+    """agent -> reward of a step."""
+    terms: dict[str, float]
+    """agent/term -> reward of a step."""
+    measures: dict[str, float]
+    """name -> measure, where it applies; nan where it never did."""
+    episodes: int
+    """Episodes that came to their end."""
+
+
+@torch.inference_mode()
+def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
+    """Play `steps` steps into the agents' storages; the last observations, and `Gathered`."""
+    sums: dict[str, Tensor] = {}
+    counts: dict[str, Tensor] = {}
+
+    def note(name: str, value: Tensor) -> None:
+        known = value.isfinite()
+        sums[name] = sums.get(name, 0.0) + value.nan_to_num(0.0, 0.0, 0.0).sum()
+        counts[name] = counts.get(name, 0) + known.sum()
+
+    for _ in range(steps):
+        actions = {agent: ppo.act(seen.select(agent, STATE)) for agent, ppo in agents.items()}
+        seen, rewards, dones, extras = env.step(actions)
+        for agent, ppo in agents.items():
+            ppo.process_env_step(
+                seen.select(agent, STATE), rewards[agent], dones, {"time_outs": extras["time_outs"]}
+            )
+            note(f"reward/{agent}", rewards[agent])
+            for term, value in extras["terms"][agent].items():
+                note(f"term/{agent}/{term}", value)
+        for name, value in extras["measures"].items():
+            note(f"measure/{name}", value)
+        note("done", dones.float())
+    for agent, ppo in agents.items():
+        ppo.compute_returns(seen.select(agent, STATE))
+    means = {name: (value / counts[name]).item() for name, value in sums.items()}
+
+    def part(prefix: str) -> dict[str, float]:
+        return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
+
+    ended = int(sums["done"].item())
+    return seen, Gathered(part("reward/"), part("term/"), part("measure/"), ended)

@@ -1,0 +1,90 @@
+"""What training is told: presets, and how long each task is trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from surgisoft.errors import InputError, unknown_name
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Hyper-parameters of one PPO for each agent (Schulman et al. 2017), and of its networks."""
+
+    envs: int = 1024
+    """Episodes that run side by side."""
+    rollout: int = 24
+    """Steps of each episode between two updates."""
+    epochs: int = 5
+    """Passes over those steps in an update."""
+    batches: int = 4
+    """Minibatches of a pass."""
+    gamma: float = 0.9
+    """Discount of a step."""
+    lam: float = 0.7
+    """Lambda of generalised advantage estimation (Schulman et al. 2016)."""
+    clip: float = 0.2
+    """Clipping of the probability ratio."""
+    entropy: float = 0.0
+    """Weight of the entropy bonus."""
+    learning_rate: float = 1e-3
+    """First learning rate of Adam."""
+    desired_kl: float | None = 0.01
+    """The learning rate is adapted to this KL divergence of an update; None: it is not."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actors and critics."""
+    activation: str = "tanh"
+    """Activation of the hidden layers, by rsl-rl's name."""
+    normalise: bool = False
+    """Whether observations are normalised by their running mean and deviation. The tasks' own are
+    of the order of 1, and a normaliser that moves changes the policy below the learner's feet."""
+    action_kPa: float = 1.0
+    """Change of pressure for an output of 1, kPa; the pumps' own limit holds besides."""
+    noise: float = 0.5
+    """First standard deviation of the actions, in outputs."""
+    last_noise: float | None = 0.03
+    """The deviation falls to this, evenly in its logarithm, until the end; None: it is learned."""
+    evaluate_every: int = 25
+    """Updates between two evaluations."""
+    evaluation_episodes: int = 32
+    """Episodes of an evaluation."""
+
+    def __post_init__(self):
+        for name in ("envs", "rollout", "epochs", "batches", "learning_rate", "action_kPa"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"preset: {name} is {getattr(self, name)}, expected more than 0")
+        if (self.envs * self.rollout) // self.batches < 2:
+            raise InputError(
+                f"preset: {self.envs} envs x {self.rollout} steps in {self.batches} minibatches "
+                "leaves fewer than 2 samples in each; take more envs"
+            )
+
+
+PRESETS: dict[str, Preset] = {
+    "fast": Preset(),
+    "paper": Preset(
+        envs=64,
+        rollout=64,
+        gamma=0.99,
+        lam=0.95,
+        clip=0.2,
+        entropy=0.01,
+        learning_rate=3e-4,
+        desired_kl=None,
+        action_kPa=3.0,
+        noise=1.0,
+        last_noise=None,
+    ),
+}
+"""Every preset by name. `paper`: Chen et al. (2025, sec. IV-A): 4096 steps an update, discount
+0.99, lambda 0.95, entropy 0.01, clipping 0.2, two layers of 64; what it does not name is as in
+Schulman et al. (2017)."""
+
+
+def preset_of(name: str, **changes) -> Preset:
+    """The named preset with some fields changed; an unknown name answers with the known ones."""
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    return replace(
+        PRESETS[name], **{key: value for key, value in changes.items() if value is not None}
+    )

@@ -1,0 +1,208 @@
+"""A training run is a folder that opens by itself: it takes scene and arm models along.
+
+`config.json` says what was asked for, `metrics.jsonl` what happened, `arms/` and `scene/` hold what
+the world was made of, `checkpoints/last.pt` all that training goes on from, `best.pt` the policies
+that did best in evaluation. Checkpoints are read as plain tensors and numbers: none runs code.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import shutil
+import tempfile
+from dataclasses import asdict, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import surgisoft
+from surgisoft.agents.plan import Plan
+from surgisoft.agents.presets import Preset
+from surgisoft.errors import InputError
+from surgisoft.scene.folder import open_scene
+from surgisoft.scene.spec import FILE
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.tasks.base import Task
+from surgisoft.tasks.configs import config_from, config_table, with_fields
+from surgisoft.tasks.registry import make_task
+from surgisoft.toml_config import to_table, write_atomically, write_toml
+
+FORMAT = 1
+"""Version of the folder's layout."""
+LAST, BEST = "last", "best"
+"""The two checkpoints."""
+
+
+def default_folder(task: str) -> Path:
+    """A free `runs/TASK-DATE-TIME`."""
+    base = Path("runs") / f"{task}-{datetime.now():%Y%m%d-%H%M%S}"
+    tries = (base.with_name(f"{base.name}-{i}") if i else base for i in range(1000))
+    return next(path for path in tries if not path.exists())
+
+
+def check_free(folder: Path) -> None:
+    """Raise unless a new run may be written there."""
+    above = next(parent for parent in folder.absolute().parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
+    if (folder / "config.json").is_file():
+        raise InputError(
+            f"{folder}: a run is already there; go on with --resume {folder} or choose another name"
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: already there; choose another name")
+
+
+def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: int) -> RunFolder:
+    """Write a new run, whole or not at all; `agents`: agent -> its widths, see `config.json`."""
+    check_free(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        for name, arm in task.world.arms.items():
+            (fresh / "arms").mkdir(exist_ok=True)
+            save_model(arm.model, fresh / "arms" / name)
+        scene = _copied_scene(plan, fresh)
+        config = {
+            "format": FORMAT,
+            "versions": versions(),
+            "started": datetime.now().isoformat(timespec="seconds"),
+            "task": plan.task,
+            "task_config": config_table(plan.task_config),
+            "scene": scene,
+            "arms": {
+                name: {"model": arm.model.summary(), "effects": [*arm.model.effects]}
+                for name, arm in task.world.arms.items()
+            },
+            "agents": agents,
+            "preset": plan.preset_name,
+            "hyper_parameters": asdict(plan.preset),
+            "steps": plan.steps,
+            "minutes": plan.minutes,
+            "target_error": plan.target_error,
+            "seed": plan.seed,
+            "processes": processes,
+        }
+        (fresh / "checkpoints").mkdir()
+        (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
+        fresh.chmod(0o755)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(fresh, folder)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+    return RunFolder(folder)
+
+
+def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
+    """The scene in the run's folder, its mounts told the run's own arm models."""
+    source = getattr(plan.task_config, "scene", None)
+    if source is None:
+        return None
+    scene = open_scene(source)
+    (fresh / "scene").mkdir()
+    for name in {body.mesh for body in scene.spec.bodies}:
+        target = fresh / "scene" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(scene.folder / name, target)
+    mounts = tuple(replace(mount, arm=f"../arms/{mount.tool}") for mount in scene.spec.mounts)
+    write_toml(fresh / "scene" / FILE, to_table(replace(scene.spec, mounts=mounts)))
+    return {"from": str(source), "hash": scene.content_hash}
+
+
+def versions() -> dict[str, str]:
+    """What the run was computed with."""
+    from importlib.metadata import version
+
+    return {
+        "surgisoft": surgisoft.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "rsl-rl-lib": version("rsl-rl-lib"),
+    }
+
+
+class RunFolder:
+    """A run that is there."""
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        file = self.path / "config.json"
+        if not file.is_file():
+            raise InputError(
+                f"{path}: no training run there (config.json missing); make one with "
+                "'surgisoft train'"
+            )
+        try:
+            self.config = json.loads(file.read_text())
+            known = self.config["format"] == FORMAT and "hyper_parameters" in self.config
+        except (ValueError, KeyError, TypeError):
+            known = False
+        if not known:
+            raise InputError(f"{file}: no training run of format {FORMAT}; train it anew")
+
+    @property
+    def agents(self) -> dict[str, dict]:
+        """agent -> `observation` (its width), `chambers` and `step_kPa`."""
+        return self.config["agents"]
+
+    def plan(self) -> Plan:
+        """What was asked for; its world is made of what the folder holds."""
+        c = self.config
+        parameters = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in c["hyper_parameters"].items()
+        }
+        return Plan(
+            task=c["task"],
+            task_config=self._task_config(),
+            preset_name=c["preset"],
+            preset=Preset(**parameters),
+            steps=c["steps"],
+            minutes=c["minutes"],
+            target_error=c["target_error"],
+            seed=c["seed"],
+        )
+
+    def _task_config(self):
+        config = config_from(self.config["task"], self.config["task_config"], self._file)
+        if self.config["scene"]:
+            return with_fields(config, scene=str(self.path / "scene"), arm=None)
+        return with_fields(config, arm=str(self.path / "arms" / "arm"))
+
+    @property
+    def _file(self) -> Path:
+        return self.path / "config.json"
+
+    def task(self, device: str | torch.device = "cpu") -> Task:
+        """The task that the run trains, from the folder alone."""
+        return make_task(self.config["task"], self._task_config(), device)
+
+    def checkpoint(self, which: str) -> Path:
+        """The file of `last` or `best`."""
+        return self.path / "checkpoints" / f"{which}.pt"
+
+    def save(self, which: str, content: dict[str, Any]) -> None:
+        """Write a checkpoint, whole or not at all."""
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_atomically(self.checkpoint(which), buffer.getvalue())
+
+    def load(self, which: str, device: str | torch.device = "cpu") -> dict[str, Any]:
+        """A checkpoint; opening it runs no code of it."""
+        file = self.checkpoint(which)
+        if not file.is_file():
+            raise InputError(
+                f"{file}: there is no such checkpoint yet; go on with 'surgisoft train --resume "
+                f"{self.path}'"
+            )
+        try:
+            return torch.load(file, map_location=device, weights_only=True)
+        except Exception as error:
+            raise InputError(f"{file}: damaged checkpoint ({str(error)[:100]})") from error

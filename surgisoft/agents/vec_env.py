@@ -1,0 +1,97 @@
+"""Episodes of a task in rsl-rl's terms; they translate and nothing else.
+
+`JointEnv` has all agents at once and is what training steps; `OneAgentEnv` is rsl-rl's own `VecEnv`
+for tasks of one agent, for rsl-rl's runners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes, Task
+
+STATE = "state"
+"""Observation group of the critics: what all agents observe, one after the other."""
+
+
+class JointEnv:
+    """B episodes of any task, all agents at once; one that is over begins anew in the same step.
+
+    Actions are in shares of `action_kPa`, so that a policy's output is of the order of 1.
+    """
+
+    def __init__(self, task: Task, count: int, seed: int, action_kPa: float, first: int = 0):
+        """Episodes `first` to `first + count - 1` of a seed, each at another point of its time."""
+        self.task, self.num_envs, self.action_kPa = task, count, action_kPa
+        self.episodes = Episodes(task)
+        with torch.inference_mode():
+            state = self.episodes.seeded(seed, count, first)
+            # Else all episodes would be over in the same step for ever.
+            spread = (first + torch.arange(count, device=task.world.device)) * 7919 % task.steps
+            self.state = replace(state, world=replace(state.world, steps=spread))
+
+    @torch.inference_mode()
+    def get_observations(self) -> TensorDict:
+        """Agent -> (B, D), and `STATE` -> (B, sum of D); new tensors each time."""
+        seen = self.episodes.observe(self.state)
+        joint = torch.cat([seen[agent] for agent in self.task.agents], 1)
+        return TensorDict({**seen, STATE: joint}, batch_size=[self.num_envs])
+
+    @torch.inference_mode()
+    def step(
+        self, actions: Mapping[str, Tensor]
+    ) -> tuple[TensorDict, dict[str, Tensor], Tensor, dict]:
+        """Agent -> (B, m) shares of `action_kPa` in; observations, rewards, dones, extras out.
+
+        rewards: agent -> (B,); dones: (B,) bool; extras hold `time_outs` (B,) bool, reward `terms`
+        (agent -> term -> (B,)) and `measures` (name -> (B,)) of the step, as rsl-rl wants them.
+        """
+        asked = {agent: self.action_kPa * action for agent, action in actions.items()}
+        state, outcome = self.episodes.step(self.state, asked, in_place=True)
+        self.state = self.episodes.reset(state, outcome.done, in_place=True)
+        extras = {
+            "time_outs": outcome.truncated,
+            "terms": outcome.terms,
+            "measures": outcome.measures,
+        }
+        return self.get_observations(), outcome.rewards, outcome.done, extras
+
+
+class OneAgentEnv(VecEnv):
+    """rsl-rl's VecEnv for a task of one agent: groups NAME (the agent's) and `STATE`."""
+
+    def __init__(self, task: Task, count: int, seed: int = 0, action_kPa: float = 1.0):
+        if len(task.agents) != 1:
+            raise InputError(
+                f"task '{task.name}' has agents {', '.join(task.agents)}, expected one; "
+                "use JointEnv"
+            )
+        self.joint, self.agent = JointEnv(task, count, seed, action_kPa), task.agents[0]
+        self.num_envs, self.num_actions = count, task.world.arms[self.agent].chambers
+        self.max_episode_length, self.device = task.steps, task.world.device
+        self.cfg = {"task": task.name, "seed": seed, "action_kPa": action_kPa}
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """(B,) int64: steps since each episode began."""
+        return self.joint.state.world.steps
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: Tensor) -> None:
+        state = self.joint.state
+        self.joint.state = replace(state, world=replace(state.world, steps=steps))
+
+    def get_observations(self) -> TensorDict:
+        return self.joint.get_observations()
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        seen, rewards, dones, extras = self.joint.step({self.agent: actions})
+        log = {f"/{name}": value.mean() for name, value in extras["terms"][self.agent].items()}
+        return seen, rewards[self.agent], dones, {"time_outs": extras["time_outs"], "log": log}

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from surgisoft.cli import run
@@ -19,6 +20,10 @@ from surgisoft.scene.folder import open_scene, rounded_mount
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
+from surgisoft.tasks.pneumatics import Pneumatics
+from surgisoft.tasks.streams import streams
+from surgisoft.tasks.world import WorldConfig, lone_arm
+from surgisoft.tasks.world_arm import Randomisation
 from tests.scene.shapes import ball, box, lumpy
 
 
@@ -75,9 +80,9 @@ def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
     assert np.all((length >= 20.0) & (length <= 60.0))
     cosine = np.einsum("ij,ij->i", -cut.directions, ring.normals)
     assert np.degrees(np.arccos(cosine)).max() <= 60.0
-    # the arm keeps its length from the mount's own base
+    # the arm keeps its length from the mount's own base, but for what pressure makes it stretch
     base = scene.spec.mount("laser").pose()[:3, 3]
-    np.testing.assert_allclose(cut.lines_mm[:, 1], np.tile(base, (72, 1)), atol=1e-9)
+    np.testing.assert_allclose(cut.lines_mm[:, 1], np.tile(base, (72, 1)), atol=0.3)
     arc = np.linalg.norm(np.diff(cut.lines_mm[:, 1:], axis=1), axis=2).sum(axis=1)
     assert np.all((arc > 69.5) & (arc < 70.0 * 1.15 + 0.1))
     # neighbours are near enough that nothing fits in between
@@ -164,6 +169,32 @@ def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, cap
     error = capsys.readouterr().err
     assert f"{folder / FILE}:{line}: mounts[1].arm: there is no arm model 'nosuch'" in error
     assert error.count("\n") == 1
+
+
+def test_a_mount_of_another_length_than_its_model_is_told(made, tmp_path, capsys):
+    mounts = list(open_scene(made[1]).spec.mounts)
+    mounts[0] = dataclasses.replace(mounts[0], length_mm=120.0)
+    folder = scene_with(made, tmp_path, mounts=tuple(mounts))
+    assert run(["scene", "check", str(folder)]) == 2
+    error = capsys.readouterr().err
+    assert "mounts[0].length_mm: got 120 mm for an arm model of 70 mm" in error
+
+
+def test_the_tables_shapes_are_those_that_the_tasks_bend(made):
+    """A world's arm taken from rest to some of the table's commands, to its memory's width."""
+    reach = reaches_of(open_scene(made[1]))["laser"]
+    free = WorldConfig(
+        samples=15,
+        pneumatics=Pneumatics(step_kPa=100.0, tau_s=0.0),
+        randomisation=Randomisation(history=0, start_kPa=0.0),
+    )
+    world = lone_arm(free)
+    state = world.start(streams(0, 5))
+    which = np.linspace(0, len(reach.commands) - 1, 5).astype(int)
+    action = torch.tensor(reach.commands[which], dtype=torch.float32)
+    part = world.step(state, {"arm": action}).arms["arm"]
+    np.testing.assert_allclose(part.line_mm.numpy(), reach.centreline_mm[which], atol=1.0)
+    np.testing.assert_allclose(part.tip_direction.numpy(), reach.tip_direction[which], atol=0.05)
 
 
 def test_the_patch_agrees_with_the_ring(made):
@@ -261,7 +292,9 @@ def test_an_existing_folder_is_kept(made, tmp_path, capsys):
 def test_a_scene_without_its_mesh_is_one_line(made, tmp_path):
     folder = scene_with(made, tmp_path)
     (folder / "rod.ply").unlink()
-    with pytest.raises(InputError, match=r"bodies\[1\]\.mesh: there is no file 'rod\.ply'"):
+    line = 1 + (folder / FILE).read_text().splitlines().index('mesh = "rod.ply"')
+    place = rf"scene\.toml:{line}: bodies\[1\]\.mesh: there is no file 'rod\.ply'"
+    with pytest.raises(InputError, match=place):
         open_scene(folder)
 
 

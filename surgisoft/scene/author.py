@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene, rounded_mount
+from surgisoft.scene.index import used_indices
 from surgisoft.scene.mesh import ROLES, Body, Mesh
 from surgisoft.scene.meshio import (
     MM_PER_UNIT,
@@ -115,7 +117,7 @@ class NoMounts(InputError):
         self.notes = notes
 
 
-def prepare(request: Request) -> Prepared:
+def prepare(request: Request, report: Report = lambda done, total, note: None) -> Prepared:
     """Read and repair every file; an InputError says why one cannot be used."""
     for role in request.roles:
         if role not in ROLES:
@@ -128,9 +130,11 @@ def prepare(request: Request) -> Prepared:
         raise unknown_name("unit", request.unit, MM_PER_UNIT)
     notes: list[str] = []
     names, roles, meshes, scales = [], [], [], []
-    for path, role in zip(request.meshes, request.roles, strict=True):
+    for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
+        tell = partial(_tell, report, i, len(request.meshes), path.name)
+        tell("reading")
         parts = read_parts(path)
-        corners = np.concatenate([part.vertices[np.unique(part.faces)] for part in parts])
+        corners = np.concatenate([part.vertices[used_indices(part.faces)[0]] for part in parts])
         size = float(np.ptp(corners, axis=0).max())
         if size == 0.0:
             raise InputError(f"{path}: all vertices are one point; expected a surface")
@@ -143,7 +147,7 @@ def prepare(request: Request) -> Prepared:
         if role == "organ":
             check_organ_size(path, size * scales[-1], told)
         notes.append(f"{path.name}: unit {told}")
-        found = _closed_bodies(path, parts, scales[-1], notes)
+        found = _closed_bodies(path, parts, scales[-1], notes, tell)
         for i, (name, mesh) in enumerate(sorted(found, key=lambda pair: -_area(pair[1]))):
             names.append(_free_name(name, names))
             roles.append(role if i == 0 or role != "organ" else "keep-out")
@@ -161,12 +165,12 @@ def prepare(request: Request) -> Prepared:
     return Prepared(tuple(names), tuple(roles), tuple(meshes), scales[0], shift, tuple(notes))
 
 
-def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
+def _closed_bodies(path, parts, scale, notes, tell) -> list[tuple[str, Mesh]]:
     """Every part repaired; where one is beyond repair, all parts taken as one surface.
 
     If that is beyond repair too, the broken parts are left out, unless nothing is left.
     """
-    found, failures, done = _repaired(path, parts, scale)
+    found, failures, done = _repaired(path, parts, scale, tell)
     if failures and len(parts) > 1:
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         whole = Part(
@@ -174,7 +178,7 @@ def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
             np.concatenate([part.vertices for part in parts]),
             np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
         )
-        together, broken, done_together = _repaired(path, [whole], scale)
+        together, broken, done_together = _repaired(path, [whole], scale, tell)
         if not broken:
             notes.append(f"{path.name}: its {len(parts)} parts make up one surface")
             found, failures, done = together, [], done_together
@@ -188,19 +192,25 @@ def _closed_bodies(path, parts, scale, notes) -> list[tuple[str, Mesh]]:
     return found
 
 
-def _repaired(path, parts, scale) -> tuple[list[tuple[str, Mesh]], list[InputError], dict]:
+def _tell(report: Report, number: int, count: int, name: str, what: str) -> None:
+    """What is done to file `number` of `count`; reading takes the first 5 % of the way."""
+    report(5.0 * number / count, 100, f"{name}: {what}")
+
+
+def _repaired(path, parts, scale, tell) -> tuple[list[tuple[str, Mesh]], list[InputError], dict]:
     """Named closed bodies of the parts, what was beyond repair, and the repairs' counts."""
     found, failures = [], []
     done: dict[str, int] = {}
     for part in parts:
         what = str(path) if len(parts) == 1 else f"{path} ({part.name})"
         try:
-            repaired = repair(part.vertices * scale, part.faces, what)
+            repaired = repair(part.vertices * scale, part.faces, what, tell)
         except InputError as error:
             failures.append(error)
             continue
         for fix in repaired.repairs:
             done[fix.done] = done.get(fix.done, 0) + fix.count
+        tell("looking for buried faces")
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem
@@ -249,7 +259,7 @@ def author(
 
     `mounts` gives each tool's arm (name, length, diameter, shaft); its place is found here.
     """
-    prepared = prepare(request)
+    prepared = prepare(request, report)
     report(5, 100, "meshes read")
     sites = choose_sites(request, prepared)
     report(10, 100, "lesion placed")

@@ -13,7 +13,7 @@ from surgisoft.scene.lesion import Ring, lesion_ring
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.meshio import read_mesh
 from surgisoft.scene.spec import FILE, SceneSpec, load_spec, spec_path
-from surgisoft.toml_config import to_table
+from surgisoft.toml_config import read_toml, to_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +57,11 @@ def open_scene(path: str | Path) -> Scene:
     """Open a scene folder (or its scene.toml); what is missing or bad is one line."""
     spec = load_spec(path)
     folder = spec_path(path).parent
-    bodies = []
+    where, bodies = read_toml(spec_path(path))[1] / "bodies", []
     for i, body in enumerate(spec.bodies):
         if not (folder / body.mesh).is_file():
-            raise InputError(
-                f"{folder / FILE}: bodies[{i}].mesh: there is no file '{body.mesh}'; expected a "
-                "mesh in the scene's folder"
+            raise (where / i / "mesh").error(
+                f"there is no file '{body.mesh}'", "a mesh in the scene's folder"
             )
         bodies.append(Body(body.name, body.role, read_mesh(folder / body.mesh), body.pose()))
     return Scene(spec, folder, tuple(bodies))

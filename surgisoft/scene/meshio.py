@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.scene.index import used_indices
 from surgisoft.scene.mesh import Mesh
 from surgisoft.toml_config import write_atomically
 
@@ -67,6 +68,7 @@ def _check_stl(path: Path) -> None:
     if len(head) == 84 and size == 84 + 50 * count:
         return
     if head.lstrip()[:5].lower() == b"solid":
+        _check_text_stl(path, size)
         return
     if len(head) == 84:
         raise InputError(
@@ -74,6 +76,19 @@ def _check_stl(path: Path) -> None:
             f"file has {size}; it is cut off or not an STL"
         )
     raise InputError(f"{path}: is neither a text nor a binary STL; expected a mesh")
+
+
+def _check_text_stl(path: Path, size: int) -> None:
+    """A text STL that ends before its last line."""
+    with path.open("rb") as file:
+        file.seek(max(0, size - 1024))
+        tail = file.read().lower()
+    if b"endsolid" not in tail:
+        last = tail.splitlines()[-1].strip().decode("ascii", "replace")[-40:]
+        raise InputError(
+            f"{path}: the text STL ends with '{last}'; expected 'endsolid' at its end: it is cut "
+            "off, export or copy it again"
+        )
 
 
 def _load(path: Path) -> tuple[list[Part], int]:
@@ -114,7 +129,7 @@ def _checked(path: Path, part: Part) -> Part:
             f"{path}: a face names vertex {part.faces.max()} of {len(part.vertices)}; "
             "the file is damaged"
         )
-    bad = ~np.isfinite(part.vertices[np.unique(part.faces)]).all(axis=1)
+    bad = ~np.isfinite(part.vertices[used_indices(part.faces)[0]]).all(axis=1)
     if bad.any():
         raise InputError(
             f"{path}: {bad.sum()} of {len(bad)} vertices are NaN or infinite; expected finite "

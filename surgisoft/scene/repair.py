@@ -4,6 +4,7 @@ The order matters: vertices are joined first, then faces are cleaned, wound alik
 bodies turned outwards, and what lies inside another body is taken out.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from surgisoft.errors import InputError
+from surgisoft.scene.index import equal_rows, used_indices
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.winding import winding_numbers
 
@@ -47,27 +49,34 @@ class Repaired:
     """What was done; empty when nothing had to be."""
 
 
-def repair(vertices: np.ndarray, faces: np.ndarray, what: str) -> Repaired:
-    """Closed bodies from vertices (V, 3) mm and faces (F, 3); `what` names them in errors."""
-    used = np.unique(faces)
+def repair(
+    vertices: np.ndarray, faces: np.ndarray, what: str, tell: Callable[[str], None] = lambda _: None
+) -> Repaired:
+    """Closed bodies from vertices (V, 3) mm and faces (F, 3); `what` names them in errors.
+
+    `tell` is called with what is being done, as this takes seconds for a million faces.
+    """
+    used, _ = used_indices(faces)
     size = float(np.ptp(vertices[used], axis=0).max())
     if size == 0.0:
         raise InputError(f"{what}: all vertices are one point; expected a surface")
     log: dict[str, int] = {}
+    tell("joining corners")
     vertices, faces = _join(vertices, faces, size, log)
     vertices, faces = _unbranch(vertices, faces)
     vertices, faces = _drop_specks(vertices, faces, size, log)
     if len(faces) < 4:
         raise InputError(f"{what}: {len(faces)} faces enclose nothing; expected a closed body")
+    tell("winding faces alike")
     faces = _wind_alike(faces, what, log)
+    tell("closing holes")
     vertices, faces = _close_holes(vertices, faces, what, log)
     shells = _outward(vertices, faces, log)
-    for shell in shells:
-        if not shell.is_watertight:
-            raise InputError(
-                f"{what}: the surface crosses itself along edges that three or more faces share, "
-                "beyond repair; expected a closed body (remesh it in a mesh editor)"
-            )
+    if not all(shell.is_watertight for shell in shells):
+        raise InputError(
+            f"{what}: the surface crosses itself along edges that three or more faces share, "
+            "beyond repair; expected a closed body (remesh it in a mesh editor)"
+        )
     flat = [s for s in shells if s.volume_mm3 <= 1e-6 * size * float(s.face_areas_mm2.sum())]
     if len(flat) == len(shells):
         raise InputError(f"{what}: the surface is flat and encloses no volume; expected a body")
@@ -84,11 +93,10 @@ def repair(vertices: np.ndarray, faces: np.ndarray, what: str) -> Repaired:
 
 def _join(vertices, faces, size, log):
     """Join vertices as little as it takes to close the surface: none, equal ones, near ones."""
-    used, dense = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], dense.reshape(-1, 3)
-    unique, same = np.unique(vertices, axis=0, return_inverse=True)
-    same = same.reshape(-1)
-    best = None
+    used, faces = used_indices(faces)
+    vertices = vertices[used]
+    first, same, _ = equal_rows(vertices)
+    unique, best = vertices[first], None
     for fraction in (None, *JOIN):
         if fraction is None:
             base, label = vertices, np.arange(len(vertices))
@@ -97,7 +105,7 @@ def _join(vertices, faces, size, log):
         cleaned, counts = _clean_faces(label[faces])
         open_edges = _open_edges(cleaned)
         if best is None or open_edges < best[0]:
-            best = (open_edges, base, cleaned, counts, len(vertices) - len(np.unique(label)))
+            best = (open_edges, base, cleaned, counts, len(vertices) - len(used_indices(label)[0]))
         if open_edges == 0:
             break
     _, base, cleaned, counts, joined = best
@@ -130,11 +138,8 @@ def _clean_faces(faces):
     kept = faces[proper]
     if not len(kept):
         return kept, (len(faces), 0)
-    key = np.sort(kept, axis=1)
-    _, first, which, count = np.unique(
-        key, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
-    turn = np.bincount(which.reshape(-1), weights=_parity(kept), minlength=len(first))
+    first, which, count = equal_rows(np.sort(kept, axis=1))
+    turn = np.bincount(which, weights=_parity(kept), minlength=len(first))
     flap = (count == 2) & (turn == 0)
     without, with_one = kept[np.sort(first[~flap])], kept[np.sort(first)]
     chosen = without if _open_edges(without) <= _open_edges(with_one) else with_one
@@ -156,8 +161,9 @@ def _edges(faces):
 def _open_edges(faces) -> int:
     """Number of edges that do not lie between exactly two faces."""
     edges, _ = _edges(faces)
-    _, count = np.unique(edges @ [faces.max(initial=0) + 1, 1], return_counts=True)
-    return int(np.sum(count != 2))
+    key = np.sort(edges @ [faces.max(initial=0) + 1, 1])
+    start = np.flatnonzero(np.r_[True, key[1:] != key[:-1]]) if len(key) else key
+    return int(np.sum(np.diff(np.r_[start, len(key)]) != 2))
 
 
 def _pairs(faces, vertices=None):
@@ -238,8 +244,7 @@ def _drop_specks(vertices, faces, size, log):
     if not len(faces):
         return vertices, faces
     label = _components(faces)
-    low = np.full((label.max() + 1, 3), np.inf)
-    high = -low
+    low, high = (np.full((label.max() + 1, 3), end) for end in (np.inf, -np.inf))
     for corner in faces.T:
         np.minimum.at(low, label, vertices[corner])
         np.maximum.at(high, label, vertices[corner])
@@ -248,8 +253,8 @@ def _drop_specks(vertices, faces, size, log):
     )
     keep = (high - low).max(axis=1) >= np.where(is_open, OPEN_SPECK, SPECK) * size
     log["loose specks removed"] = int(np.sum(~keep))
-    used, dense = np.unique(faces[keep[label]], return_inverse=True)
-    return vertices[used], dense.reshape(-1, 3)
+    used, dense = used_indices(faces[keep[label]])
+    return vertices[used], dense
 
 
 def _wind_alike(faces, what, log):
@@ -313,7 +318,7 @@ def _close_holes(vertices, faces, what, log):
     following = len(vertices)
     for loop in loops:
         rim = vertices[loop]
-        body = vertices[np.unique(faces[label == part_of[loop[0]]])]
+        body = vertices[used_indices(faces[label == part_of[loop[0]]])[0]]
         width, size = np.ptp(rim, axis=0).max(), np.ptp(body, axis=0).max()
         if width > HOLE * size:
             raise InputError(
@@ -336,9 +341,8 @@ def _outward(vertices, faces, log):
     label = _components(faces)
     shells, turned = [], 0
     for part in range(label.max() + 1):
-        mine = faces[label == part]
-        used, dense = np.unique(mine, return_inverse=True)
-        mesh = Mesh(vertices[used], dense.reshape(-1, 3))
+        used, dense = used_indices(faces[label == part])
+        mesh = Mesh(vertices[used], dense)
         if mesh.volume_mm3 < 0.0:
             mesh = Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
             turned += 1

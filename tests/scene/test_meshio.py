@@ -84,6 +84,7 @@ POINTS = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty fl
 BROKEN = {
     "empty.stl": (b"", "the file is empty"),
     "cut.stl": (b"x" * 80 + (640).to_bytes(4, "little") + b"y" * 500, "cut off"),
+    "half.stl": (b"solid a\n facet normal 0 0 1\n  outer loop\n   vertex 0 0", "with 'vertex 0 0'"),
     "word.stl": (b"hello\n", "neither a text nor a binary STL"),
     "points.ply": (POINTS.encode(), "2 points or lines but no faces"),
     "lines.obj": (b"v 0 0 0\nv 1 0 0\nl 1 2\n", "no faces"),

@@ -81,10 +81,32 @@ PRESETS: dict[str, Preset] = {
 Schulman et al. (2017)."""
 
 
-def preset_of(name: str, **changes) -> Preset:
-    """The named preset with some fields changed; an unknown name answers with the known ones."""
+STEPS: dict[str, int] = {
+    "track_circle": 20_000_000,
+    "track_square": 20_000_000,
+    "laser_plane": 20_000_000,
+    "circle_ablation": 6_000_000,
+}
+"""Task -> steps that the `fast` preset trains it unless told otherwise."""
+PAPER_STEPS = 20_000_000
+"""Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
+
+TASK_CHANGES: dict[str, dict] = {}
+"""Task -> fields in which its `fast` preset differs."""
+
+
+def preset_for(name: str, task: str, **changes) -> Preset:
+    """The named preset as it suits a task, with some fields changed (None: as it is).
+
+    An unknown name answers with the known ones.
+    """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
-    return replace(
-        PRESETS[name], **{key: value for key, value in changes.items() if value is not None}
-    )
+    own = TASK_CHANGES.get(task, {}) if name == "fast" else {}
+    given = {key: value for key, value in changes.items() if value is not None}
+    return replace(PRESETS[name], **{**own, **given})
+
+
+def steps_for(name: str, task: str) -> int:
+    """Steps that a preset trains a task unless told otherwise."""
+    return STEPS.get(task, PAPER_STEPS) if name == "fast" else PAPER_STEPS

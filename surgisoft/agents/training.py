@@ -56,7 +56,11 @@ class Iteration:
 
 
 class Training:
-    """The agents of a task while they learn; `state` and `load_state` are all that changes."""
+    """The agents of a task while they learn; `state` and `load_state` are all that changes.
+
+    `iteration` counts the turns, `share` 0..1 is how much of the plan is done, `best` what
+    evaluation found for the best policies so far.
+    """
 
     def __init__(self, plan: Plan, task: Task, processes: Processes):
         self.plan, self.task, self.processes = plan, task, processes
@@ -71,6 +75,7 @@ class Training:
         self.seen = self.env.get_observations()
         self.iteration, self.clock = 0, Clock()
         self.best: dict[str, float] | None = None
+        self.share = 0.0
 
     @property
     def steps(self) -> int:
@@ -78,9 +83,8 @@ class Training:
         preset = self.plan.preset
         return self.iteration * preset.envs * preset.rollout * self.processes.count
 
-    @property
-    def share(self) -> float:
-        """Share 0..1 of the training that is done."""
+    def _shared(self) -> float:
+        """Share of the training that is done; all processes ask together."""
         seconds = 0.0
         if self.plan.minutes is not None:
             seconds = self.processes.of_leader(self.clock.wall_s)
@@ -88,9 +92,9 @@ class Training:
 
     def turn(self) -> Iteration:
         """One rollout, and one update of every agent."""
-        preset, share = self.plan.preset, self.share
+        preset = self.plan.preset
         for ppo in self.agents.values():
-            set_noise(ppo, preset, share)
+            set_noise(ppo, preset, self.share)
         self.seen, gathered = gather(self.env, self.agents, self.seen, preset.rollout)
         losses = {}
         for agent, ppo in self.agents.items():
@@ -98,6 +102,7 @@ class Training:
                 losses[f"{agent}/{name}"] = value
         self.iteration += 1
         self.clock.tick()
+        self.share = self._shared()
         first = next(iter(self.agents.values()))
         noise = first.get_policy().distribution.log_std_param.detach().exp().mean().item()
         return Iteration(gathered, losses, first.learning_rate, noise)
@@ -158,6 +163,7 @@ class Training:
             torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), device)
         self.iteration, self.best = saved["iteration"], saved["best"]
         self.clock = Clock(saved["wall_s"], saved["cpu_s"])
+        self.share = self._shared()
 
 
 def _copied(weights: dict[str, Tensor]) -> dict[str, Tensor]:

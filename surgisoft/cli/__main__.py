@@ -1,0 +1,5 @@
+"""`python -m surgisoft.cli`, for torchrun."""
+
+from surgisoft.cli import main
+
+main()

@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
     "agents": {"scene", "surrogate", "measurement", "tasks"},
-    "replay": {"scene"},
+    "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
         "agents",

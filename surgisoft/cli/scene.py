@@ -120,7 +120,7 @@ def show(
     with temporary_recording() as recording:
         save_scene_view(scene, reaches, recording)
         if screenshot is not None:
-            take_screenshot(recording, screenshot)
+            take_screenshot(recording, screenshot, "Scene", ("ring_point", 0))
             print(f"wrote {screenshot}")
         elif web:
             serve_viewer(recording, lambda url: print(f"open {url} (Ctrl-C ends it)", flush=True))

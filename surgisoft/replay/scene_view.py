@@ -1,15 +1,23 @@
 """A scene as a Rerun recording: bodies, both arms at work, ring, beam and the camera's cone."""
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from surgisoft.errors import InputError
-from surgisoft.replay.shapes import finer, polar_patch, tube, view_cone
+from surgisoft.replay.colours import (
+    ARM_COLOURS,
+    BACKGROUND,
+    BEAM_COLOUR,
+    CONE_COLOUR,
+    LESION_COLOUR,
+    PLAN_COLOUR,
+    ROLE_COLOURS,
+    SHAFT_COLOUR,
+)
+from surgisoft.replay.recording import new_recording
+from surgisoft.replay.shapes import creased, finer, polar_patch, tube, view_cone
 from surgisoft.scene import frames
 from surgisoft.scene.check import held_arms
 from surgisoft.scene.folder import Scene
@@ -17,18 +25,6 @@ from surgisoft.scene.lesion import circle_on, nearest_on_surface
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.sweep import Cut, Held, Look, cut_ring, look_at_lesion
 
-ROLE_COLOURS = {
-    "organ": (142, 58, 48),
-    "keep-out": (112, 140, 62),
-    "support": (176, 186, 196),
-}
-ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196)}
-SHAFT_COLOUR = (88, 94, 102)
-LESION_COLOUR = (214, 172, 118)
-RING_COLOUR = (255, 214, 64)
-BEAM_COLOUR = (255, 40, 32)
-CONE_COLOUR = (90, 200, 250)
-BACKGROUND = (24, 28, 34)
 BORE_MM = 1.5
 """Radius of the arm's channel: 3 mm across in the paper's arm (mm)."""
 LIFT_MM = 0.5
@@ -39,29 +35,15 @@ FRAMES = 72
 
 def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> None:
     """Write the scene as an .rrd file that opens by itself with a fitting view."""
-    path = Path(path)
-    if path.suffix != ".rrd":
-        raise InputError(f"{path}: suffix '{path.suffix}', expected .rrd")
     arms, ring = held_arms(scene, reaches), scene.ring
     cut = cut_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".rrd", dir=path.parent)
-    os.close(handle)
-    try:
-        recording = rr.RecordingStream("surgisoft_scene", recording_id=scene.content_hash[:16])
-        recording.save(name, default_blueprint=blueprint(scene, arms))
+    identity = scene.content_hash[:16]
+    with new_recording(path, "surgisoft_scene", identity, blueprint(scene, arms)) as recording:
         _log_bodies(recording, scene)
         _log_lesion(recording, scene)
         _log_endoscope(recording, scene, arms["endoscope"], look)
         _log_laser(recording, arms["laser"], cut, ring.points_mm)
-        recording.flush()
-        recording.disconnect()
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def blueprint(scene: Scene, arms: dict[str, Held]) -> rrb.Blueprint:
@@ -104,7 +86,7 @@ def _log_bodies(recording, scene: Scene) -> None:
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for body in scene.bodies:
         mesh = body.world_mesh
-        vertices, faces, normals = _creased(mesh)
+        vertices, faces, normals = creased(mesh)
         recording.log(
             f"/bodies/{body.name}",
             rr.Mesh3D(
@@ -117,22 +99,13 @@ def _log_bodies(recording, scene: Scene) -> None:
         )
 
 
-def _creased(mesh):
-    """Vertices, faces and normals; sharp-edged coarse meshes keep a normal for every face."""
-    cosine = np.einsum("fk,fck->fc", mesh.face_normals, mesh.vertex_normals[mesh.faces])
-    if np.mean(cosine < 0.8) < 0.3:
-        return mesh.vertices_mm, mesh.faces, mesh.vertex_normals
-    vertices = mesh.triangles_mm.reshape(-1, 3)
-    return vertices, np.arange(len(vertices)).reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)
-
-
 def _log_lesion(recording, scene: Scene) -> None:
     ring, lesion, mesh = scene.ring, scene.spec.lesion, scene.organ.world_mesh
     recording.log(
         "/lesion/ring",
         rr.LineStrips3D(
             [np.vstack((ring.points_mm, ring.points_mm[:1])) + LIFT_MM * ring.normal],
-            colors=[RING_COLOUR],
+            colors=[PLAN_COLOUR],
             radii=[0.45],
         ),
         static=True,

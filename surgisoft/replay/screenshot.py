@@ -20,26 +20,29 @@ PATIENCE_S = 60.0
 def take_screenshot(
     recording: Path,
     picture: Path,
-    view: str = "Scene",
-    timeline: tuple[str, int] | None = ("ring_point", 0),
-    max_size: int = 1600,
+    view: str | None = None,
+    cursor: tuple[str, float] | None = None,
+    size: tuple[int, int] = WINDOW,
 ) -> None:
-    """Draw one view of an .rrd file into a .png; `timeline` puts the cursor (name, sequence)."""
+    """Draw an .rrd file into a .png: one view by its name, or the whole window.
+
+    `cursor` is a timeline and the place on it, s or a whole number; `size` the window in points,
+    two pixels each for the whole window, at most `size[0]` wide in the file.
+    """
     picture = Path(picture)
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
     if not picture.parent.is_dir():
         raise InputError(f"{picture.parent}: there is no such folder for the picture")
     port = free_port()
-    size = f"{WINDOW[0]}x{WINDOW[1]}"
     arguments = (str(recording), "--bind", LOCAL, "--port", str(port), "--headless")
-    with running(*arguments, "--window-size", size) as viewer:
+    with running(*arguments, "--window-size", f"{size[0]}x{size[1]}") as viewer:
         wait_for_port(viewer, port)
-        write_atomically(picture, _draw(port, view, timeline, max_size))
+        write_atomically(picture, _draw(port, view, cursor, max(size)))
 
 
-def _draw(port: int, view: str, timeline, max_size: int) -> bytes:
-    """Ask the running viewer for the picture, once the view is there and its data have come."""
+def _draw(port: int, view: str | None, cursor, max_size: int) -> bytes:
+    """Ask the running viewer for the picture, once its views are there and their data have come."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from rerun.experimental import ViewerClient
@@ -49,15 +52,18 @@ def _draw(port: int, view: str, timeline, max_size: int) -> bytes:
         found = None
         while found is None and time.monotonic() < end:
             with contextlib.suppress(Exception):
-                found = next(v.view_id for v in client.get_state().views if v.name == view)
+                found = next(v.view_id for v in client.get_state().views if view in (v.name, None))
             time.sleep(0.2)
         if found is None:
-            raise InputError(f"the Rerun viewer shows no view '{view}' of the recording")
-        if timeline is not None:
-            client.set_time(timeline[0], sequence=timeline[1], play_state="paused")
+            wanted = "no view" if view is None else f"no view '{view}'"
+            raise InputError(f"the Rerun viewer shows {wanted} of the recording")
+        if cursor is not None:
+            place = {"sequence" if isinstance(cursor[1], int) else "duration": cursor[1]}
+            client.set_time(cursor[0], **place, play_state="paused")
         time.sleep(NOTICES_S)
-        picture, before = client.take_screenshot(found, max_size=max_size), b""
+        shown = None if view is None else found
+        picture, before = client.take_screenshot(shown, max_size=max_size), b""
         while picture != before and time.monotonic() < end:
             time.sleep(0.3)
-            before, picture = picture, client.take_screenshot(found, max_size=max_size)
+            before, picture = picture, client.take_screenshot(shown, max_size=max_size)
         return picture

@@ -87,3 +87,12 @@ def view_cone(eye: np.ndarray, axis: np.ndarray, half_rad: float, length_mm: flo
     )
     rim = eye + rim @ frame.T
     return [rim, *(np.stack((eye, point)) for point in rim[:-1:8])]
+
+
+def creased(mesh):
+    """Vertices, faces and normals to draw; sharp coarse meshes keep a normal for every face."""
+    cosine = np.einsum("fk,fck->fc", mesh.face_normals, mesh.vertex_normals[mesh.faces])
+    if np.mean(cosine < 0.8) < 0.3:
+        return mesh.vertices_mm, mesh.faces, mesh.vertex_normals
+    vertices = mesh.triangles_mm.reshape(-1, 3)
+    return vertices, np.arange(len(vertices)).reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)

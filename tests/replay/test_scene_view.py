@@ -113,7 +113,7 @@ def _processes_that_name(path):
 def test_a_picture_without_a_display_shows_the_liver(recording, tmp_path):
     picture = tmp_path / "scene.png"
     try:
-        take_screenshot(recording, picture)
+        take_screenshot(recording, picture, "Scene", ("ring_point", 0))
     except InputError as error:
         if "mesa-vulkan-drivers" in str(error):
             pytest.skip(f"no driver to draw with: {error}")

@@ -1,0 +1,72 @@
+"""The colours that every picture shares, as sRGB 0..255."""
+
+import numpy as np
+
+ROLE_COLOURS = {
+    "organ": (142, 58, 48),
+    "keep-out": (112, 140, 62),
+    "support": (128, 136, 146),
+}
+"""A body by its role."""
+ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196), "arm": (236, 226, 208)}
+"""A soft body by its arm's name."""
+BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196, 132, 56)}
+"""The bands that mark an arm's key points."""
+SHAFT_COLOUR = (88, 94, 102)
+LESION_COLOUR = (214, 172, 118)
+PLAN_COLOUR = (255, 214, 64)
+"""Where something should be: ring, path, target."""
+REAL_COLOUR = (70, 225, 240)
+"""Where it is."""
+BEAM_COLOUR = (80, 255, 120)
+"""The aiming beam is green, as in the endoscope's picture: red is lost on an organ."""
+CONE_COLOUR = (90, 200, 250)
+BACKGROUND = (24, 28, 34)
+LIMIT_COLOUR = (255, 96, 80)
+"""A limit in a plot."""
+SERIES = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 190, 140),
+    (240, 228, 66),
+    (213, 94, 0),
+    (204, 121, 167),
+    (150, 150, 250),
+    (200, 200, 200),
+)
+"""Lines of a plot, told apart by colour-blind eyes too (Okabe & Ito 2008), brightened for black."""
+
+BLANCHED = (204, 186, 172)
+"""Tissue at the threshold of ablation."""
+CHARRED = (26, 20, 18)
+"""Ablated tissue."""
+
+
+def series_colour(number: int) -> tuple[int, int, int]:
+    """The colour of a plot's line by its number; they come round."""
+    return SERIES[number % len(SERIES)]
+
+
+def paler(colour: tuple[int, int, int], share: float = 0.5) -> tuple[int, int, int]:
+    """The colour mixed with the plot's dark ground."""
+    return tuple(round(share * part + (1.0 - share) * 40) for part in colour)
+
+
+def tissue_colours(heat: np.ndarray, base: tuple[int, int, int]) -> np.ndarray:
+    """(V, 4) uint8 of tissue at `heat` (V,), its dose as a share of the threshold of ablation.
+
+    It turns pale on the way to the threshold and is charred beyond.
+    """
+    share = np.clip(heat, 0.0, 1.0)[:, None]
+    colour = np.array(base) + (np.array(BLANCHED) - np.array(base)) * share
+    colour = np.where(heat[:, None] >= 1.0, np.array(CHARRED), colour)
+    return np.column_stack((colour, np.full(len(heat), 255))).astype(np.uint8)
+
+
+def error_colours(error: np.ndarray, largest: float) -> np.ndarray:
+    """(..., 3) uint8 from blue by yellow to red for errors (...) from 0 to `largest`."""
+    stops = np.array([[60, 130, 230], [90, 210, 170], [250, 220, 70], [240, 60, 40]], float)
+    place = np.clip(np.nan_to_num(error) / max(largest, 1e-12), 0.0, 1.0) * (len(stops) - 1)
+    low = np.minimum(place.astype(int), len(stops) - 2)
+    share = (place - low)[..., None]
+    return (stops[low] + (stops[low + 1] - stops[low]) * share + 0.5).astype(np.uint8)

@@ -1,0 +1,116 @@
+"""What the endoscope saw: JPEG pictures drawn from an episode's log, and the camera's place."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import rerun as rr
+from scipy.spatial import cKDTree
+
+from surgisoft.replay.colours import CONE_COLOUR
+from surgisoft.replay.recording import Columns
+from surgisoft.scene import frames
+from surgisoft.scene.camera import Camera
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.render import Renderer
+from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
+
+CAMERA = "/endoscope/camera"
+"""The camera's pose and its pictures."""
+PIXELS = 240
+"""Width and height of a picture."""
+PICTURES_HZ = 2.5
+"""Pictures a second."""
+JPEG_QUALITY = 82
+FRUSTUM_MM = 16.0
+"""Length of the drawn frustum (mm)."""
+SAMPLE_MM = 0.4
+"""A pixel takes its dose from a sample within this distance (mm)."""
+
+
+def log_camera(columns: Columns, log: EpisodeLog, rows: np.ndarray, looks: np.ndarray) -> None:
+    """The camera's pose in the log's `rows`, and its picture in `looks`."""
+    arm, half = log.arms[ENDOSCOPE], 0.5 * log.camera.fov_rad
+    pinhole = rr.Pinhole(
+        resolution=[PIXELS, PIXELS],
+        focal_length=0.5 * PIXELS / math.tan(half),
+        image_plane_distance=FRUSTUM_MM,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        color=CONE_COLOUR,
+        line_width=0.15,
+    )
+    columns.recording.log(CAMERA, pinhole, static=True)
+    poses = frames.pose_from_z(arm.line_mm[rows, -1].astype(float), arm.tip_direction[rows])
+    moving = rr.Transform3D.columns(
+        translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
+    )
+    columns.send(CAMERA, rows, moving)
+    pictures = jpegs(log, looks)
+    style = rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="linear")
+    columns.recording.log(f"{CAMERA}/picture", style, static=True)
+    shown = rr.EncodedImage.columns(blob=pictures)
+    columns.send(f"{CAMERA}/picture", looks, shown)
+
+
+def jpegs(log: EpisodeLog, rows: np.ndarray) -> list[bytes]:
+    """The endoscope's round picture in each of the log's `rows`, as JPEG files."""
+    from PIL import Image
+
+    bodies = [Body(b.name, b.role, Mesh(b.vertices_mm, b.faces)) for b in log.bodies]
+    camera = Camera(log.camera.fov_rad, tuple(log.camera.range_mm))
+    renderer = Renderer(bodies, camera, PIXELS, PIXELS)
+    paint, files = _Paint(log), []
+    poses = frames.pose_from_z(
+        log.arms[ENDOSCOPE].line_mm[:, -1].astype(float), log.arms[ENDOSCOPE].tip_direction
+    )
+    for row in rows:
+        shapes = {name: ArmShape(arm.line_mm[row], arm.radius_mm) for name, arm in log.arms.items()}
+        picture = renderer.image(
+            poses[row], shapes, ENDOSCOPE, _visible_beam(log, row), paint.at(int(row))
+        )
+        file = io.BytesIO()
+        Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
+        files.append(file.getvalue())
+    return files
+
+
+def _visible_beam(log: EpisodeLog, row: int) -> np.ndarray | None:
+    """(2, 3) mm: the beam's ends while it burns."""
+    if log.beam is None or not log.beam.on[row]:
+        return None
+    return np.stack((log.arms[LASER].line_mm[row, -1], log.beam.end_mm[row]))
+
+
+class _Paint:
+    """Colours the organ in the picture by the dose of a row."""
+
+    def __init__(self, log: EpisodeLog):
+        self.dose = log.dose
+        if self.dose is not None:
+            self.tree = cKDTree(self.dose.points_mm)
+            self.low = self.dose.points_mm.min(axis=0) - SAMPLE_MM
+            self.high = self.dose.points_mm.max(axis=0) + SAMPLE_MM
+
+    def at(self, row: int):
+        """For `Renderer.image`; None before anything has got a dose."""
+        if self.dose is None:
+            return None
+        dose = self.dose.at(row)
+        if not dose.any():
+            return None
+        share = np.append(dose / self.dose.threshold_j_per_mm2, 0.0)
+        blanched, charred = np.array([0.62, 0.50, 0.42]), np.array([0.015, 0.012, 0.010])
+
+        def recolour(_faces, points, colours):
+            heat = np.zeros((len(points), 1))
+            near = ((points >= self.low) & (points <= self.high)).all(axis=1)
+            _, sample = self.tree.query(points[near], distance_upper_bound=SAMPLE_MM)
+            heat[near, 0] = share[sample]
+            pale = colours + (blanched - colours) * np.clip(heat, 0.0, 1.0)
+            return np.where(heat >= 1.0, charred, pale)
+
+        return {self.dose.body: recolour}

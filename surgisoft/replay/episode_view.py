@@ -1,0 +1,176 @@
+"""An episode's log as a Rerun recording: everything that happened, in 3D and in plots."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from surgisoft.replay.bodies import log_arm
+from surgisoft.replay.colours import (
+    BEAM_COLOUR,
+    PLAN_COLOUR,
+    REAL_COLOUR,
+    ROLE_COLOURS,
+    paler,
+    tissue_colours,
+)
+from surgisoft.replay.dosed_surface import dosed_surface
+from surgisoft.replay.endoscope import PICTURES_HZ, log_camera
+from surgisoft.replay.episode_blueprint import TRAIL, episode_blueprint
+from surgisoft.replay.plots import plots_of
+from surgisoft.replay.recording import Columns, new_recording
+from surgisoft.replay.shapes import creased
+from surgisoft.scene.mesh import Mesh
+from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
+
+MOTION_HZ = 10.0
+"""Bodies are drawn so many times a second; plots have every step."""
+DOSE_HZ = 2.5
+"""The organ's colours change so many times a second."""
+LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+"""An event's level in Rerun's text log."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A recording that was written."""
+
+    path: Path
+    """The .rrd file."""
+    megabytes: float
+    """Its size, 10^6 bytes."""
+    duration_s: float
+    """Time that it shows, s."""
+    cost_s: float
+    """Time that writing it took, s."""
+
+    def __str__(self) -> str:
+        rate = self.megabytes / max(self.duration_s, 1e-9) * 60.0
+        return (
+            f"{self.path}: {self.megabytes:.2f} MB for {self.duration_s:.1f} s "
+            f"({rate:.1f} MB a minute), written in {self.cost_s:.1f} s"
+        )
+
+
+def write_replay(log: EpisodeLog, path: str | Path, pictures_hz: float = PICTURES_HZ) -> Replay:
+    """Write the log as an .rrd file that opens by itself with a fitting layout.
+
+    `pictures_hz` endoscope pictures are drawn a second, which is nearly all that writing costs.
+    """
+    began, path = time.perf_counter(), Path(path)
+    plots = plots_of(log)
+    identity = f"{log.task}-{log.driver}-{log.on}-{log.seed}-{log.episode}"
+    blueprint = episode_blueprint(log, plots)
+    with new_recording(path, "surgisoft_episode", identity, blueprint) as recording:
+        columns = Columns(recording, log.time_s)
+        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        moments = finite_rows(log, MOTION_HZ)
+        _log_bodies(columns, log)
+        for name, arm in log.arms.items():
+            log_arm(columns, name, arm, moments)
+        _log_paths(columns, log, moments)
+        if log.beam is not None:
+            _log_beam(columns, log, moments)
+        if log.camera is not None and ENDOSCOPE in log.arms:
+            log_camera(columns, log, moments, finite_rows(log, pictures_hz))
+        for line in (line for plot in plots for line in plot.lines):
+            columns.plot(line)
+        _log_events(recording, log)
+    cost = time.perf_counter() - began
+    return Replay(path, path.stat().st_size / 1e6, float(log.time_s[-1]), cost)
+
+
+def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
+    """(R,) rows about 1 / rate_hz apart, the last one among them, in which every arm is finite."""
+    stride = max(1, round(1.0 / (rate_hz * log.dt_s)))
+    rows = np.unique(np.append(np.arange(0, log.rows, stride), log.rows - 1))
+    finite = [np.isfinite(arm.line_mm[rows]).all((1, 2)) for arm in log.arms.values()]
+    return rows[np.all(finite, axis=0)]
+
+
+def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
+    """Every body once; the organ's faces around the lesion apart, coloured as they are cut."""
+    for body in log.bodies:
+        mesh, entity = Mesh(body.vertices_mm, body.faces), f"/bodies/{body.name}"
+        kept = np.ones(len(mesh.faces), dtype=bool)
+        if log.dose is not None and log.dose.body == body.name:
+            surface = dosed_surface(mesh, log.dose)
+            kept[surface.replaced] = False
+            _log_dosed(columns, log, surface, f"{entity}/dose", ROLE_COLOURS[body.role])
+        vertices, faces, normals = creased(mesh)
+        plain = rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces[kept],
+            vertex_normals=normals,
+            albedo_factor=ROLE_COLOURS[body.role],
+        )
+        columns.recording.log(entity, plain, static=True)
+
+
+def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) -> None:
+    still = rr.Mesh3D(
+        vertex_positions=surface.vertices_mm,
+        triangle_indices=surface.faces,
+        vertex_normals=surface.normals,
+    )
+    columns.recording.log(entity, still, static=True)
+    moments = np.union1d(finite_rows(log, DOSE_HZ), [0])
+    before = np.searchsorted(log.dose.rows, moments, side="right")
+    rows = moments[np.diff(before, prepend=-1) > 0]
+    colours = [
+        tissue_colours(surface.heat(log.dose.at(int(row)), log.dose.threshold_j_per_mm2), base)
+        for row in rows
+    ]
+    count = len(surface.vertices_mm)
+    changing = rr.Mesh3D.columns(vertex_colors=np.concatenate(colours))
+    columns.send(entity, rows, changing.partition([count] * len(rows)))
+
+
+def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
+    """What is asked for once; the way that was gone, piece by piece; both points as they move."""
+    planned = log.path_mm if len(log.path_mm) else log.target_mm
+    closed = np.vstack((planned, planned[:1])) if len(log.path_mm) else planned
+    plan = rr.LineStrips3D([closed], colors=[PLAN_COLOUR], radii=[0.18])
+    columns.recording.log("/path/planned", plan, static=True)
+    shown = np.isfinite(log.actual_mm).all(1)
+    if log.beam is not None:
+        shown &= log.beam.on
+    ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
+    pieces = np.stack((log.actual_mm[ends - 1], log.actual_mm[ends]), axis=1)
+    if len(ends):
+        style = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
+        columns.recording.log(TRAIL, style, static=True)
+        columns.send(TRAIL, ends, rr.LineStrips3D.columns(strips=list(pieces)))
+    style = rr.Points3D.from_fields(colors=PLAN_COLOUR, radii=0.55)
+    columns.recording.log("/path/target", style, static=True)
+    moving = rr.Points3D.columns(positions=log.targets_mm[rows].reshape(-1, 3))
+    columns.send("/path/target", rows, moving.partition([log.targets_mm.shape[1]] * len(rows)))
+
+
+def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
+    """The beam from the tip to where it ends: thick while it burns, thin while it only aims."""
+    ends = np.stack((log.arms[LASER].line_mm[:, -1], log.beam.end_mm), axis=1)[rows]
+    on = log.beam.on[rows]
+    strips = rr.LineStrips3D.columns(
+        strips=list(ends),
+        radii=np.where(on, 0.4, 0.08),
+        colors=np.where(on[:, None], BEAM_COLOUR, paler(BEAM_COLOUR, 0.7)).astype(np.uint8),
+    )
+    columns.send("/beam", rows, strips)
+    spots = rr.Points3D.columns(positions=ends[:, 1], radii=np.where(on, 0.8, 0.3))
+    columns.recording.log("/beam/hit", rr.Points3D.from_fields(colors=BEAM_COLOUR), static=True)
+    columns.send("/beam/hit", rows, spots)
+
+
+def _log_events(recording, log: EpisodeLog) -> None:
+    for event in log.events:
+        recording.set_time("time", duration=event.time_s)
+        recording.set_time("step", sequence=round(event.time_s / log.dt_s))
+        text = f"{event.time_s:6.1f} s  {event.text}"
+        recording.log("/events", rr.TextLog(text, level=LEVELS[event.level]))
+    recording.reset_time()

@@ -1,0 +1,103 @@
+"""Which plots a replay has, and their lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
+from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.episode_parts import ArmLog
+
+SHARES = ("completion", "view_fraction")
+"""Measures that run from 0 to 1 together."""
+SHOWN_ELSEWHERE = ("success", "collided", "clearance_mm")
+"""Measures that events or another plot show."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One line of a plot."""
+
+    entity: str
+    """Where it is in the recording."""
+    name: str
+    """Its name in the legend."""
+    values: np.ndarray
+    """(T,) one for each row of the log; what is not finite is left out."""
+    colour: tuple[int, int, int]
+    """sRGB, 0..255."""
+    width: float = 1.6
+    """Width in points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """One plot."""
+
+    title: str
+    """What it shows, with the unit."""
+    lines: tuple[Line, ...]
+    """Its lines."""
+    legend: str | None = None
+    """The corner of the legend; None: the title says it all."""
+    group: str = ""
+    """Plots of one group share a place as tabs."""
+
+
+def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
+    """The plots for a log, in the order in which they are laid out."""
+    errors = {name: values for name, values in log.measures.items() if "error" in name}
+    if not any(np.isfinite(values).any() for values in errors.values()):
+        errors["error_mm"] = log.error_mm
+    shares = {name: log.measures[name] for name in SHARES if name in log.measures}
+    taken = {*errors, *shares, *SHOWN_ELSEWHERE}
+    others = {name: values for name, values in log.measures.items() if name not in taken}
+    made = [Plot("Path error (mm)", _lines("error", errors), _corner(errors, "righttop"))]
+    for name, arm in log.arms.items():
+        title = f"Pressure of {name} (kPa), thin: commanded"
+        made.append(Plot(title, _pressures(name, arm)))
+    if shares:
+        title = "Ring cut, ring in sight (share)"
+        made.append(Plot(title, _lines("share", shares), "rightbottom"))
+    if log.clearance_mm is not None:
+        made.append(Plot("Clearance (mm), red: limit", _clearance(log)))
+    for agent, terms in log.rewards.items():
+        title = f"Reward of {agent}"
+        made.append(Plot(title, _lines(f"reward/{agent}", terms), "rightbottom", "rewards"))
+    if others:
+        made.append(Plot("Other measures", _lines("measures", others), "righttop"))
+    return tuple(made)
+
+
+def _corner(series: Mapping[str, np.ndarray], corner: str) -> str | None:
+    """A legend only where there is something to tell apart."""
+    return corner if len(series) > 1 else None
+
+
+def _lines(group: str, series: Mapping[str, np.ndarray]) -> tuple[Line, ...]:
+    return tuple(
+        Line(f"/plots/{group}/{name}", name, values, series_colour(i))
+        for i, (name, values) in enumerate(series.items())
+    )
+
+
+def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
+    """Each chamber's pressure, and thinner and darker what was commanded."""
+    lines = []
+    for i in range(arm.pressure_kPa.shape[1]):
+        where, colour = f"/plots/pressure/{name}", series_colour(i)
+        command, pressure = arm.command_kPa[:, i], arm.pressure_kPa[:, i]
+        lines.append(Line(f"{where}/c{i + 1}", f"c{i + 1}", command, paler(colour), 1.0))
+        lines.append(Line(f"{where}/p{i + 1}", f"p{i + 1}", pressure, colour))
+    return tuple(lines)
+
+
+def _clearance(log: EpisodeLog) -> tuple[Line, ...]:
+    limit = np.full(log.rows, log.limits["clearance_mm"])
+    return (
+        Line("/plots/clearance/clearance_mm", "clearance_mm", log.clearance_mm, series_colour(0)),
+        Line("/plots/clearance/limit", "limit", limit, LIMIT_COLOUR, 1.0),
+    )

@@ -1,0 +1,72 @@
+"""An .rrd file that is written whole or not at all, and fed with whole columns."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from surgisoft.errors import InputError
+from surgisoft.replay.plots import Line
+
+SUFFIX = ".rrd"
+"""Suffix of a Rerun recording."""
+TIME, STEP = "time", "step"
+"""Timelines of every replay: s since the start, and rows of the log."""
+
+
+@contextlib.contextmanager
+def new_recording(
+    path: Path, application: str, identity: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
+    """A recording to log to; the file is there when the block ends, unless it raises."""
+    path = Path(path)
+    if path.suffix != SUFFIX:
+        raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=SUFFIX, dir=path.parent)
+    os.close(handle)
+    try:
+        recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
+        recording.save(name, default_blueprint=blueprint)
+        yield recording
+        recording.flush()
+        recording.disconnect()
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+class Columns:
+    """Sends what changes over time, all rows of an entity in one call."""
+
+    def __init__(self, recording: rr.RecordingStream, time_s: np.ndarray):
+        """time_s (T,): the time of every row of the log."""
+        self.recording, self.time_s = recording, np.asarray(time_s, dtype=np.float64)
+
+    def send(self, entity: str, rows: np.ndarray, columns) -> None:
+        """The columns, one entry for each of the log's `rows` (R,), which are its steps."""
+        rows = np.asarray(rows, dtype=np.int64)
+        if not len(rows):
+            return
+        times = [
+            rr.TimeColumn(TIME, duration=self.time_s[rows]),
+            rr.TimeColumn(STEP, sequence=rows),
+        ]
+        self.recording.send_columns(entity, indexes=times, columns=columns)
+
+    def plot(self, line: Line) -> None:
+        """A line of a plot; rows that are not finite are left out."""
+        style = rr.SeriesLines(names=line.name, colors=line.colour, widths=line.width)
+        self.recording.log(line.entity, style, static=True)
+        values = np.asarray(line.values, dtype=np.float64)
+        known = np.flatnonzero(np.isfinite(values))
+        self.send(line.entity, known, rr.Scalars.columns(scalars=values[known]))

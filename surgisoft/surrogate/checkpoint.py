@@ -15,6 +15,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects.own import check_files, files_of
 from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
@@ -62,6 +63,7 @@ def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, 
         "arm": asdict(model.spec),
         "network": _network_config(model.network),
         "effects": {name: effect.config() for name, effect in model.effects.items()},
+        "effect_files": files_of(model.effects),
         "validation": model.validation,
     }
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -114,6 +116,7 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
         kind = network.pop("kind")
         if kind not in NETWORKS:
             raise unknown_name("network", kind, NETWORKS)
+        check_files(config.get("effect_files", {}), str(folder))
         facts = arm_facts(spec, weights["rest_mm"])
         effects = {
             name: make_effect(name, facts, **arguments)

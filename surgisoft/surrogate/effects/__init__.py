@@ -1,6 +1,9 @@
 """The named physical effects; a file's stem is the name that is printed."""
 
+from pathlib import Path
+
 from surgisoft.errors import unknown_name
+from surgisoft.surrogate.effects import own
 from surgisoft.surrogate.effects.base import (
     STAGES,
     ArmFacts,
@@ -10,17 +13,37 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     Stage,
 )
+from surgisoft.surrogate.effects.contact import Contact
+from surgisoft.surrogate.effects.coupling import Coupling
 from surgisoft.surrogate.effects.creep import Creep
+from surgisoft.surrogate.effects.dead_zone import DeadZone
+from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.effects.gain_mismatch import GainMismatch
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
+from surgisoft.surrogate.effects.inertia import Inertia
 from surgisoft.surrogate.effects.line_lag import LineLag
 from surgisoft.surrogate.effects.misalignment import Misalignment
+from surgisoft.surrogate.effects.payload import Payload
+from surgisoft.surrogate.effects.rate_dependence import RateDependence
+from surgisoft.surrogate.effects.softening import Softening
+from surgisoft.surrogate.effects.stiffening import Stiffening
+from surgisoft.surrogate.effects.twist import Twist
 
 EFFECTS: dict[str, type[Effect]] = {
     "line_lag": LineLag,
+    "gain_mismatch": GainMismatch,
+    "coupling": Coupling,
+    "dead_zone": DeadZone,
+    "stiffening": Stiffening,
+    "softening": Softening,
     "hysteresis": Hysteresis,
     "creep": Creep,
-    "gain_mismatch": GainMismatch,
+    "rate_dependence": RateDependence,
+    "inertia": Inertia,
+    "payload": Payload,
+    "contact": Contact,
+    "twist": Twist,
+    "drift": Drift,
     "misalignment": Misalignment,
 }
 """Every effect of the package by name; `known_effects` adds the users' own."""
@@ -36,16 +59,42 @@ __all__ = [
     "Stage",
     "known_effects",
     "make_effect",
+    "named_effect",
+    "register_effect_file",
 ]
 
 
 def known_effects() -> dict[str, type[Effect]]:
-    """Every known effect by name."""
-    return dict(EFFECTS)
+    """Every known effect by name: the package's, installed packages', and those of named files."""
+    known = dict(EFFECTS)
+    for name in own.offered():
+        if name not in known and name not in own.RESERVED:
+            known[name] = own.load_offered(name)
+    return known | {name: file.kind for name, file in own.FILES.items()}
+
+
+def register_effect_file(path: str | Path) -> str:
+    """Run a person's effect file and register its one `Effect`; returns its name, the file's stem.
+
+    Only for files that the person who calls named: it runs code.
+    """
+    return own.register_effect_file(path, EFFECTS)
+
+
+def named_effect(given: str) -> str:
+    """The name of an effect given by name or by path (`path/to/my_effect.py`, which is run)."""
+    if given.endswith(".py") or "/" in given:
+        return register_effect_file(given)
+    known = known_effects()
+    if given not in known:
+        raise unknown_name("effect", given, known)
+    return given
 
 
 def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
     """The named effect for an arm."""
+    if name in EFFECTS:
+        return EFFECTS[name](facts, **config)
     known = known_effects()
     if name not in known:
         raise unknown_name("effect", name, known)

@@ -104,10 +104,31 @@ class Creep(Effect):
         return {}
 
     def quantities(self) -> list[Quantity]:
-        rubber = "silicone rubber creeps by 2 to 30 % in ten minutes (Findley 1976, ch. 5)"
+        rubber = "wide: at most as much again as at once; a solid does not creep backwards"
         return [
             Quantity("amount_share", value_of(self.amount), "", 0.0, 1.0, rubber),
-            Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.1, 2000.0, "times of TIMES"),
-            Quantity("width_log", value_of(self.log_width.exp()), "", 0.1, 6.0, "Wiechert 1893"),
-            Quantity("power", value_of(self.log_power.exp()), "", 0.5, 3.0, "Findley 1976, ch. 5"),
+            Quantity(
+                "tau_s",
+                value_of(self.log_tau.exp()),
+                "s",
+                0.1,
+                2000.0,
+                "around the times of the elements",
+            ),
+            Quantity(
+                "width_log",
+                value_of(self.log_width.exp()),
+                "",
+                0.1,
+                6.0,
+                "one time alone, to evenly over all decades",
+            ),
+            Quantity(
+                "power",
+                value_of(self.log_power.exp()),
+                "",
+                0.3,
+                3.0,
+                "wide: 1 is a linear solid (Findley 1976, ch. 5)",
+            ),
         ]

@@ -34,5 +34,5 @@ class GainMismatch(Memoryless):
         return {}
 
     def quantities(self) -> list[Quantity]:
-        cast = "moulded chambers differ by up to a third (Marchese et al. 2015)"
+        cast = "wide: half to one and a half times the nominal push"
         return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]

@@ -139,7 +139,7 @@ class Hysteresis(Effect):
         opened = (weight * self.radius).sum(-1) * self.half_range[:, None]
         unit = self.facts.unit
         span = float(self.half_range.max())
-        source = "loops of pneumatic arms are narrower than half the range (Kuhnen 2003; own data)"
+        source = "wide: a loop as wide as the range"
         return [
             Quantity(f"half_loop_{unit}", value_of(opened), unit, -span, span, source),
             Quantity("line_share", value_of(self.linear), "", -3.0, 3.0, "a mixture of shares"),

@@ -1,7 +1,7 @@
 """Line lag: the chamber's pressure follows the command through a long thin tube.
 
 A chamber fills through the resistance of its tube, a first-order lag (Blackburn, Reethof & Shearer
-1960, ch. 16), with another time constant in emptying than in filling (choked and laminar flow, and
+1960), with another time constant in emptying than in filling (choked and laminar flow, and
 the valve's own openings, differ). The tube itself spreads the command's arrival over a dead time
 (Schuder & Binder 1959), here a chain of N equal lags of the same mean ("linear chain trick",
 MacDonald 1978):
@@ -121,7 +121,7 @@ class LineLag(Effect):
         return {}
 
     def quantities(self) -> list[Quantity]:
-        tube = "tubes of 0.5 to 10 m (Schuder & Binder 1959; Blackburn et al. 1960)"
+        tube = "wide: tubes of up to some ten metres; slower is creep"
         return [
             Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the line lags"),
             Quantity("tau_up_s", value_of(self.log_up.exp()), "s", 0.005, 10.0, tube),

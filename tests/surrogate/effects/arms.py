@@ -33,12 +33,12 @@ def signal(effect: Effect, runs: int, steps: int, seed: int) -> torch.Tensor:
     return REST_MM + 3 * bend * share**2
 
 
-def context(runs: int, steps: int, seed: int = 0) -> Context:
+def context(runs: int, steps: int, seed: int = 0, chambers: int = 3) -> Context:
     """Uneven times, warming rooms and pressures."""
     generator = torch.Generator().manual_seed(seed + 99)
     dt = 0.02 + 0.3 * torch.rand(runs, steps, generator=generator)
     dt[:, 0] = 0
-    pressure = 50 * torch.rand(runs, steps, 3, generator=generator)
+    pressure = 50 * torch.rand(runs, steps, chambers, generator=generator)
     room = 21 + 4 * torch.rand(runs, steps, generator=generator)
     return Context(dt, dt.cumsum(1), room, pressure)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects import STAGES, known_effects, make_effect
+from surgisoft.surrogate.effects import STAGES, Context, known_effects, make_effect
 from tests.surrogate.effects.arms import FACTS, REST_MM, at, context, facts, signal, stir, variants
 
 VARIANTS = variants()
@@ -58,7 +58,7 @@ def test_stepping_is_scanning(effect, elapsed):
 def test_columns_are_the_slopes_at_zero_strength(effect):
     """Central differences in float64 of every amplitude, one by one."""
     effect = at_zero(effect).double()
-    x, seen = signal(effect, 2, 12, 2).double(), context(2, 12)
+    x, seen = signal(effect, 1, 400, 0).double(), context(1, 400)
     memory = effect.scan(effect.rest(x[:, 0]), x, seen)
     columns = effect.columns(x, memory)
     found = []
@@ -120,8 +120,8 @@ def test_memory_starts_as_if_nothing_had_happened(effect):
     x = signal(effect, 4, 1, 7)
     memory = effect.rest(x[:, 0])
     assert memory.shape[0] == 4
-    now = context(4, 1)
-    assert torch.allclose(effect.advance(memory, x[:, 0], at(now, 0)), memory, atol=1e-5)
+    now = Context(torch.zeros(4))
+    assert torch.allclose(effect.advance(memory, x[:, 0], now), memory, atol=1e-5)
 
 
 @EVERY
@@ -169,7 +169,7 @@ def test_any_number_of_chambers(name, chambers):
         x = torch.rand(2, 9, chambers) * 40
         if effect.stage in ("body", "sensor"):
             x = points[:18].view(2, 9, 5, 3)
-        seen = context(2, 9)
+        seen = context(2, 9, chambers=chambers)
         assert through(effect, x, seen).shape == x.shape
         memory = effect.scan(effect.rest(x[:, 0]), x, seen)
         assert effect.columns(x, memory).isfinite().all()

@@ -1,0 +1,126 @@
+"""Contact: a one-sided support that part of the body cannot pass.
+
+The support is the plane {p : n . p = offset} with the arm's side below it, met by one key point c.
+Where that point would be deeper by delta, the support pushes it back by a share of delta and the
+whole body yields as a clamped beam under a force at c (Love 1927, ch. XVIII), more towards the tip:
+
+    delta = max(n . p_c - offset, 0),    q = p + share delta u(p) / |u_c(p) . n|,
+
+with u the beam's displacement under a force along -n at c (`surgisoft.surrogate.beam`). share = 1
+is a rigid support, less a yielding one (penalty contact, Wriggers 2006).
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.beam import Beam, displaced, force_moment
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Effect,
+    Memoryless,
+    Quantity,
+    amplitude,
+    value_of,
+)
+
+AROUND = 8
+"""Directions of the support that a diagnosis tries."""
+DEPTHS = (0.5, 0.8)
+"""Quantiles of the body's excursion at which it puts the support."""
+STEEP = 0.2
+"""Least share of the point's displacement that is along the normal; below it the arm stands on the
+support, and to push it back would take no bounded bending."""
+
+
+class Contact(Memoryless):
+    """A one-sided, yielding support at one key point."""
+
+    stage = "body"
+
+    def __init__(
+        self,
+        facts: ArmFacts,
+        point: int = -1,
+        azimuth_rad: float = 0.0,
+        rise_rad: float = 0.0,
+        offset_mm: float = 1.0,
+    ):
+        """point: the key point that meets the support; azimuth from x and rise above the base's
+        plane of the normal, rad; offset of the plane along it, mm, base frame."""
+        super().__init__(facts)
+        beam = Beam.through(facts.rest_mm)
+        self.point = int(point) % len(beam.key)
+        self.length_mm = beam.length_mm
+        self.share = amplitude(1)
+        self.azimuth = nn.Parameter(torch.tensor([float(azimuth_rad)]))
+        self.rise = nn.Parameter(torch.tensor([float(rise_rad)]))
+        # In lengths of the arm, so that a step of the shapes means alike for all of them.
+        self.offset = nn.Parameter(torch.tensor([float(offset_mm) / self.length_mm]))
+        self.register_buffer("position", beam.position, persistent=False)
+        self.register_buffer("key", beam.key, persistent=False)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"share": self.share}
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        """Supports around the body, each where it would be met in a part of the recording."""
+        points = points[torch.isfinite(points).all(-1).all(-1)]
+        n = points.shape[1]
+        made = []
+        if not len(points):
+            return made
+        for point in sorted({n - 1, n // 2, max(n - 2, 0)}):
+            for turn in range(AROUND):
+                azimuth = 2 * math.pi * turn / AROUND
+                normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
+                out = points[:, point] @ normal
+                if float(out.max() - out.min()) <= 0.0:
+                    continue
+                for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
+                    made.append(cls(facts, point, azimuth, 0.0, offset))
+        return made
+
+    @property
+    def normal(self) -> Tensor:
+        """(3,) unit vector out of the arm's side into the support, base frame."""
+        flat = self.rise.cos()
+        return torch.cat([flat * self.azimuth.cos(), flat * self.azimuth.sin(), self.rise.sin()])
+
+    def _yielded(self, points: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, by a rigid support."""
+        normal = self.normal
+        deep = points[..., self.point, :] @ normal - self.offset * self.length_mm
+        line = self.position @ points
+        sample = int(self.key[self.point])
+        moved = displaced(line, force_moment(line, -normal / self.length_mm**3, sample))
+        moved = moved[..., self.key, :]
+        at = moved[..., self.point, :]
+        back = torch.maximum(-(at @ normal), STEEP * (at.square().sum(-1) + 1e-12).sqrt())
+        return moved * (deep.clamp(min=0) / back)[..., None, None]
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Supported key points (..., n, 3) from those of the free arm, mm."""
+        return signal + self.share * self._yielded(signal)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._yielded(signal).unsqueeze(0)
+
+    def config(self) -> dict:
+        return {"point": self.point}
+
+    def quantities(self) -> list[Quantity]:
+        length = self.length_mm
+        offset = length * float(self.offset.detach())
+        reach = "within the arm's reach"
+        share = "0: no support, 1: rigid (Wriggers 2006)"
+        return [
+            Quantity("share", value_of(self.share), "", 0.0, 1.1, share),
+            Quantity("azimuth_rad", value_of(self.azimuth), "rad", -10.0, 10.0, "any direction"),
+            Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
+            Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),
+            Quantity("key_point", self.point, "", 0, len(self.key), "which one meets it"),
+        ]

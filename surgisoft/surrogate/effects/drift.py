@@ -1,0 +1,146 @@
+"""Drift: what changes with elapsed time, or with the temperature of the room.
+
+`base`: the arm's holder yields, a rotation and shift of the whole body that grows towards a limit
+like a Kelvin-Voigt element under a constant load (Findley 1976, ch. 5),
+
+    g(t) = (1 - exp(-t / tau)) / (1 - exp(-600 s / tau)),      q = R(g turn) p + g shift,
+
+so that `turn` and `shift` are those after ten minutes, and a tau of hours is a steady drift.
+
+`temperature`: actuation and wall change with the room's temperature, to first order
+
+    x_eff_i = x_i + (T - T_0) / 10 K (gain x_i + shift_i).
+
+Elapsed time is that of the recording where there is one, and the sum of the steps in a world; where
+no temperature is known it counts as T_0.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.errors import unknown_name
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Context,
+    Effect,
+    Quantity,
+    amplitude,
+    logarithm,
+    value_of,
+)
+from surgisoft.surrogate.rotation import rotate
+
+KINDS = ("base", "temperature")
+TEN_MINUTES = 600.0
+"""Time at which the amplitudes are given, s."""
+TEN_KELVIN = 10.0
+"""Change of temperature at which the amplitudes are given, K."""
+GRID = (60.0, 250.0, 1000.0, 20000.0)
+"""Times tau that a diagnosis tries, s."""
+
+
+class Drift(Effect):
+    """A yielding holder, or a gain and offset that follow the temperature."""
+
+    stage = "body"
+
+    def __init__(
+        self,
+        facts: ArmFacts,
+        kind: str = "base",
+        tau_s: float = 1000.0,
+        reference_C: float = 22.0,
+    ):
+        """kind: `base` or `temperature`; tau of the base, s; T_0, degrees Celsius."""
+        super().__init__(facts)
+        if kind not in KINDS:
+            raise unknown_name("kind of drift", kind, KINDS)
+        self.kind, self.reference_C = kind, float(reference_C)
+        if kind == "base":
+            self.turn = amplitude(3)
+            self.shift = amplitude(3)
+            self.log_tau = logarithm(tau_s)
+        else:
+            self.stage = "material"
+            self.gain = amplitude(1)
+            self.offset = amplitude(len(facts.low))
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        if self.kind == "base":
+            return {"turn": self.turn, "shift": self.shift}
+        return {"gain": self.gain, "offset": self.offset}
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        return [*(cls(facts, "base", tau) for tau in GRID), cls(facts, "temperature")]
+
+    def rest(self, signal: Tensor) -> Tensor:
+        """(B, 1) elapsed time, s, or warming over T_0, K: none."""
+        return signal.new_zeros(len(signal), 1)
+
+    def _warming(self, context: Context) -> Tensor:
+        """(...) warming over T_0, K; 0 where the temperature is not known."""
+        if context.temperature_C is None:
+            return torch.zeros_like(context.dt_s)
+        return (context.temperature_C - self.reference_C).nan_to_num(0.0)
+
+    def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(B, 1) elapsed time, s, or warming, K."""
+        if self.kind == "temperature":
+            return self._warming(context).unsqueeze(-1)
+        if context.t_s is None:
+            return memory + context.dt_s.unsqueeze(-1)
+        return context.t_s.unsqueeze(-1)
+
+    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(R, T, 1) elapsed time, s, or warming, K."""
+        if self.kind == "temperature":
+            return self._warming(context).unsqueeze(-1)
+        if context.t_s is None:
+            return memory.unsqueeze(1) + context.dt_s.cumsum(1).unsqueeze(-1)
+        return context.t_s.unsqueeze(-1)
+
+    def grown(self, elapsed_s: Tensor) -> Tensor:
+        """Share of the drift after ten minutes that has come about after a time, s."""
+        tau = self.log_tau.exp()
+        return torch.expm1(-elapsed_s / tau) / torch.expm1(-TEN_MINUTES / tau)
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Drifted key points (..., n, 3), mm, or effective actuation (..., m)."""
+        if self.kind == "base":
+            grown = self.grown(memory).unsqueeze(-2)
+            return rotate(signal, grown * self.turn) + grown * self.shift
+        share = memory / TEN_KELVIN
+        moved = self.gain * (signal - self.origin) + self.reach * self.offset
+        return signal + share * moved
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        with torch.no_grad():
+            if self.kind == "base":
+                grown = self.grown(memory).unsqueeze(-2)
+                axes = torch.eye(3, dtype=signal.dtype, device=signal.device)
+                axes = axes.view(3, *[1] * (signal.ndim - 1), 3).expand(3, *signal.shape)
+                turned = torch.linalg.cross(axes, signal.expand(axes.shape))
+                return grown * torch.cat([turned, axes])
+            share = memory / TEN_KELVIN
+            offsets = torch.diag_embed((share * self.reach).expand(signal.shape))
+            gain = (share * (signal - self.origin)).unsqueeze(0)
+            return torch.cat([gain, offsets.movedim(-1, 0)])
+
+    def config(self) -> dict:
+        return {"kind": self.kind, "reference_C": self.reference_C}
+
+    def quantities(self) -> list[Quantity]:
+        if self.kind == "base":
+            held = "a holder that yields a little, not one that has come loose"
+            tau = value_of(self.log_tau.exp())
+            return [
+                Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
+                Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
+                Quantity("tau_s", tau, "s", 5.0, 1e6, held),
+            ]
+        rubber = "wide: an ideal rubber has 3 % in 10 K (modulus ~ T, Treloar 1975)"
+        return [
+            Quantity("gain_in_10_K_share", value_of(self.gain), "", -0.4, 0.4, rubber),
+            Quantity("offset_in_10_K_share", value_of(self.offset), "", -0.3, 0.3, rubber),
+        ]

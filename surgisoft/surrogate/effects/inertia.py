@@ -1,0 +1,119 @@
+"""Inertia: the arm swings after its actuation.
+
+The first bending mode is an under-damped oscillator that the actuation drives (Meirovitch 2001,
+ch. 8):
+
+    y'' + 2 damping w y' + w^2 y = w^2 p,      w = 2 pi frequency,
+    p_eff = p + share (y - p).
+
+The actuation is held between two rows and the oscillator integrated exactly: with the poles
+l = w (-damping + i sqrt(1 - damping^2)), the complex number Q = y' - conj(l) y obeys
+Q' = l Q + w^2 p, a linear recurrence.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Context,
+    Effect,
+    Quantity,
+    amplitude,
+    logarithm,
+    value_of,
+)
+from surgisoft.surrogate.scan import linear_scan
+
+GRID = (
+    (0.5, 0.1),
+    (1.0, 0.1),
+    (2.0, 0.1),
+    (4.0, 0.1),
+    (0.5, 0.4),
+    (1.0, 0.4),
+    (2.0, 0.4),
+    (4.0, 0.4),
+)
+"""(frequency in Hz, damping ratio) that a diagnosis tries."""
+
+
+class Inertia(Effect):
+    """An under-damped second-order response, the same for all chambers."""
+
+    stage = "material"
+
+    def __init__(self, facts: ArmFacts, frequency_Hz: float = 2.0, damping: float = 0.2):
+        """Undamped frequency, Hz, and damping ratio between 0 and 1."""
+        super().__init__(facts)
+        self.share = amplitude(1)
+        self.log_frequency = logarithm(frequency_Hz)
+        self.damping_logit = nn.Parameter(torch.tensor([math.log(damping / (1 - damping))]))
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"share": self.share}
+
+    def memory_parameters(self) -> list[nn.Parameter]:
+        return [self.log_frequency, self.damping_logit]
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        return [cls(facts, *mode) for mode in GRID]
+
+    def _pole(self) -> tuple[Tensor, Tensor]:
+        """(1,) pole l over w, complex, and w in rad/s."""
+        damping = self.damping_logit.sigmoid()
+        return torch.complex(-damping, (1 - damping.square()).sqrt()), (
+            2 * math.pi * self.log_frequency.exp()
+        )
+
+    def _drive(self, signal: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """Factor (..., 1) and addend (..., m) of the recurrence of Q / w."""
+        pole, w = self._pole()
+        keep = torch.exp(pole * (w * dt).unsqueeze(-1))
+        return keep, (keep - 1) * pole.conj() * signal
+
+    def _to_mode(self, memory: Tensor) -> Tensor:
+        """(..., m) Q / w from y and y' / w (..., m, 2)."""
+        return memory[..., 1] - self._pole()[0].conj() * memory[..., 0]
+
+    def _from_mode(self, mode: Tensor) -> Tensor:
+        """(..., m, 2) y and y' / w from Q / w."""
+        pole = self._pole()[0]
+        y = mode.imag / pole.imag
+        return torch.stack([y, mode.real + pole.real * y], dim=-1)
+
+    def rest(self, signal: Tensor) -> Tensor:
+        """(B, m, 2) y and y' / w of an arm that has rested at the actuation (B, m)."""
+        return torch.stack([signal, torch.zeros_like(signal)], dim=-1)
+
+    def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(B, m, 2) y and y' / w after the actuation (B, m)."""
+        keep, addend = self._drive(signal, context.dt_s)
+        return self._from_mode(keep * self._to_mode(memory) + addend)
+
+    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(R, T, m, 2) y and y' / w along the actuation (R, T, m)."""
+        keep, addend = self._drive(signal, context.dt_s)
+        return self._from_mode(linear_scan(keep, addend, self._to_mode(memory)))
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Effective actuation (..., m) from actuation (..., m) and oscillators (..., m, 2)."""
+        return signal + self.share * (memory[..., 0] - signal)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        return (memory[..., 0] - signal).unsqueeze(0).detach()
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        soft = "wide: first modes of soft arms of centimetres to a metre"
+        damping = value_of(self.damping_logit.sigmoid())
+        return [
+            Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the arm swings"),
+            Quantity("frequency_Hz", value_of(self.log_frequency.exp()), "Hz", 0.1, 50.0, soft),
+            Quantity("damping_ratio", damping, "", 0.005, 0.99, soft),
+        ]

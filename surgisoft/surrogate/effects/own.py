@@ -1,0 +1,129 @@
+"""Effects of the users' own: by entry point of an installed package, or by file.
+
+A package offers effects in the entry point group `surgisoft.effects`; the entry's name is the
+effect's. A file holds one `Effect`; its stem is the effect's name, and it is only ever run because
+a person named it.
+"""
+
+import hashlib
+import importlib.util
+import sys
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.effects.base import STAGES, Effect
+
+GROUP = "surgisoft.effects"
+"""Entry point group of effects in other packages."""
+RESERVED = ("network", "none")
+"""Names that mean something else in a model."""
+
+
+@dataclass(frozen=True)
+class EffectFile:
+    """An effect that came from a file."""
+
+    kind: type[Effect]
+    """Its class."""
+    path: str
+    """The file as it was named."""
+    sha256: str
+    """Hash of the file's bytes."""
+
+
+FILES: dict[str, EffectFile] = {}
+"""Effects from files that a person has named, by name."""
+
+
+def register_effect_file(path: str | Path, taken=()) -> str:
+    """Run a person's effect file and register its one `Effect`; returns its name, the file's stem.
+
+    taken: names that the package has itself.
+    """
+    path = Path(path)
+    name = path.stem
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a .py file with one Effect in it")
+    if path.suffix != ".py" or not name.isidentifier():
+        raise InputError(f"{path}: expected a .py file whose stem is a plain name (my_effect.py)")
+    if name in taken or name in RESERVED or name in offered():
+        raise InputError(f"{path}: an effect '{name}' is there already; rename the file")
+    content = path.read_bytes()
+    module_name = f"surgisoft_effect_{name}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module_name] = module
+    try:
+        exec(compile(content, str(path), "exec"), module.__dict__)
+    except Exception as error:
+        del sys.modules[module_name]
+        raise InputError(
+            f"{path}: does not run ({type(error).__name__}: {str(error)[:120]}); correct it"
+        ) from error
+    made = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type)
+        and issubclass(value, Effect)
+        and value.__module__ == module_name
+        and not value.__abstractmethods__
+    ]
+    if len(made) != 1:
+        found = ", ".join(kind.__name__ for kind in made) or "none"
+        raise InputError(f"{path}: expected one complete Effect in the file, found {found}")
+    _check(made[0], str(path))
+    FILES[name] = EffectFile(made[0], str(path), hashlib.sha256(content).hexdigest())
+    return name
+
+
+def offered() -> dict:
+    """Entry points of effects in installed packages by name; none is loaded."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def load_offered(name: str) -> type[Effect]:
+    """The effect of an installed package."""
+    entry = offered()[name]
+    try:
+        kind = entry.load()
+    except Exception as error:
+        raise InputError(
+            f"effect '{name}' ({entry.value}): does not load ({type(error).__name__}: "
+            f"{str(error)[:120]}); correct or remove that package"
+        ) from error
+    _check(kind, f"effect '{name}' ({entry.value})")
+    return kind
+
+
+def _check(kind, label: str) -> None:
+    if not (isinstance(kind, type) and issubclass(kind, Effect)):
+        raise InputError(f"{label}: expected a subclass of surgisoft.surrogate.effects.Effect")
+    if getattr(kind, "stage", None) not in STAGES:
+        raise InputError(f"{label}: expected a 'stage' of {', '.join(STAGES)}")
+
+
+def files_of(names) -> dict[str, dict]:
+    """Path and hash of those named effects that came from files, for a checkpoint."""
+    return {
+        name: {"path": FILES[name].path, "sha256": FILES[name].sha256}
+        for name in names
+        if name in FILES
+    }
+
+
+def check_files(wanted: dict[str, dict], label: str) -> None:
+    """Raise unless a person has named each effect file that a checkpoint needs, unchanged."""
+    for name, file in wanted.items():
+        if name not in FILES:
+            raise InputError(
+                f"{label}: its effect '{name}' is code in {file['path']}, which opening a model "
+                f"does not run; name the file with --effect if you trust it"
+            )
+        if FILES[name].sha256 != file["sha256"]:
+            raise InputError(
+                f"{label}: {FILES[name].path} is not the file that its effect '{name}' was made "
+                f"with (sha256 {FILES[name].sha256[:12]}, expected {file['sha256'][:12]}); "
+                "name the same file, or amend the model anew"
+            )

@@ -1,0 +1,72 @@
+"""Payload: weight at the tip and along the body bends the arm.
+
+Euler-Bernoulli on the bent centreline r(s) (Love 1927, ch. XVIII; `surgisoft.surrogate.beam`):
+
+    M(s) = (r_tip - r(s)) x F + int_s^L (r(s') - r(s)) x w ds',
+    theta(s) = C int_0^s M ds,     u(s) = int_0^s theta x dr,     q = p + u.
+
+Shapes alone tell C F and C w, compliance times load. They are given as the sag that they cause at
+the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8. Where gravity's
+direction is not known, each is a vector in the base frame.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.beam import Beam, displaced, force_moment, weight_moment
+from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
+
+
+class Payload(Memoryless):
+    """Weight at the tip and along the body."""
+
+    stage = "body"
+
+    def __init__(self, facts: ArmFacts):
+        super().__init__(facts)
+        beam = Beam.through(facts.rest_mm)
+        known = facts.gravity is not None
+        down = torch.tensor([facts.gravity]) if known else torch.eye(3)
+        self.length_mm = beam.length_mm
+        self.tip_sag = amplitude(len(down))
+        self.body_sag = amplitude(len(down))
+        self.register_buffer("down", down.float(), persistent=False)
+        self.register_buffer("position", beam.position, persistent=False)
+        self.register_buffer("key", beam.key, persistent=False)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        """Sag at the tip, mm, by a load at the tip and along the body; (1,), or (3,) by axis."""
+        return {"tip_sag": self.tip_sag, "body_sag": self.body_sag}
+
+    def _moved(self, points: Tensor, tip: Tensor, body: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, by sags (3,) in mm at the tip and along the body."""
+        line = self.position @ points
+        moment = force_moment(line, 3 * tip / self.length_mm**3)
+        moment = moment + weight_moment(line, 8 * body / self.length_mm**4)
+        return displaced(line, moment)[..., self.key, :]
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Loaded key points (..., n, 3) from those of the unloaded arm, mm."""
+        return signal + self._moved(signal, self.tip_sag @ self.down, self.body_sag @ self.down)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        none = torch.zeros(3, dtype=signal.dtype, device=signal.device)
+        with torch.no_grad():
+            tip = [self._moved(signal, axis, none) for axis in self.down]
+            body = [self._moved(signal, none, axis) for axis in self.down]
+        return torch.stack(tip + body)
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        small = "to first order in the load, so below half the length"
+        largest = 0.5 * self.length_mm
+        least = -0.1 * self.length_mm if len(self.down) == 1 else -largest
+        total = (self.tip_sag + self.body_sag).detach()
+        lightest = 0.0 if len(self.down) == 1 else -largest
+        return [
+            Quantity("tip_sag_mm", value_of(self.tip_sag), "mm", least, largest, small),
+            Quantity("body_sag_mm", value_of(self.body_sag), "mm", least, largest, small),
+            Quantity("sag_mm", value_of(total), "mm", lightest, largest, "no negative mass"),
+        ]

@@ -1,0 +1,85 @@
+"""Stiffening: the wall resists more, the farther it is strained.
+
+The share of push that is lost grows with a chamber's own load and with the bending of the arm,
+after Fung's exponential (Fung 1967), whose first term is the cubic spring:
+
+    x_eff_i = x_i (1 - own h(x_i^2) - bend h(B^2)),   h(q) = (exp(k q) - 1) / (exp(k) - 1),
+    B^2 = sum_i (x_i - mean x)^2 m / (m - 1),
+
+with B = 1 where one chamber alone is fully loaded.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Memoryless,
+    Quantity,
+    amplitude,
+    logarithm,
+    value_of,
+)
+
+GRID = (0.1, 2.0, 5.0)
+"""Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
+
+
+class Stiffening(Memoryless):
+    """Progressive loss of push, the same for all chambers."""
+
+    stage = "material"
+
+    def __init__(self, facts: ArmFacts, steepness: float = 1.0):
+        """Steepness k of the exponential; towards 0 a cubic spring."""
+        super().__init__(facts)
+        self.own = amplitude(1)
+        self.bend = amplitude(1)
+        self.log_steepness = logarithm(steepness)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        return {"own": self.own, "bend": self.bend}
+
+    @classmethod
+    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
+        return [cls(facts, steepness) for steepness in GRID]
+
+    def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
+        """Two (..., m) shifts of the actuation at strength one: own and bending."""
+        x, k = self.load(signal), self.log_steepness.exp()
+        m = x.shape[-1]
+        bend = (x - x.mean(-1, keepdim=True)).square().sum(-1, keepdim=True) * m / max(m - 1, 1)
+        moved = signal - self.origin
+        return tuple(
+            # A recording beyond the fitted range must not blow up.
+            -moved * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
+            for q in (x.square(), bend)
+        )
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Effective actuation (..., m) from actuation (..., m)."""
+        own, bend = self._lost(signal)
+        return signal + self.own * own + self.bend * bend
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        return torch.stack(self._lost(signal)).detach()
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        rubber = "wide: a rest of the push is left"
+        total = float((self.own + self.bend).detach())
+        return [
+            Quantity("own_share", value_of(self.own), "", -0.5, 0.9, rubber),
+            Quantity("bend_share", value_of(self.bend), "", -0.5, 0.9, rubber),
+            Quantity(
+                "total_share",
+                total,
+                "",
+                0.0,
+                0.9,
+                "a wall that stiffens takes push and leaves some",
+            ),
+            Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
+        ]

@@ -1,0 +1,87 @@
+"""Twist: actuation turns the cross-sections about the centreline.
+
+Fibres that are wound unequally make every slice of the body turn by an angle per length that grows
+with the chambers' mean load l (Connolly, Walsh & Bertoldi 2017, fibre-reinforced actuators):
+
+    theta(s) = (linear l + quadratic l |l|) / L  int_0^s t ds,     q = p + int_0^s theta x dr,
+
+with t the tangent of the bent centreline r(s) of length L. A straight arm hides it.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.beam import Beam, displaced, lengths
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Context,
+    Effect,
+    Quantity,
+    amplitude,
+    value_of,
+)
+
+
+class Twist(Effect):
+    """Torsion of the body by the mean load of the chambers."""
+
+    stage = "body"
+
+    def __init__(self, facts: ArmFacts):
+        super().__init__(facts)
+        beam = Beam.through(facts.rest_mm)
+        self.linear = amplitude(1)
+        self.quadratic = amplitude(1)
+        self.register_buffer("position", beam.position, persistent=False)
+        self.register_buffer("key", beam.key, persistent=False)
+
+    def strengths(self) -> dict[str, nn.Parameter]:
+        """Twist of the tip against the base at full load, rad."""
+        return {"linear": self.linear, "quadratic": self.quadratic}
+
+    def rest(self, signal: Tensor) -> Tensor:
+        """(B, 1) mean load of the chambers: none."""
+        return signal.new_zeros(len(signal), 1)
+
+    def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(B, 1) mean load of the chambers now; the last one where it is not told."""
+        if context.pressure is None:
+            return memory
+        return self.load(context.pressure).mean(-1, keepdim=True)
+
+    def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
+        """(R, T, 1) mean load of the chambers."""
+        if context.pressure is None:
+            return memory.unsqueeze(1).expand(*signal.shape[:2], 1)
+        return self.load(context.pressure).mean(-1, keepdim=True)
+
+    def _turned(self, points: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, by a twist of 1 rad from base to tip."""
+        line = self.position @ points
+        chords = line.diff(dim=-2)
+        steps = lengths(line)
+        tangent = chords / steps
+        ends = torch.cat([tangent[..., :1, :], tangent, tangent[..., -1:, :]], dim=-2)
+        tangents = (ends[..., 1:, :] + ends[..., :-1, :]) / 2
+        whole = steps.sum(-2, keepdim=True)
+        return displaced(line, tangents / whole)[..., self.key, :]
+
+    def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """Twisted key points (..., n, 3), mm, from the mean load (..., 1)."""
+        angle = self.linear * memory + self.quadratic * memory * memory.abs()
+        return signal + angle.unsqueeze(-1) * self._turned(signal)
+
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        with torch.no_grad():
+            turned, load = self._turned(signal), memory.unsqueeze(-1)
+            return torch.stack([load * turned, load * load.abs() * turned])
+
+    def config(self) -> dict:
+        return {}
+
+    def quantities(self) -> list[Quantity]:
+        fibres = "arms that are meant to bend, not to twist (Connolly et al. 2017)"
+        return [
+            Quantity("linear_rad", value_of(self.linear), "rad", -1.0, 1.0, fibres),
+            Quantity("quadratic_rad", value_of(self.quadratic), "rad", -1.0, 1.0, fibres),
+        ]

@@ -32,7 +32,9 @@ SAMPLE_MM = 0.4
 """A pixel takes its dose from a sample within this distance (mm)."""
 
 
-def log_camera(columns: Columns, log: EpisodeLog, rows: np.ndarray, looks: np.ndarray) -> None:
+def log_camera(
+    columns: Columns, log: EpisodeLog, rows: np.ndarray, looks: np.ndarray, report=None
+) -> None:
     """The camera's pose in the log's `rows`, and its picture in `looks`."""
     arm, half = log.arms[ENDOSCOPE], 0.5 * log.camera.fov_rad
     pinhole = rr.Pinhole(
@@ -49,14 +51,14 @@ def log_camera(columns: Columns, log: EpisodeLog, rows: np.ndarray, looks: np.nd
         translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
     )
     columns.send(CAMERA, rows, moving)
-    pictures = jpegs(log, looks)
+    pictures = jpegs(log, looks, report)
     style = rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="linear")
     columns.recording.log(f"{CAMERA}/picture", style, static=True)
     shown = rr.EncodedImage.columns(blob=pictures)
     columns.send(f"{CAMERA}/picture", looks, shown)
 
 
-def jpegs(log: EpisodeLog, rows: np.ndarray) -> list[bytes]:
+def jpegs(log: EpisodeLog, rows: np.ndarray, report=None) -> list[bytes]:
     """The endoscope's round picture in each of the log's `rows`, as JPEG files."""
     from PIL import Image
 
@@ -75,6 +77,8 @@ def jpegs(log: EpisodeLog, rows: np.ndarray) -> list[bytes]:
         file = io.BytesIO()
         Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
         files.append(file.getvalue())
+        if report is not None:
+            report(len(files), len(rows), "endoscope")
     return files
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,10 +58,16 @@ class Replay:
         )
 
 
-def write_replay(log: EpisodeLog, path: str | Path, pictures_hz: float = PICTURES_HZ) -> Replay:
+def write_replay(
+    log: EpisodeLog,
+    path: str | Path,
+    pictures_hz: float = PICTURES_HZ,
+    report: Callable[[float, float, str], None] | None = None,
+) -> Replay:
     """Write the log as an .rrd file that opens by itself with a fitting layout.
 
-    `pictures_hz` endoscope pictures are drawn a second, which is nearly all that writing costs.
+    `pictures_hz` endoscope pictures are drawn a second, which is nearly all that writing costs;
+    `report` is told (pictures drawn, pictures to draw, note).
     """
     began, path = time.perf_counter(), Path(path)
     plots = plots_of(log)
@@ -77,7 +84,7 @@ def write_replay(log: EpisodeLog, path: str | Path, pictures_hz: float = PICTURE
         if log.beam is not None:
             _log_beam(columns, log, moments)
         if log.camera is not None and ENDOSCOPE in log.arms:
-            log_camera(columns, log, moments, finite_rows(log, pictures_hz))
+            log_camera(columns, log, moments, finite_rows(log, pictures_hz), report)
         for line in (line for plot in plots for line in plot.lines):
             columns.plot(line)
         _log_events(recording, log)

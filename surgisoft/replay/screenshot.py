@@ -11,10 +11,23 @@ from surgisoft.toml_config import write_atomically
 
 WINDOW = (1600, 1000)
 """Width and height of the invisible window (pixels)."""
+LEAST, MOST = 100, 4000
+"""Bounds of width and height (points)."""
 NOTICES_S = 7.0
 """The viewer's notices about its start lie over the picture for so long (s)."""
 PATIENCE_S = 60.0
 """How long the viewer may take to load the recording and draw (s)."""
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height from text such as `1600x1000`."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"size is '{text}', expected WIDTHxHEIGHT such as 1600x1000")
+    size = int(width), int(height)
+    if not (min(size) >= LEAST and max(size) <= MOST):
+        raise InputError(f"size is '{text}', expected {LEAST} to {MOST} each way")
+    return size
 
 
 def take_screenshot(

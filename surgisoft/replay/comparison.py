@@ -1,0 +1,163 @@
+"""A model against a recording as a replay: measured and predicted body, coloured by error."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from surgisoft.errors import InputError
+from surgisoft.replay.colours import BACKGROUND, PLAN_COLOUR, SHAFT_COLOUR, error_colours
+from surgisoft.replay.episode_view import Replay
+from surgisoft.replay.plots import Line, series_colour
+from surgisoft.replay.recording import TIME, Columns, new_recording
+from surgisoft.replay.shapes import finer
+
+MOST_ROWS = 6000
+"""Longer comparisons are thinned evenly to so many rows."""
+STRETCH_OF_ERROR = 0.15
+"""Errors are drawn so long that a large one (95 %) is this share of the body's size."""
+LARGE = 0.95
+"""Share of all errors that the colour scale reaches up to."""
+LINE_MM = 2.0
+"""Spacing of the drawn centreline's points (mm)."""
+
+
+def write_comparison(
+    t_s: np.ndarray,
+    measured_mm: np.ndarray,
+    predicted_mm: np.ndarray,
+    name: str,
+    path: str | Path,
+    pressure: np.ndarray | None = None,
+    unit: str = "kPa",
+) -> Replay:
+    """Write measured against predicted key points as an .rrd file.
+
+    t_s (S,) s, where it falls back a new run begins; measured_mm (S, n, 3) and predicted_mm
+    (S, n, 3) in the base frame, nan where missing; pressure (S, m) in `unit`, drawn if given;
+    `name` says what is compared. Both bodies lie on each other, so each error is also drawn as an
+    arrow from measured to predicted, stretched by the factor that the view's title gives.
+    """
+    began, path = time.perf_counter(), Path(path)
+    t_s, measured, predicted = (np.asarray(x, float) for x in (t_s, measured_mm, predicted_mm))
+    _check(t_s, measured, predicted)
+    keep = np.unique(np.linspace(0, len(t_s) - 1, min(len(t_s), MOST_ROWS)).round().astype(int))
+    time_s = continued(t_s)[keep]
+    measured, predicted = measured[keep], predicted[keep]
+    error = np.linalg.norm(predicted - measured, axis=-1)
+    large = _quantile(error, LARGE)
+    stretch = _stretch(measured, large)
+    lines = _lines(error, None if pressure is None else np.asarray(pressure, float)[keep], unit)
+    blueprint = _blueprint(name, measured, stretch, large, lines)
+    with new_recording(path, "surgisoft_comparison", name, blueprint) as recording:
+        columns = Columns(recording, time_s)
+        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        _log_body(columns, "/measured", measured, SHAFT_COLOUR, 0.5)
+        _log_body(columns, "/predicted", predicted, PLAN_COLOUR, 0.3)
+        _log_errors(columns, measured, predicted, error, stretch, large)
+        for line in (line for group in lines.values() for line in group):
+            columns.plot(line)
+    cost = time.perf_counter() - began
+    return Replay(path, path.stat().st_size / 1e6, float(time_s[-1] - time_s[0]), cost)
+
+
+def continued(t_s: np.ndarray) -> np.ndarray:
+    """(S,) s that never fall: where time falls back, a new run goes on after the one before."""
+    steps = np.diff(t_s)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    steps = np.where(steps < 0.0, usual, steps)
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _check(t_s, measured, predicted) -> None:
+    shape = measured.shape
+    if measured.ndim != 3 or shape[-1] != 3 or not len(t_s):
+        raise InputError(f"comparison: measured has shape {shape}, expected (S, n, 3), S > 0")
+    if predicted.shape != shape or t_s.shape != shape[:1]:
+        raise InputError(
+            f"comparison: measured {shape}, predicted {predicted.shape} and times {t_s.shape} do "
+            "not fit each other"
+        )
+
+
+def _quantile(error: np.ndarray, share: float) -> float:
+    known = error[np.isfinite(error)]
+    return float(np.quantile(known, share)) if len(known) else 0.0
+
+
+def _stretch(measured: np.ndarray, large: float) -> float:
+    """A round factor by which errors are drawn longer."""
+    points = measured[np.isfinite(measured).all(-1)]
+    size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 1.0
+    factor = STRETCH_OF_ERROR * size / max(large, 1e-9)
+    rounds = [k * 10.0**p for p in range(4) for k in (1.0, 2.0, 5.0)]
+    return max((r for r in rounds if r <= factor), default=1.0)
+
+
+def _lines(error, pressure, unit: str) -> dict[str, list[Line]]:
+    """Title of each plot -> its lines."""
+    count = error.shape[1]
+    groups = {
+        "Error of each key point (mm)": [
+            Line(f"/plots/error/k{i}", f"k{i}", error[:, i], series_colour(i)) for i in range(count)
+        ]
+    }
+    if pressure is not None:
+        groups[f"Pressure ({unit})"] = [
+            Line(f"/plots/pressure/p{i + 1}", f"p{i + 1}", pressure[:, i], series_colour(i))
+            for i in range(pressure.shape[1])
+        ]
+    return groups
+
+
+def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> None:
+    """A spline through the key points of each row in which all are known."""
+    rows = np.flatnonzero(np.isfinite(points).all((1, 2)))
+    style = rr.LineStrips3D.from_fields(colors=colour, radii=radius)
+    columns.recording.log(f"{entity}/body", style, static=True)
+    strips = [finer(points[row], LINE_MM).astype(np.float32) for row in rows]
+    columns.send(f"{entity}/body", rows, rr.LineStrips3D.columns(strips=strips))
+
+
+def _log_errors(columns: Columns, measured, predicted, error, stretch: float, large: float) -> None:
+    """Key points coloured by error, and an arrow for each; what is missing is left out."""
+    known = np.isfinite(error)
+    rows, counts = np.flatnonzero(known.any(1)), known.sum(1)
+    counts = counts[rows]
+    colours = error_colours(error[known], large)
+    points = rr.Points3D.columns(positions=measured[known], colors=colours)
+    columns.recording.log("/errors/points", rr.Points3D.from_fields(radii=1.3), static=True)
+    columns.send("/errors/points", rows, points.partition(counts))
+    arrows = rr.Arrows3D.columns(
+        origins=measured[known], vectors=stretch * (predicted - measured)[known], colors=colours
+    )
+    columns.recording.log("/errors/arrows", rr.Arrows3D.from_fields(radii=0.35), static=True)
+    columns.send("/errors/arrows", rows, arrows.partition(counts))
+
+
+def _blueprint(name: str, measured, stretch: float, large: float, lines) -> rrb.Blueprint:
+    points = measured[np.isfinite(measured).all(-1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
+    eye = middle + 1.3 * size * np.array([0.35, -0.9, 0.3])
+    scene = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /measured/**", "+ /predicted/**", "+ /errors/**"],
+        name=f"{name}: errors x {stretch:g}, red from {large:.2g} mm",
+        background=rrb.Background(BACKGROUND),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
+    )
+    plots = [
+        rrb.TimeSeriesView(origin="/", contents=[line.entity for line in group], name=title)
+        for title, group in lines.items()
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, rrb.Vertical(*plots)),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="paused"),
+    )

@@ -82,6 +82,8 @@ def _check(t_s, measured, predicted) -> None:
             f"comparison: measured {shape}, predicted {predicted.shape} and times {t_s.shape} do "
             "not fit each other"
         )
+    if not np.isfinite(predicted - measured).all(-1).any():
+        raise InputError("comparison: no key point is both measured and predicted, nothing to draw")
 
 
 def _quantile(error: np.ndarray, share: float) -> float:
@@ -115,8 +117,11 @@ def _lines(error, pressure, unit: str) -> dict[str, list[Line]]:
 
 
 def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> None:
-    """A spline through the key points of each row in which all are known."""
-    rows = np.flatnonzero(np.isfinite(points).all((1, 2)))
+    """A spline through the key points of each row in which all are known and apart."""
+    apart = (np.linalg.norm(np.diff(points, axis=1), axis=-1) > 1e-6).all(1)
+    rows = np.flatnonzero(np.isfinite(points).all((1, 2)) & apart)
+    if points.shape[1] < 2 or not len(rows):
+        return
     style = rr.LineStrips3D.from_fields(colors=colour, radii=radius)
     columns.recording.log(f"{entity}/body", style, static=True)
     strips = [finer(points[row], LINE_MM).astype(np.float32) for row in rows]

@@ -2,8 +2,10 @@
 
 Euler-Bernoulli on the bent centreline r(s): a moment M(s) turns the cross-section by
 theta(s) = C int_0^s M ds, and moves it by u(s) = int_0^s theta x dr (Love 1927, ch. XVIII, to first
-order in the load). The compliance C = 1 / EI is taken to be the same in every direction. All
-integrals are trapezoids over samples of the B-spline through the key points.
+order in the load). The compliance C = 1 / EI is the same in every direction, and s is the length
+along the unloaded body, so that a stretched arm keeps its mass. The moment of a force is linear in
+the centreline, the centreline in the key points: all integrals (trapezoids over samples of the
+B-spline) are constant matrices times key points.
 """
 
 from dataclasses import dataclass
@@ -21,14 +23,24 @@ BASE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class Beam:
-    """Constant matrices of an arm's centreline, clamped at its base."""
+    """Constant matrices of an arm that is clamped at its base; K intervals between samples.
 
-    position: Tensor
-    """(K, n) times key points gives K samples of the centreline, mm; row 0 is the clamp."""
-    key: Tensor
-    """(n,) sample of each key point."""
+    Key points as (..., 3, n) times one of the (n, K) matrices give vectors (..., 3, K) at the
+    middles of the intervals.
+    """
+
+    chords: Tensor
+    """(n, K) the intervals' chords dr, mm."""
+    collect: Tensor
+    """(K, n) sums what the intervals add into the key points."""
+    levers: Tensor
+    """(n, n, K) for a force at each key point c: int_0^s (r_c - r) ds', up to c, mm^2."""
+    weights: Tensor
+    """(n, K) for a load per length: int_0^s int_s'^L (r'' - r') ds'' ds', mm^3."""
+    places: Tensor
+    """(n, K) the centreline itself less its clamp, r - r(0), mm."""
     length_mm: float
-    """Length of the chords at rest, mm."""
+    """Length L of the chords at rest, mm."""
 
     @classmethod
     def through(cls, rest_mm: Tensor) -> "Beam":
@@ -42,50 +54,51 @@ class Beam:
         steps = np.linalg.norm(np.diff(rest, axis=0), axis=1)
         if not rest.any() or not (steps > 0).all():
             rest = np.arange(1.0, n + 1)[:, None] * np.array([0.0, 0.0, 1.0])
-        clamped = n == 1 or np.linalg.norm(rest[0]) > BASE_SHARE * steps.sum()
-        nodes = np.concatenate([np.zeros((1, 3)), rest]) if clamped else rest
+        below = int(n == 1 or np.linalg.norm(rest[0]) > BASE_SHARE * steps.sum())
+        nodes = np.concatenate([np.zeros((below, 3)), rest])
         chords = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
         knots = np.concatenate([[0.0], np.cumsum(chords)])
         cuts = knots[:-1, None] + chords[:, None] * np.arange(CUTS) / CUTS
         where = np.append(cuts.ravel(), knots[-1])
         spline = make_interp_spline(knots, np.eye(len(nodes)), k=min(3, len(nodes) - 1))
-        position = torch.tensor(spline(where)[:, int(clamped) :], dtype=torch.float32)
-        key = CUTS * (torch.arange(n) + int(clamped))
-        return cls(position, key, float(chords.sum()))
+        position = spline(where)[:, below:]
+        key = CUTS * (np.arange(n) + below)
+
+        samples, ds = len(where), np.diff(where)
+        up_to = np.tril(np.ones((samples, samples - 1)), -1)
+        trapezoid = (np.eye(samples)[1:] + np.eye(samples)[:-1]) / 2
+        integral = up_to @ (ds[:, None] * trapezoid)
+        middle = trapezoid @ integral
+        levers = []
+        for end in key:
+            ahead = position[end] - position
+            # The force's moment ends at its point: the trapezoid's last value there is zero.
+            levers.append(middle @ (ahead * (np.arange(samples) <= end)[:, None]))
+        beyond = integral[-1] - integral
+        weighed = beyond @ position - beyond.sum(1)[:, None] * position
+
+        def matrix(values) -> Tensor:
+            return torch.tensor(np.ascontiguousarray(values), dtype=torch.float32)
+
+        return cls(
+            matrix(np.diff(position, axis=0).T),
+            matrix(up_to[key].T),
+            matrix(np.stack([lever.T for lever in levers])),
+            matrix((middle @ weighed).T),
+            matrix((trapezoid @ (position - position[0])).T),
+            float(knots[-1]),
+        )
 
 
-def along(values: Tensor, steps: Tensor) -> Tensor:
-    """(..., K, 3) integral from the clamp of values (..., K, 3) over steps (..., K-1, 1)."""
-    middle = (values[..., 1:, :] + values[..., :-1, :]) / 2 * steps
-    return torch.nn.functional.pad(middle.cumsum(-2), (0, 0, 1, 0))
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 3, K) vector product of (..., 3, K), broadcast."""
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(-2), b.unbind(-2)
+    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], dim=-2)
 
 
-def lengths(line: Tensor) -> Tensor:
-    """(..., K-1, 1) lengths of the chords of a centreline (..., K, 3), mm."""
-    return line.diff(dim=-2).norm(dim=-1, keepdim=True)
+def displaced(turned: Tensor, chords: Tensor, collect: Tensor) -> Tensor:
+    """(..., n, 3) displacement of the key points, mm.
 
-
-def displaced(line: Tensor, moment: Tensor) -> Tensor:
-    """(..., K, 3) displacement of a centreline under moments (..., K, 3) times compliance, 1/mm."""
-    turned = along(moment, lengths(line))
-    middle = (turned[..., 1:, :] + turned[..., :-1, :]) / 2
-    moved = torch.linalg.cross(middle, line.diff(dim=-2)).cumsum(-2)
-    return torch.nn.functional.pad(moved, (0, 0, 1, 0))
-
-
-def force_moment(line: Tensor, force: Tensor, sample: int = -1) -> Tensor:
-    """(..., K, 3) moment of a force (3,) at one sample: (r_c - r) x F below it, none above."""
-    force = force.expand(line.shape)
-    moment = torch.linalg.cross(line[..., sample, None, :] - line, force)
-    if sample == -1:
-        return moment
-    below = torch.arange(line.shape[-2], device=line.device) <= sample
-    return moment * below.unsqueeze(-1)
-
-
-def weight_moment(line: Tensor, weight: Tensor) -> Tensor:
-    """(..., K, 3) moment of a load (3,) per mm over the whole line: int_s (r' - r) ds' x w."""
-    steps = lengths(line)
-    place, length = along(line, steps), along(torch.ones_like(line), steps)
-    beyond = (place[..., -1:, :] - place) - line * (length[..., -1:, :] - length)
-    return torch.linalg.cross(beyond, weight.expand(beyond.shape))
+    turned: (..., 3, K) rotation of the intervals, rad; chords: (..., 3, K) mm.
+    """
+    return (cross(turned, chords) @ collect).mT

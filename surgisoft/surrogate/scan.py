@@ -6,6 +6,8 @@ bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms
 are affine maps of their last value, which compose to affine maps: `linear_scan`.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -68,17 +70,25 @@ def last_nonzero(values: Tensor) -> Tensor:
 def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
     """y[:, t] = factor[:, t] y[:, t-1] + addend[:, t] with y[:, -1] = start.
 
-    Shapes: factor, addend (R, T, ...) broadcast to each other, start (R, ...); answer (R, T, ...).
-    Real or complex, differentiable. Affine maps compose to affine maps, and with |factor| <= 1 no
-    intermediate grows (Blelloch 1990, "Prefix sums and their applications", sec. 1.4).
+    Shapes: addend (R, T, ...), factor broadcast to it with its own (R, T), start (R, ...); answer
+    (R, T, ...). Real or complex, differentiable; with |factor| <= 1 no intermediate grows. Affine
+    maps compose to affine maps (Blelloch 1990, "Prefix sums and their applications", sec. 1.4):
+    all blocks of about sqrt(T) rows are stepped at once, then the blocks one after the other.
     """
-    factor, addend = torch.broadcast_tensors(factor, addend)
-    steps = addend.shape[1]
-    shift = 1
-    while shift < steps:
-        addend = torch.cat(
-            [addend[:, :shift], addend[:, shift:] + factor[:, shift:] * addend[:, :-shift]], dim=1
-        )
-        factor = torch.cat([factor[:, :shift], factor[:, shift:] * factor[:, :-shift]], dim=1)
-        shift *= 2
-    return addend + factor * start.unsqueeze(1)
+    runs, steps = addend.shape[:2]
+    block = max(1, math.isqrt(steps))
+    blocks = -(-steps // block)
+    if padding := blocks * block - steps:
+        factor = torch.cat([factor, factor[:, -1:].expand(-1, padding, *factor.shape[2:])], 1)
+        addend = torch.cat([addend, addend[:, -1:].expand(-1, padding, *addend.shape[2:])], 1)
+    factor = factor.reshape(runs, blocks, block, *factor.shape[2:])
+    addend = addend.reshape(runs, blocks, block, *addend.shape[2:])
+    within = [addend[:, :, 0]]
+    for now, plus in zip(factor.unbind(2)[1:], addend.unbind(2)[1:], strict=True):
+        within.append(now * within[-1] + plus)
+    share = factor.cumprod(2)
+    before = [start]
+    for kept, last in zip(share[:, :, -1].unbind(1), within[-1].unbind(1), strict=True):
+        before.append(kept * before[-1] + last)
+    whole = torch.stack(within, 2) + share * torch.stack(before[:-1], 1).unsqueeze(2)
+    return whole.flatten(1, 2)[:, :steps]

@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, displaced, force_moment
+from surgisoft.surrogate.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Effect,
@@ -51,15 +51,17 @@ class Contact(Memoryless):
         plane of the normal, rad; offset of the plane along it, mm, base frame."""
         super().__init__(facts)
         beam = Beam.through(facts.rest_mm)
-        self.point = int(point) % len(beam.key)
+        self.point = int(point) % len(beam.levers)
         self.length_mm = beam.length_mm
         self.share = amplitude(1)
         self.azimuth = nn.Parameter(torch.tensor([float(azimuth_rad)]))
         self.rise = nn.Parameter(torch.tensor([float(rise_rad)]))
         # In lengths of the arm, so that a step of the shapes means alike for all of them.
         self.offset = nn.Parameter(torch.tensor([float(offset_mm) / self.length_mm]))
-        self.register_buffer("position", beam.position, persistent=False)
-        self.register_buffer("key", beam.key, persistent=False)
+        lever = beam.levers[self.point] / self.length_mm**2
+        self.register_buffer("lever", lever, persistent=False)
+        self.register_buffer("chords", beam.chords, persistent=False)
+        self.register_buffer("collect", beam.collect, persistent=False)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
@@ -93,10 +95,9 @@ class Contact(Memoryless):
         """(..., n, 3) displacement, mm, by a rigid support."""
         normal = self.normal
         deep = points[..., self.point, :] @ normal - self.offset * self.length_mm
-        line = self.position @ points
-        sample = int(self.key[self.point])
-        moved = displaced(line, force_moment(line, -normal / self.length_mm**3, sample))
-        moved = moved[..., self.key, :]
+        p = points.mT.contiguous()
+        turned = cross(p @ self.lever, -normal.unsqueeze(-1))
+        moved = displaced(turned, p @ self.chords, self.collect)
         at = moved[..., self.point, :]
         back = torch.maximum(-(at @ normal), STEEP * (at.square().sum(-1) + 1e-12).sqrt())
         return moved * (deep.clamp(min=0) / back)[..., None, None]
@@ -122,5 +123,5 @@ class Contact(Memoryless):
             Quantity("azimuth_rad", value_of(self.azimuth), "rad", -10.0, 10.0, "any direction"),
             Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),
-            Quantity("key_point", self.point, "", 0, len(self.key), "which one meets it"),
+            Quantity("key_point", self.point, "", 0, self.lever.shape[0], "which one meets it"),
         ]

@@ -130,6 +130,19 @@ class Hysteresis(Effect):
             shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
         return signal + self.half_range * shift
 
+    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+        with torch.no_grad():
+            u = self.lines(signal)
+            lag = memory - u.unsqueeze(-1)
+            if self.ring:
+                # (m, L) the line that is to each chamber what line l is to the first.
+                seen = lag[..., self.turns.argsort(1), :] * self.half_range[:, None, None]
+                return seen.movedim((-2, -1), (0, 1)).flatten(0, 1)
+            sloped = lag * (u - self.lines(self.origin)).unsqueeze(-1)
+            spread = torch.diag(self.half_range)
+            moved = [torch.einsum("ci,...q->cq...i", spread, x.flatten(-2)) for x in (lag, sloped)]
+            return torch.cat([x.flatten(0, 1) for x in moved])
+
     def config(self) -> dict:
         return {"radii": list(self.radii), "ring": self.ring, "pairs": self.pairs}
 

@@ -135,15 +135,18 @@ def _rising(target: Tensor, start: Tensor, keep_up: Tensor, keep_down: Tensor) -
 
     By Newton's method on the whole recording: with the sides taken from the last answer the lag is
     linear and one scan; the next answer gives the next sides. It ends at the sides of stepping,
-    because after k passes the first k rows are right; a handful of passes are enough.
+    because after k passes the first k rows are right; a handful of passes are enough. Where target
+    and lag are equal but for rounding, either side gives the same and the last one is kept.
     """
     before = torch.cat([start.unsqueeze(1), target[:, :-1]], dim=1)
-    up, last = target > before, None
+    up = target > before
+    level = 1e-6 * target.abs().amax(dim=1, keepdim=True)
     for _ in range(target.shape[1]):
         keep = torch.where(up, keep_up, keep_down)
         lagged = linear_scan(keep, (1 - keep) * target, start)
-        now = target > torch.cat([start.unsqueeze(1), lagged[:, :-1]], dim=1)
-        if torch.equal(now, up) or (last is not None and torch.equal(lagged, last)):
+        above = target - torch.cat([start.unsqueeze(1), lagged[:, :-1]], dim=1)
+        now = torch.where(above.abs() > level, above > 0, up)
+        if torch.equal(now, up):
             break
-        up, last = now, lagged
+        up = now
     return up

@@ -13,7 +13,7 @@ direction is not known, each is a vector in the base frame.
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, displaced, force_moment, weight_moment
+from surgisoft.surrogate.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
 
 
@@ -31,30 +31,41 @@ class Payload(Memoryless):
         self.tip_sag = amplitude(len(down))
         self.body_sag = amplitude(len(down))
         self.register_buffer("down", down.float(), persistent=False)
-        self.register_buffer("position", beam.position, persistent=False)
-        self.register_buffer("key", beam.key, persistent=False)
+        # As levers of unit sags: C F = 3 tip_sag / L^3 and C w = 8 body_sag / L^4.
+        lever = torch.stack(
+            [beam.levers[-1] * (3 / self.length_mm**3), beam.weights * (8 / self.length_mm**4)]
+        )
+        self.register_buffer("lever", lever, persistent=False)
+        self.register_buffer("chords", beam.chords, persistent=False)
+        self.register_buffer("collect", beam.collect, persistent=False)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         """Sag at the tip, mm, by a load at the tip and along the body; (1,), or (3,) by axis."""
         return {"tip_sag": self.tip_sag, "body_sag": self.body_sag}
 
-    def _moved(self, points: Tensor, tip: Tensor, body: Tensor) -> Tensor:
-        """(..., n, 3) displacement, mm, by sags (3,) in mm at the tip and along the body."""
-        line = self.position @ points
-        moment = force_moment(line, 3 * tip / self.length_mm**3)
-        moment = moment + weight_moment(line, 8 * body / self.length_mm**4)
-        return displaced(line, moment)[..., self.key, :]
+    def _moved(self, points: Tensor, sags: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, by sags (2, 3) in mm at the tip and along the body."""
+        p = points.mT.contiguous()
+        tip, body = (sag.unsqueeze(-1) for sag in sags)
+        turned = cross(p @ self.lever[0], tip) + cross(p @ self.lever[1], body)
+        return displaced(turned, p @ self.chords, self.collect)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Loaded key points (..., n, 3) from those of the unloaded arm, mm."""
-        return signal + self._moved(signal, self.tip_sag @ self.down, self.body_sag @ self.down)
+        return signal + self._moved(signal, torch.stack([self.tip_sag, self.body_sag]) @ self.down)
 
     def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
-        none = torch.zeros(3, dtype=signal.dtype, device=signal.device)
         with torch.no_grad():
-            tip = [self._moved(signal, axis, none) for axis in self.down]
-            body = [self._moved(signal, none, axis) for axis in self.down]
-        return torch.stack(tip + body)
+            p = signal.mT.contiguous()
+            chords = p @ self.chords
+            levers = [p @ lever for lever in self.lever]
+            return torch.stack(
+                [
+                    displaced(cross(lever, axis.unsqueeze(-1)), chords, self.collect)
+                    for lever in levers
+                    for axis in self.down
+                ]
+            )
 
     def config(self) -> dict:
         return {}

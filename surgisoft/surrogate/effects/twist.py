@@ -3,7 +3,8 @@
 Fibres that are wound unequally make every slice of the body turn by an angle per length that grows
 with the chambers' mean load l (Connolly, Walsh & Bertoldi 2017, fibre-reinforced actuators):
 
-    theta(s) = (linear l + quadratic l |l|) / L  int_0^s t ds,     q = p + int_0^s theta x dr,
+    theta(s) = (linear l + quadratic l |l|) / L  int_0^s t ds = (...) (r(s) - r(0)) / L,
+    q = p + int_0^s theta x dr,
 
 with t the tangent of the bent centreline r(s) of length L. A straight arm hides it.
 """
@@ -11,7 +12,7 @@ with t the tangent of the bent centreline r(s) of length L. A straight arm hides
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, displaced, lengths
+from surgisoft.surrogate.beam import Beam, displaced
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
@@ -32,8 +33,9 @@ class Twist(Effect):
         beam = Beam.through(facts.rest_mm)
         self.linear = amplitude(1)
         self.quadratic = amplitude(1)
-        self.register_buffer("position", beam.position, persistent=False)
-        self.register_buffer("key", beam.key, persistent=False)
+        self.register_buffer("places", beam.places / beam.length_mm, persistent=False)
+        self.register_buffer("chords", beam.chords, persistent=False)
+        self.register_buffer("collect", beam.collect, persistent=False)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         """Twist of the tip against the base at full load, rad."""
@@ -57,14 +59,8 @@ class Twist(Effect):
 
     def _turned(self, points: Tensor) -> Tensor:
         """(..., n, 3) displacement, mm, by a twist of 1 rad from base to tip."""
-        line = self.position @ points
-        chords = line.diff(dim=-2)
-        steps = lengths(line)
-        tangent = chords / steps
-        ends = torch.cat([tangent[..., :1, :], tangent, tangent[..., -1:, :]], dim=-2)
-        tangents = (ends[..., 1:, :] + ends[..., :-1, :]) / 2
-        whole = steps.sum(-2, keepdim=True)
-        return displaced(line, tangents / whole)[..., self.key, :]
+        p = points.mT.contiguous()
+        return displaced(p @ self.places, p @ self.chords, self.collect)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Twisted key points (..., n, 3), mm, from the mean load (..., 1)."""

@@ -1,0 +1,236 @@
+"""Training: reproducible, resumable without loss, opened from its folder alone; and it learns."""
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.agents.distributed import Processes
+from surgisoft.agents.judge import better, judge
+from surgisoft.agents.learned import LearnedPolicy
+from surgisoft.agents.plan import Plan
+from surgisoft.agents.policies import Random
+from surgisoft.agents.presets import PRESETS, Preset, preset_for
+from surgisoft.agents.run_folder import BEST, LAST, RunFolder
+from surgisoft.agents.train import resume, train_new
+from surgisoft.agents.training import Training
+from surgisoft.errors import InputError
+from surgisoft.tasks.configs import config_of, with_fields
+from surgisoft.tasks.registry import make_task
+
+CPU = torch.device("cpu")
+TINY = Preset(envs=8, rollout=8, epochs=2, batches=2, evaluate_every=2, evaluation_episodes=2)
+
+
+def plan_of(task="track_circle", turns=4, preset=TINY, **changes):
+    steps = turns * preset.envs * preset.rollout
+    return Plan(task, config_of(task), "fast", preset, steps, **changes)
+
+
+def trained(folder, plan):
+    result = train_new(folder, plan, Processes(), CPU)
+    assert result.done
+    return RunFolder(folder)
+
+
+def weights(run, which=LAST):
+    saved = run.load(which)["agents"]
+    return {
+        (agent, network, name): value
+        for agent, networks in saved.items()
+        for network in ("actor_state_dict", "critic_state_dict")
+        for name, value in networks[network].items()
+    }
+
+
+def assert_equal(one, other):
+    assert one.keys() == other.keys()
+    for key, value in one.items():
+        assert torch.equal(value, other[key]), key
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("runs") / "one", plan_of())
+
+
+def test_same_seed_same_weights_other_seed_others(run, tmp_path):
+    assert_equal(weights(run), weights(trained(tmp_path / "again", plan_of())))
+    other = weights(trained(tmp_path / "other", plan_of(seed=1)))
+    assert not all(torch.equal(value, other[key]) for key, value in weights(run).items())
+
+
+def test_resumed_is_uninterrupted(run, tmp_path):
+    """Stopped in the middle, reopened, finished: weights, episodes and records are the same."""
+    half, count = tmp_path / "half", 0
+
+    def stop_after_two(progress):
+        nonlocal count
+        count += 1
+        if count == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = train_new(half, plan_of(), Processes(), CPU, stop_after_two)
+    assert not result.done
+    assert RunFolder(half).load(LAST)["iteration"] < 4
+    torch.manual_seed(99)
+    assert resume(half, Processes(), CPU).done
+    assert_equal(weights(run), weights(RunFolder(half)))
+    saved, again = (RunFolder(path).load(LAST) for path in (run.path, half))
+    for one, other in zip(saved["processes"], again["processes"], strict=True):
+        assert all(map(torch.equal, one["world"], other["world"]))
+        assert torch.equal(one["random"]["cpu"], other["random"]["cpu"])
+    assert saved["best"] == again["best"]
+    rows = [
+        [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        for path in (run.path, half)
+    ]
+    assert [row["iteration"] for row in rows[1]] == [1, 2, 3, 4]
+    for one, other in zip(*rows, strict=True):
+        assert one["reward/arm"] == other["reward/arm"]
+        assert one.get("evaluation/error_mm") == other.get("evaluation/error_mm")
+
+
+def test_a_kill_between_checkpoints_loses_nothing(run, tmp_path):
+    """As kill -9 leaves it: an old checkpoint, and records of turns that came after it."""
+    killed, first = tmp_path / "killed", {}
+
+    def keep_the_first(progress):
+        if progress.steps == 3 * TINY.envs * TINY.rollout:
+            shutil.copy2(killed / "checkpoints" / "last.pt", tmp_path / "old.pt")
+            first["rows"] = (killed / "metrics.jsonl").read_text()
+
+    train_new(killed, plan_of(), Processes(), CPU, keep_the_first)
+    shutil.copy2(tmp_path / "old.pt", killed / "checkpoints" / "last.pt")
+    (killed / "metrics.jsonl").write_text(first["rows"] + '{"iteration": 4, "st')
+    assert len(first["rows"].splitlines()) == 3
+    assert RunFolder(killed).load(LAST)["iteration"] == 2
+    assert resume(killed, Processes(), CPU).done
+    assert_equal(weights(run), weights(RunFolder(killed)))
+    rows = [json.loads(row) for row in (killed / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+
+
+def test_a_finished_run_stays_as_it_is(run):
+    before = weights(run)
+    assert resume(run.path, Processes(), CPU).done
+    assert_equal(before, weights(run))
+
+
+@pytest.fixture(scope="module")
+def ablation():
+    return make_task("circle_ablation")
+
+
+def test_both_agents_learn_at_once(ablation):
+    training = Training(plan_of("circle_ablation"), ablation, Processes())
+    before = {
+        agent: [value.clone() for value in ppo.actor.parameters()]
+        for agent, ppo in training.agents.items()
+    }
+    assert set(training.agents) == {"laser", "endoscope"}
+    widths = {agent: ppo.actor.obs_dim for agent, ppo in training.agents.items()}
+    for agent, ppo in training.agents.items():
+        assert widths[agent] == training.seen[agent].shape[1]
+        assert ppo.critic.obs_dim == sum(widths.values()), "the critic sees the joint state"
+    turn = training.turn()
+    assert set(turn.gathered.rewards) == {"laser", "endoscope"}
+    for agent, ppo in training.agents.items():
+        pairs = zip(before[agent], ppo.actor.parameters(), strict=True)
+        assert not all(torch.equal(one, other) for one, other in pairs), agent
+
+
+def test_a_run_opens_from_its_folder_alone(ablation, tmp_path):
+    """Moved elsewhere it finds its own scene and arm models, and does what it did."""
+    preset = replace(TINY, envs=2, rollout=4, evaluate_every=100, evaluation_episodes=1)
+    config = with_fields(config_of("circle_ablation"), view_points=5)
+    plan = replace(plan_of("circle_ablation", 1, preset), task_config=config)
+    made = trained(tmp_path / "a", plan)
+    moved = tmp_path / "elsewhere" / "b"
+    shutil.move(made.path, moved)
+    run = RunFolder(moved)
+    again = run.task()
+    assert str(again.config.scene).startswith(str(moved))
+    assert again.config.world.scenery.view_points == 5
+    assert again.surroundings.spec.lesion == ablation.surroundings.spec.lesion
+    for name, arm in ablation.world.arms.items():
+        own = again.world.arms[name].model.state_dict()
+        for key, value in arm.model.state_dict().items():
+            assert torch.equal(value, own[key])
+    found = judge(again, LearnedPolicy(moved, again), 1)
+    assert found == pytest.approx(run.load(BEST)["evaluation"], nan_ok=True)
+
+
+def test_the_best_checkpoint_is_the_best_by_evaluation(run):
+    rows = [json.loads(row) for row in (run.path / "metrics.jsonl").read_text().splitlines()]
+    found = {row["iteration"]: row["evaluation/error_mm"] for row in rows
+             if "evaluation/error_mm" in row}  # fmt: skip
+    assert list(found) == [2, 4]
+    best = run.load(BEST)
+    assert best["iteration"] == min(found, key=found.get)
+    task = run.task()
+    assert judge(task, LearnedPolicy(run.path, task, "best"), 2)["error_mm"] == min(found.values())
+    assert judge(task, LearnedPolicy(run.path, task, "last"), 2)["error_mm"] == found[4]
+
+
+def test_success_counts_before_error():
+    assert better({"success": 1.0, "error_mm": 0.5}, {"success": 0.9, "error_mm": 0.1})
+    assert not better({"success": 0.9, "error_mm": 0.1}, {"success": 1.0, "error_mm": 0.5})
+    assert better({"error_mm": 0.1}, {"error_mm": 0.2})
+    assert not better({"error_mm": float("nan")}, {"error_mm": 0.2})
+    assert better({"error_mm": 0.1}, None)
+
+
+def test_it_learns(tmp_path):
+    """A minute's share of real training: far better than random actions, and than none."""
+    preset = preset_for(
+        "fast", "track_circle", envs=64, last_noise=0.2, evaluate_every=1000, evaluation_episodes=8
+    )
+    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=60_000)
+    run = trained(tmp_path / "learns", plan)
+    learned = run.load(BEST)["evaluation"]["error_mm"]
+    random = judge(run.task(), Random(), 8)["error_mm"]
+    assert random > 10.0
+    assert learned < 0.1 * random
+
+
+def test_paper_preset_is_the_papers():
+    """Chen et al. (2025, sec. IV-A)."""
+    paper = PRESETS["paper"]
+    assert paper.envs * paper.rollout == 4096
+    assert (paper.gamma, paper.lam, paper.entropy, paper.clip) == (0.99, 0.95, 0.01, 0.2)
+    assert paper.hidden == (64, 64)
+
+
+def test_bad_folders_and_policies_are_told(run, ablation, tmp_path):
+    with pytest.raises(InputError, match="already there"):
+        train_new(run.path, plan_of(), Processes(), CPU)
+    with pytest.raises(InputError, match="no training run"):
+        RunFolder(tmp_path)
+    with pytest.raises(InputError, match="trained on track_circle"):
+        LearnedPolicy(run.path, ablation)
+    with pytest.raises(InputError, match="unknown checkpoint"):
+        LearnedPolicy(run.path, which="first")
+    copy = tmp_path / "copy"
+    shutil.copytree(run.path, copy)
+    (copy / "checkpoints" / "last.pt").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="damaged checkpoint"):
+        resume(copy, Processes(), CPU)
+
+
+def test_opening_a_checkpoint_runs_no_code(run, tmp_path):
+    copy, mark = tmp_path / "evil", tmp_path / "mark"
+    shutil.copytree(run.path, copy)
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(mark),)
+
+    torch.save({"iteration": 1, "agents": Evil()}, copy / "checkpoints" / "best.pt")
+    with pytest.raises(InputError, match="damaged"):
+        LearnedPolicy(copy)
+    assert not mark.exists()

@@ -9,6 +9,7 @@ no shielding by the plume, and the surface's shape stays as it was.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,8 @@ class AblationState:
     """(B, 3): the beam's direction at the last moment."""
     last_on: torch.Tensor
     """(B,) bool: whether the beam ended on the organ at the last moment."""
+    ring: torch.Tensor
+    """(B,) int64: which of the map's rings is to be cut."""
 
 
 _SUMS = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j", "delivered_j")
@@ -78,17 +81,22 @@ class RingReport:
 
 
 class AblationMap:
-    """The laser on one patch; built once, advanced every step."""
+    """The laser on one patch with one ring or several to choose from; built once, asked often."""
 
     def __init__(
         self,
-        patch: DosePatch,
+        patch: DosePatch | Sequence[DosePatch],
         waist_mm: float,
         tissue: Tissue | None = None,
         depth_mm: float = 0.0,
         device: str | torch.device = "cpu",
     ):
-        """waist_mm is the beam's 1/e^2 radius; the ring counts as cut where it is depth_mm deep."""
+        """waist_mm is the beam's 1/e^2 radius; the ring counts as cut where it is depth_mm deep.
+
+        Several patches are the rings of `cut_patches`, which share their samples.
+        """
+        self.patches = (patch,) if isinstance(patch, DosePatch) else tuple(patch)
+        patch = self.patches[0]
         if not 0.0 < waist_mm < math.inf:
             raise InputError(f"laser waist is {waist_mm} mm: expected more than 0")
         if not 0.0 <= depth_mm < math.inf:
@@ -106,11 +114,18 @@ class AblationMap:
             torch.tensor(array, device=self.device)
             for array in (patch.points_mm, patch.normals, patch.areas_mm2)
         ]
-        self._zone = torch.tensor(patch.zone, device=self.device, dtype=torch.int64)
-        self._station = torch.tensor(patch.station, device=self.device)
+        zone, station = ([getattr(one, k) for one in self.patches] for k in ("zone", "station"))
+        self._zone = torch.tensor(np.stack(zone), device=self.device, dtype=torch.int64)
+        self._station = torch.tensor(np.stack(station), device=self.device)
+        self._zones, self._stations = np.stack(zone), np.stack(station)
+        lengths = [one.ring_length_mm for one in self.patches]
+        self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
 
-    def start(self, point_mm, direction, on) -> AblationState:
-        """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool."""
+    def start(self, point_mm, direction, on, ring=None) -> AblationState:
+        """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool.
+
+        ring (B,) int64 says which ring is to be cut; None: the first.
+        """
         count, patch = len(point_mm), self.patch
         sizes = (
             (count, len(patch.areas_mm2)),
@@ -121,12 +136,13 @@ class AblationMap:
             (count,),
         )
         empty = [torch.zeros(size, device=self.device) for size in sizes]
-        return AblationState(*empty, *self._beam(point_mm, direction, on))
+        ring = torch.zeros(count, dtype=torch.int64, device=self.device) if ring is None else ring
+        return AblationState(*empty, *self._beam(point_mm, direction, on), ring)
 
     def reset(
-        self, state: AblationState, mask, point_mm, direction, on, in_place=False
+        self, state: AblationState, mask, point_mm, direction, on, in_place=False, ring=None
     ) -> AblationState:
-        """Fresh tissue where mask (B,) is set; the beam as for `start`.
+        """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
 
         With in_place the old state's tensors are given up.
         """
@@ -142,7 +158,8 @@ class AblationMap:
                 tensor[mask] = 0.0
         else:
             kept = [_pick(mask, 0.0, tensor) for tensor in kept]
-        return AblationState(*kept, *beam)
+        ring = torch.zeros_like(state.ring) if ring is None else ring
+        return AblationState(*kept, *beam, torch.where(mask, ring, state.ring))
 
     def advance(
         self, state: AblationState, point_mm, direction, on, power_w, dt_s: float, in_place=False
@@ -167,9 +184,9 @@ class AblationMap:
         if not in_place:
             tensors = tuple(t.clone() for t in tensors)
         deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
-        dose, peak, band, area, joule = deposit(began, ended, middle, energy, *tensors)
+        dose, peak, band, area, joule = deposit(began, ended, middle, energy, state.ring, *tensors)
         return AblationState(
-            dose, peak, band, area, joule, state.delivered_j + energy, point, aim, on
+            dose, peak, band, area, joule, state.delivered_j + energy, point, aim, on, state.ring
         )
 
     def _beam(self, point_mm, direction, on):
@@ -181,16 +198,17 @@ class AblationMap:
         held = finite[:, None]
         return torch.where(held, point, 0.0), torch.where(held, aim, 0.0), on & finite
 
-    def _deposit(self, began, ended, direction, energy, dose, peak, band, area, joule):
+    def _deposit(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
         patch, grid = self.patch, self.patch.buckets
         beams = [t.contiguous().numpy() for t in (began, ended, direction, energy)]
         kept = [t.numpy() for t in (dose, peak, band, area, joule)]
-        samples = (patch.points_mm, patch.normals, patch.areas_mm2, patch.zone, patch.station)
+        samples = (patch.points_mm, patch.normals, patch.areas_mm2, self._zones, self._stations)
         place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
-        _deposit(*beams, self.waist_mm, self.threshold, samples, place, *kept)
+        which = ring.contiguous().numpy()
+        _deposit(*beams, which, self.waist_mm, self.threshold, samples, place, *kept)
         return dose, peak, band, area, joule
 
-    def _deposit_torch(self, began, ended, direction, energy, dose, peak, band, area, joule):
+    def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
         """The same on an accelerator: every sample of every environment, a few at a time."""
         points, normals, areas = (t.float() for t in self._samples)
         size = max(1, 8_000_000 // len(points))
@@ -201,9 +219,8 @@ class AblationMap:
             gain = gain * (-(d @ normals.T)).clamp(min=0.0)
             after = dose[part] + gain
             burnt = (after >= self.threshold) & (dose[part] < self.threshold)
-            shape = (len(p), len(points))
-            zone, station = self._zone.expand(shape), self._station.expand(shape)
-            in_ring = self._zone == RING
+            zone, station = self._zone[ring[part]], self._station[ring[part]]
+            in_ring = zone == RING
             joule[part] = joule[part].scatter_add(1, zone, gain * areas)
             area[part] = area[part].scatter_add(1, zone, burnt * areas)
             band[part] = band[part].scatter_add(1, station, burnt * areas * in_ring)
@@ -214,7 +231,7 @@ class AblationMap:
     def report(self, state: AblationState) -> RingReport:
         """How far the ring of each environment is done."""
         cut = state.peak >= self.cut_dose
-        length = self.patch.ring_length_mm / self.patch.stations
+        length = self._ring_mm[state.ring] / self.patch.stations
         gap = longest_run(~cut)
         cut_length = cut.sum(1) * length
         burnt = (state.band_mm2 * cut).sum(1)
@@ -223,7 +240,7 @@ class AblationMap:
             completion=cut.float().mean(1),
             largest_gap_mm=gap * length,
             largest_gap_deg=gap * (360.0 / self.patch.stations),
-            width_mm=torch.where(cut_length > 0.0, burnt / cut_length.clamp(min=length), 0.0),
+            width_mm=torch.where(cut_length > 0.0, burnt / torch.maximum(cut_length, length), 0.0),
             healthy_mm2=state.zone_mm2[:, HEALTHY],
             healthy_j=state.zone_j[:, HEALTHY] + beyond,
             lesion_mm2=state.zone_mm2[:, LESION],
@@ -287,16 +304,30 @@ def _pick(mask, fresh, old):
 
 @compiled
 def _deposit(
-    began, ended, direction, energy, waist, threshold, samples, place, dose, peak, band, area, joule
+    began,
+    ended,
+    direction,
+    energy,
+    ring,
+    waist,
+    threshold,
+    samples,
+    place,
+    dose,
+    peak,
+    band,
+    area,
+    joule,
 ):
     """Add each environment's sweep to the samples near its path; see `sweep_fluence`."""
-    points, normals, areas, zone, station = samples
+    points, normals, areas, zones, stations = samples
     origin, cell, shape, starts = place
     scale = math.sqrt(2.0) / waist
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
     for n in range(len(energy)):
         if not energy[n] > 0.0:
             continue
+        zone, station = zones[ring[n]], stations[ring[n]]
         d0, d1, d2 = direction[n, 0], direction[n, 1], direction[n, 2]
         reach = REACH_WAISTS * waist
         for i in range(3):

@@ -8,6 +8,7 @@ triangles; each keeps the dose at its centroid. With edges up to `SPACING_WAISTS
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,47 +89,81 @@ def cut_patch(
     parted into stations of about station_mm; the patch reaches margin_mm beyond the path, and all
     over the inside. Where the surface crosses itself, what lies inside the solid is left out.
     """
-    ring, normals = np.asarray(ring_mm, float), np.asarray(ring_normals, float)
-    centre = np.asarray(centre_mm, float)
-    if ring.ndim != 2 or len(ring) < 3 or ring.shape != normals.shape:
-        raise InputError(f"ring has shape {ring.shape}: expected (M, 3) points, M >= 3, normals")
+    ring = (ring_mm, ring_normals, centre_mm)
+    return cut_patches(mesh, (ring,), spacing_mm, band_mm, margin_mm, station_mm)[0]
+
+
+def cut_patches(
+    mesh: Mesh,
+    rings: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    spacing_mm: float,
+    band_mm: float = 2.0,
+    margin_mm: float = 4.0,
+    station_mm: float = 0.5,
+) -> tuple[DosePatch, ...]:
+    """One patch for each ring (points, normals, centre), on samples that they all share.
+
+    As `cut_patch`; the rings lie near one another and have as many stations as the longest one.
+    """
+    rings = [tuple(np.asarray(part, float) for part in ring) for ring in rings]
+    for ring, normals, _ in rings:
+        if ring.ndim != 2 or len(ring) < 3 or ring.shape != normals.shape:
+            raise InputError(
+                f"ring has shape {ring.shape}: expected (M, 3) points, M >= 3, normals"
+            )
     if not (spacing_mm > 0.0 and 0.0 < band_mm <= 2.0 * margin_mm):
         raise InputError(
             f"dose patch: spacing {spacing_mm} mm, band {band_mm} mm, margin {margin_mm} mm; "
             "expected all above 0 and the band within the margin"
         )
-    reach = np.linalg.norm(ring - centre, axis=1).max() + margin_mm
-    near = _faces_near(mesh, ring, reach, centre)
+    centre, paths = rings[0][2], np.concatenate([ring for ring, _, _ in rings])
+    reach = np.linalg.norm(paths - centre, axis=1).max() + margin_mm
+    near = _faces_near(mesh, paths, reach, centre)
     points, faces, areas = _exposed(mesh, near, spacing_mm, reach, centre)
-    steps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
-    along, offset = _ring_coordinates(points, ring, normals, centre, steps)
-    below = normals[np.searchsorted(np.cumsum(steps), along).clip(max=len(ring) - 1)]
-    facing = frames.dot(mesh.face_normals[faces], below) > LEAST_FACING
-    kept = (offset <= margin_mm) & facing
+    zoned = [_zoned(mesh, points, faces, ring, band_mm, margin_mm) for ring in rings]
+    kept = np.any([one.near for one in zoned], axis=0)
     if not kept.any():
         raise InputError("dose patch: the ring lies nowhere near the organ's surface")
     order, buckets = _fill_buckets(points[kept], max(2.0 * spacing_mm, 0.5))
     chosen = np.flatnonzero(kept)[order]
-    points, faces, areas, along, offset = (x[chosen] for x in (points, faces, areas, along, offset))
-    length = float(steps.sum())
-    stations = max(12, round(length / station_mm))
-    zone = np.where(np.abs(offset) <= 0.5 * band_mm, RING, np.where(offset < 0, LESION, HEALTHY))
-    station = np.minimum((along / length * stations).astype(np.int64), stations - 1)
-    if len(np.unique(station[zone == RING])) < stations:
-        raise InputError("dose patch: stretches of the ring have no surface below them; move it")
-    return DosePatch(
-        points_mm=points,
-        normals=np.array(mesh.face_normals[faces]),
-        areas_mm2=areas,
-        faces=faces,
-        offset_mm=offset,
-        station=station,
-        zone=zone.astype(np.int8),
-        stations=stations,
-        ring_length_mm=length,
-        spacing_mm=float(spacing_mm),
-        buckets=buckets,
-    )
+    points, faces, areas = (x[chosen] for x in (points, faces, areas))
+    normals = np.array(mesh.face_normals[faces])
+    stations = max(12, round(max(one.length for one in zoned) / station_mm))
+    patches = []
+    for one in zoned:
+        zone, along = one.zone[chosen], one.along[chosen]
+        station = np.minimum((along / one.length * stations).astype(np.int64), stations - 1)
+        if len(np.unique(station[zone == RING])) < stations:
+            raise InputError(
+                "dose patch: stretches of the ring have no surface below them; move it"
+            )
+        shared = (points, normals, areas, faces)
+        own = (one.offset[chosen], station, zone, stations, one.length)
+        patches.append(DosePatch(*shared, *own, float(spacing_mm), buckets))
+    return tuple(patches)
+
+
+@dataclass(frozen=True, eq=False)
+class _Zoned:
+    """Samples as one ring sees them."""
+
+    along: np.ndarray
+    offset: np.ndarray
+    zone: np.ndarray
+    near: np.ndarray
+    length: float
+
+
+def _zoned(mesh, points, faces, ring, band, margin) -> _Zoned:
+    """Where samples (P, 3) lie by a ring; those turned away from it are healthy tissue."""
+    path, normals, centre = ring
+    steps = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1)
+    along, offset = _ring_coordinates(points, path, normals, centre, steps)
+    below = normals[np.searchsorted(np.cumsum(steps), along).clip(max=len(path) - 1)]
+    facing = frames.dot(mesh.face_normals[faces], below) > LEAST_FACING
+    zone = np.where(np.abs(offset) <= 0.5 * band, RING, np.where(offset < 0, LESION, HEALTHY))
+    zone = np.where(facing, zone, HEALTHY).astype(np.int8)
+    return _Zoned(along, offset, zone, (offset <= margin) & facing, float(steps.sum()))
 
 
 def _faces_near(mesh: Mesh, ring: np.ndarray, reach: float, centre: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """A scene folder opened: the file's values, the meshes in their places, the ring on the organ."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene.lesion import Ring, lesion_ring
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.meshio import read_mesh
-from surgisoft.scene.spec import FILE, SceneSpec, load_spec, spec_path
+from surgisoft.scene.spec import FILE, LesionSpec, SceneSpec, load_spec, spec_path
 from surgisoft.toml_config import read_toml, to_table
 
 
@@ -43,6 +43,10 @@ class Scene:
             return lesion_ring(self.organ.world_mesh, self.spec.lesion, **count)
         except InputError as error:
             raise InputError(f"{self.folder / FILE}: {error}") from None
+
+    def with_lesion(self, lesion: LesionSpec) -> "Scene":
+        """The same scene with another lesion on the same organ."""
+        return replace(self, spec=replace(self.spec, lesion=lesion))
 
     @cached_property
     def content_hash(self) -> str:

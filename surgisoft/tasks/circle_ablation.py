@@ -5,23 +5,22 @@ The ring is cut while the endoscope sees enough of it; success is judged on the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-import surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.aim import Aim, body_part
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.streams import Stream
+from surgisoft.tasks.cut import along, fresh_cut, further
 from surgisoft.tasks.world import WorldConfig, scene_world
+from surgisoft.tasks.world_scene import PHANTOM
 
-PHANTOM = Path(surgisoft.__file__).parents[1] / "scenes" / "phantom_liver"
-"""The scene that comes with the project."""
+FAR_MM = 10.0
+"""Scale of the reward terms that reach far, mm."""
 
 
 @dataclass(frozen=True)
@@ -49,20 +48,6 @@ class CircleAblationConfig:
                 raise InputError(f"circle_ablation: {name} is {getattr(self, name)}, expected > 0")
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """How far a batch of cuts is."""
-
-    start: Tensor
-    """(B,) 0..1: share of the ring where the cut begins."""
-    way: Tensor
-    """(B,) +1 or -1: which way round."""
-    walked: Tensor
-    """(B,) int64: steps that the target has moved on."""
-    fired: Tensor
-    """(B,) bool: the beam is on."""
-
-
 class CircleAblation:
     """Agents `laser` and `endoscope` of a scene."""
 
@@ -77,83 +62,73 @@ class CircleAblation:
         self.round = round(self.config.cut_s / dt_s)
         self.aims = {name: Aim(arm, dt_s) for name, arm in self.world.arms.items()}
 
-    def goal(self, stream: Stream) -> tuple[Stream, Cut]:
-        stream, draw = stream.uniform(0.0, 1.0, 2)
-        walked = torch.zeros_like(stream.count)
-        way = torch.where(draw[:, 1] < 0.5, 1.0, -1.0)
-        return stream, Cut(draw[:, 0], way, walked, walked > 0)
+        self.goal = fresh_cut
 
-    def target_mm(self, cut: Cut, ahead: int = 0) -> Tensor:
+    def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
         """(B, 3) mm: where the beam should meet the ring, `ahead` steps further on."""
-        path = self.surroundings.path_mm
-        place = (cut.start + cut.way * (cut.walked + ahead) / self.round) * len(path)
-        below = place.floor()
-        first = below.long().remainder(len(path))
-        return torch.lerp(path[first], path[(first + 1) % len(path)], (place - below)[:, None])
+        share = state.goal.share(self.round, ahead)
+        return along(self.surroundings.paths_mm, state.world.scenery.lesion, share)
+
+    def centre_mm(self, state: TaskState) -> Tensor:
+        """(B, 3) mm: the middle of the lesion."""
+        return self.surroundings.centres_mm[state.world.scenery.lesion]
 
     def beam_error_mm(self, state: TaskState) -> Tensor:
         """(B,) mm: how far the beam's axis passes from its target."""
         laser = state.world.arms["laser"]
-        return self.aims["laser"].miss(laser.points_mm, self.target_mm(state.goal)).norm(dim=1)
+        return self.aims["laser"].miss(laser.points_mm, self.target_mm(state)).norm(dim=1)
 
     def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
         """The beam fires, and its target goes on, while three things hold.
 
-        The endoscope sees enough of the ring, the axis passes the target closely, and nothing but
-        the organ stands in the beam.
+        The endoscope sees the ring, the axis passes the target, only the organ is in the beam.
         """
-        scenery, cut = state.world.scenery, state.goal
+        scenery = state.world.scenery
         seen = scenery.view.fraction >= self.spec.limits.view_fraction
         near = self.beam_error_mm(state) <= self.config.fire_mm
         fired = seen & near & scenery.hit.on_organ
-        cut = replace(cut, walked=cut.walked + fired, fired=fired)
-        power = fired * self.spec.laser.power_w
-        return TaskState(self.world.step(state.world, actions, power, in_place), cut)
+        world = self.world.step(state.world, actions, fired * self.spec.laser.power_w, in_place)
+        return TaskState(world, further(state.goal, fired))
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Each arm's body and the other's tip; misses of the beam and of the camera's axis."""
         arms, scenery, cut = state.world.arms, state.world.scenery, state.goal
-        laser, eye, count = arms["laser"], arms["endoscope"], len(cut.walked)
-        ahead = [self.target_mm(cut, k) for k in range(self.config.preview + 1)]
-        misses = [self.aims["laser"].miss(laser.seen_mm, target).asinh() for target in ahead]
-        centre = self.surroundings.centre_mm.expand(count, 3)
-        look = self.aims["endoscope"].miss(eye.seen_mm, centre).asinh()
+        laser, eye, aim = arms["laser"], arms["endoscope"], self.aims["laser"]
+        ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
+        misses = [aim.miss(laser.seen_mm, target).asinh() for target in ahead]
+        look = self.aims["endoscope"].miss(eye.seen_mm, self.centre_mm(state)).asinh()
         apart = (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0
         time = state.world.steps[:, None] / self.steps
-        turn = 2.0 * math.pi * (cut.start + cut.way * cut.walked / self.round)[:, None]
         shared = [scenery.view.fraction[:, None], cut.fired[:, None].float(), time, apart]
-        place = [turn.sin(), turn.cos(), cut.way[:, None]]
-        return {
-            "laser": torch.cat(
-                (*body_part(self.world.arms["laser"], laser), *misses, *place, *shared), 1
-            ),
-            "endoscope": torch.cat(
-                (*body_part(self.world.arms["endoscope"], eye), look, *shared), 1
-            ),
-        }
+        bodies = {name: body_part(self.world.arms[name], part) for name, part in arms.items()}
+        own = {"laser": (*misses, *cut.seen(self.round)), "endoscope": (look,)}
+        return {name: torch.cat((*bodies[name], *own[name], *shared), 1) for name in self.agents}
 
     def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
-        """Aim and look: exp(-e); cut: the beam is on; contact: too close to anything."""
-        error, view, cut = self.beam_error_mm(state), state.world.scenery.view, state.goal
+        """Aim and look; cut: the beam is on; contact: too close to anything.
+
+        exp(-e / scale) is flat tens of mm off, where an episode begins; 1 / (1 + e / FAR_MM) not.
+        """
+        error, view = self.beam_error_mm(state), state.world.scenery.view
+        cut = state.goal.fired.float()
         close = -(state.world.scenery.clearance.least_mm < self.spec.limits.clearance_mm).float()
-        laser = {
+        aim = {
+            "far": 1.0 / (1.0 + error / FAR_MM),
             "aim": (-error).exp(),
             "fine": (-error / self.config.fine_mm).exp(),
-            "cut": cut.fired.float(),
-            "contact": close,
         }
-        look = {"look": (-view.axis_error_mm / 10.0).exp(), "view": view.fraction}
-        return {"laser": laser, "endoscope": {**look, "cut": cut.fired.float(), "contact": close}}
+        look = {"look": 1.0 / (1.0 + view.axis_error_mm / FAR_MM), "view": view.fraction}
+        both = {"cut": cut, "contact": close}
+        return {"laser": {**aim, **both}, "endoscope": {**look, **both}}
 
     def ended(self, state: TaskState) -> Tensor:
         """The ring is cut, or something is hit."""
-        ring = self.surroundings.ablation.report(state.world.scenery.dose)
-        return state.world.scenery.clearance.collides | (ring.completion >= 1.0)
+        done = self.surroundings.ablation.report(state.world.scenery.dose).completion >= 1.0
+        return done | state.world.scenery.clearance.collides
 
     def measures(self, state: TaskState) -> dict[str, Tensor]:
         scenery = state.world.scenery
-        ring = self.surroundings.ablation.report(scenery.dose)
-        hit = scenery.clearance.collides
+        ring, hit = self.surroundings.ablation.report(scenery.dose), scenery.clearance.collides
         return {
             "beam_error_mm": self.beam_error_mm(state).where(state.goal.fired, float("nan")),
             "completion": ring.completion,
@@ -167,14 +142,9 @@ class CircleAblation:
 
     def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
         """The place on the ring, and where the beam ends."""
-        return self.target_mm(state.goal)[:, None], state.world.scenery.hit.point_mm[:, None]
+        return self.target_mm(state)[:, None], state.world.scenery.hit.point_mm[:, None]
 
     def script(self, state: TaskState) -> dict[str, Tensor]:
         """The laser aims at its next target, the endoscope at the lesion's middle."""
-        arms, count = state.world.arms, len(state.goal.walked)
-        centre = self.surroundings.centre_mm.expand(count, 3)
-        on_ring = self.target_mm(state.goal, 1)
-        return {
-            "laser": self.aims["laser"].action(arms["laser"], on_ring),
-            "endoscope": self.aims["endoscope"].action(arms["endoscope"], centre),
-        }
+        aims = {"laser": self.target_mm(state, 1), "endoscope": self.centre_mm(state)}
+        return {n: self.aims[n].action(state.world.arms[n], aim) for n, aim in aims.items()}

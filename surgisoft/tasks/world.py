@@ -88,7 +88,9 @@ class World:
         parts = {}
         for name, arm in self.arms.items():
             stream, parts[name] = arm.start(stream)
-        scenery = self.surroundings.start(parts) if self.surroundings else Scenery()
+        scenery = Scenery()
+        if self.surroundings:
+            stream, scenery = self.surroundings.start(stream, parts)
         return WorldState(
             stream, torch.zeros_like(stream.count), parts, scenery, _not_finite(parts)
         )
@@ -172,7 +174,9 @@ def scene_world(
         pose = torch.tensor(mount.pose(), dtype=torch.float32)
         name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
         arms[mount.tool] = Mounted(named_arm(name, device, folder), pose, shaft_mm=mount.shaft_mm)
-    return World(arms, config, Surroundings(scene, config.scenery, device, engine), device)
+    vary = config.randomisation
+    around = Surroundings(scene, config.scenery, device, engine, vary)
+    return World(arms, config, around, device)
 
 
 def named_arm(name: str | Path, device="cpu", folder: str | Path = ".") -> ArmModel:

@@ -36,8 +36,16 @@ class Randomisation:
     """Standard deviation of a measured pressure, kPa."""
     delay: int = 0
     """Most steps that an action is late; each episode has a whole number of its own."""
+    lesion_mm: float = 0.0
+    """Greatest distance of an episode's lesion from the scene's own, along the surface, mm."""
+    lesion_size: float = 0.0
+    """Half width of the even spread of a lesion's diameter, as a share of it; below 1."""
+    lesions: int = 16
+    """Number of lesions that are laid out for that, once; each episode draws one of them."""
 
     def __post_init__(self):
+        if self.lesions < 1:
+            raise InputError(f"randomisation: lesions is {self.lesions}, expected at least 1")
         for name, value in vars(self).items():
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"randomisation: {name} is {value}, expected 0 or more")

@@ -4,28 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+import surgisoft
 from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap, AblationState
 from surgisoft.scene.batched import BatchClearance, BatchedScene
 from surgisoft.scene.camera import View, view
-from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patch
+from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
+from surgisoft.scene.lesions import lesions_like
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.tissue import Tissue
-from surgisoft.tasks.world_arm import ArmPart
+from surgisoft.tasks.streams import Stream
+from surgisoft.tasks.world_arm import ArmPart, Randomisation
 
+_PACKAGE = Path(surgisoft.__file__).parent
+_HOME = _PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent
+PHANTOM = _HOME / "scenes" / "phantom_liver"
+"""The scene that comes with the project: in the installed package, or beside it in a checkout."""
 LASER, ENDOSCOPE = "laser", "endoscope"
 """Names of the arm that carries the beam and of the one that carries the camera."""
 BEAM_BEYOND_MM = 50.0
 """The beam is followed so far beyond the greatest distance at which the laser works (mm)."""
-
-
 PATH_POINTS = 360
 """Points of the ring's path as the laser follows it."""
+EVER_THE_SAME = Randomisation()
+"""One lesion: the scene's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +49,8 @@ class Scenery:
     """What the beam has done."""
     view: View | None = None
     """What the endoscope sees of the ring, (B,)."""
+    lesion: Tensor | None = None
+    """(B,) int64: which of the surroundings' lesions the organ bears in this episode."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +68,8 @@ class SceneryConfig:
 class Surroundings:
     """A scene with its engines; built once, asked every step, holds no state.
 
-    `spec` is the scene's file; `path_mm` (360, 3) the ring's closed path and `centre_mm` (3,) its
-    middle, world frame, mm.
+    `spec` is the scene's file; of its K lesions `paths_mm` (K, 360, 3) are the rings' closed paths
+    and `centres_mm` (K, 3) their middles, world frame, mm. `path_mm` and `centre_mm` are the first.
     """
 
     def __init__(
@@ -67,6 +78,7 @@ class Surroundings:
         config: SceneryConfig | None = None,
         device: str | torch.device = "cpu",
         engine: str | None = None,
+        vary: Randomisation = EVER_THE_SAME,
     ):
         """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere."""
         config, spec, self.device = config or SceneryConfig(), scene.spec, torch.device(device)
@@ -75,29 +87,34 @@ class Surroundings:
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
-        ring, waist = scene.ring, 0.5 * spec.laser.spot_mm
-        patch = cut_patch(
-            scene.organ.world_mesh,
-            ring.points_mm,
-            ring.normals,
-            ring.centre_mm,
-            SPACING_WAISTS * waist,
-            config.band_mm,
-        )
+        mesh, waist = scene.organ.world_mesh, 0.5 * spec.laser.spot_mm
+        place = (vary.lesions, vary.lesion_mm, vary.lesion_size)
+        scenes = [scene.with_lesion(one) for one in lesions_like(mesh, spec.lesion, *place)]
+        rings = [(one.ring.points_mm, one.ring.normals, one.ring.centre_mm) for one in scenes]
+        patches = cut_patches(mesh, rings, SPACING_WAISTS * waist, config.band_mm)
         tissue = Tissue(spec.laser.absorption_per_mm)
-        self.ablation = AblationMap(patch, waist, tissue, config.depth_mm, device)
-        look, row = scene.ring_of(count=config.view_points), {"dtype": torch.float32}
-        row["device"] = self.device
-        self.spec = spec
-        self.path_mm = torch.tensor(scene.ring_of(count=PATH_POINTS).points_mm, **row)
-        self.centre_mm = torch.tensor(ring.centre_mm, **row)
-        self.ring_mm = torch.tensor(look.points_mm, **row)
-        self.ring_normals = torch.tensor(look.normals, **row)
+        self.ablation = AblationMap(patches, waist, tissue, config.depth_mm, device)
+        looks = [one.ring_of(count=config.view_points) for one in scenes]
+        paths = [one.ring_of(count=PATH_POINTS).points_mm for one in scenes]
 
-    def start(self, parts: Mapping[str, ArmPart]) -> Scenery:
-        """Untouched tissue around arms at the start of an episode."""
-        scenery = self._look(parts)
-        return replace(scenery, dose=self.ablation.start(*self._beam(scenery, parts)))
+        def held(arrays) -> Tensor:
+            return torch.tensor(np.stack(arrays), dtype=torch.float32, device=self.device)
+
+        self.spec, self.lesions = spec, len(scenes)
+        self.paths_mm, self.centres_mm = held(paths), held([centre for _, _, centre in rings])
+        self.path_mm, self.centre_mm = self.paths_mm[0], self.centres_mm[0]
+        self.rings_mm = held([look.points_mm for look in looks])
+        self.ring_normals = held([look.normals for look in looks])
+
+    def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, Scenery]:
+        """Untouched tissue, on a lesion that the stream draws, around arms at the start."""
+        lesion = torch.zeros_like(stream.count)
+        if self.lesions > 1:
+            stream, draw = stream.uniform(0.0, float(self.lesions))
+            lesion = draw.long().clamp(max=self.lesions - 1)
+        scenery = self._look(parts, lesion)
+        dose = self.ablation.start(*self._beam(scenery, parts), lesion)
+        return stream, replace(scenery, dose=dose)
 
     def step(
         self,
@@ -108,7 +125,7 @@ class Surroundings:
         in_place: bool,
     ) -> Scenery:
         """The surroundings of the moved arms, the beam having swept with `power_w` (B,) W."""
-        after = self._look(parts)
+        after = self._look(parts, scenery.lesion)
         beam = self._beam(after, parts)
         in_place = in_place and _may_change(scenery.dose.dose)
         dose = self.ablation.advance(scenery.dose, *beam, power_w, dt_s, in_place)
@@ -123,19 +140,18 @@ class Surroundings:
         in_place: bool,
     ) -> AblationState:
         """Untouched tissue where mask (B,) is set, under the beam as `scenery` has it."""
-        beam = self._beam(scenery, parts)
-        return self.ablation.reset(dose, mask, *beam, in_place and _may_change(dose.dose))
+        beam, in_place = self._beam(scenery, parts), in_place and _may_change(dose.dose)
+        return self.ablation.reset(dose, mask, *beam, in_place, scenery.lesion)
 
-    def _look(self, parts: Mapping[str, ArmPart]) -> Scenery:
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> Scenery:
         lines = {name: part.line_mm for name, part in parts.items()}
         beam, eye = parts[LASER], parts[ENDOSCOPE]
         clearance = self.geometry.clearance(lines)
         hit = self.geometry.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
         pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
-        seen = view(
-            self.geometry, self.camera, pose, self.ring_mm, self.ring_normals, lines, own=ENDOSCOPE
-        )
-        return Scenery(clearance, hit, None, seen)
+        ring = (self.rings_mm[lesion], self.ring_normals[lesion])
+        seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)
+        return Scenery(clearance, hit, None, seen, lesion)
 
     def _beam(self, scenery: Scenery, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
         on = scenery.hit.on_organ & (scenery.hit.body == self.organ)

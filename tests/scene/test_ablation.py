@@ -215,10 +215,9 @@ def test_compiled_and_torch_deposits_agree(slab):
     energy = torch.tensor(rng.uniform(0.1, 1.0, count)).float()
     state = ablation.start(began, aim, torch.ones(count, dtype=torch.bool))
     names = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j")
-    one = ablation._deposit(began, ended, aim, energy, *(getattr(state, n).clone() for n in names))
-    two = ablation._deposit_torch(
-        began, ended, aim, energy, *(getattr(state, n).clone() for n in names)
-    )
+    beam = (began, ended, aim, energy, state.ring)
+    one = ablation._deposit(*beam, *(getattr(state, n).clone() for n in names))
+    two = ablation._deposit_torch(*beam, *(getattr(state, n).clone() for n in names))
     peak = one[0].max().item()
     torch.testing.assert_close(one[0], two[0], atol=1e-4 * peak, rtol=1e-3)
     torch.testing.assert_close(one[1], two[1], atol=1e-4 * peak, rtol=1e-3)

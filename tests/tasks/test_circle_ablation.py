@@ -7,11 +7,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.tree import rows
+from surgisoft.tasks.world import WorldConfig
+from surgisoft.tasks.world_arm import Randomisation
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +98,8 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
 
 def test_the_target_runs_along_the_scenes_ring(quick):
     """Against a closed polygon walked in numpy, both ways round and over the seam."""
-    goal = rows(Episodes(quick).seeded(3, 1).goal, torch.tensor([0]))
+    state = Episodes(quick).seeded(3, 1)
+    goal = state.goal
     path = quick.surroundings.path_mm.double().numpy()
     closed = np.vstack((path, path[:1]))
     for way in (1.0, -1.0):
@@ -103,7 +107,8 @@ def test_the_target_runs_along_the_scenes_ring(quick):
             cut = replace(goal, walked=torch.tensor([walked]), way=torch.tensor([way]))
             share = (goal.start.item() + way * walked / 150) % 1.0
             expected = [np.interp(share * 360, np.arange(361), axis) for axis in closed.T]
-            np.testing.assert_allclose(quick.target_mm(cut)[0], expected, atol=2e-3)
+            now = replace(state, goal=cut)
+            np.testing.assert_allclose(quick.target_mm(now)[0], expected, atol=2e-3)
 
 
 def test_the_miss_is_the_distance_from_the_axis(quick):
@@ -136,3 +141,73 @@ def test_bad_config_is_one_line():
         CircleAblationConfig(cut_s=math.nan)
     with pytest.raises(InputError, match="there is no such scene"):
         CircleAblation(CircleAblationConfig(scene="no/such/scene"))
+
+
+@pytest.fixture(scope="module")
+def varied():
+    """Three lesions up to 4 mm aside and 10 % larger or smaller."""
+    vary = Randomisation(lesion_mm=4.0, lesion_size=0.1, lesions=3)
+    return CircleAblation(CircleAblationConfig(cut_s=15.0, world=WorldConfig(randomisation=vary)))
+
+
+def test_lesions_differ_in_place_and_size_and_lie_on_the_organ(varied):
+    around = varied.surroundings
+    own = np.array(varied.spec.lesion.centre_mm)
+    centres, paths = around.centres_mm.numpy(), around.paths_mm.numpy()
+    away = np.linalg.norm(centres - own, axis=1)
+    assert (away < 4.0 + 0.5).all()
+    assert np.ptp(away) > 0.3
+    width = [np.linalg.norm(path[:180] - path[180:], axis=1).mean() for path in paths]
+    assert all(17.9 < w < 22.5 for w in width)
+    assert np.ptp(width) > 0.3
+    organ = around.geometry.bodies[around.organ].world_mesh
+    for path in paths:
+        _, distance, _ = trimesh.proximity.closest_point(
+            trimesh.Trimesh(organ.vertices_mm, organ.faces, process=False), path[::30]
+        )
+        assert distance.max() < 1e-3
+    drawn = Episodes(varied).seeded(0, 300).world.scenery.lesion
+    assert torch.bincount(drawn, minlength=3).min() > 70
+
+
+def test_each_episodes_own_ring_is_cut_and_judged(varied):
+    """Scripted to the end; each environment's burnt samples lie on its own path and no other."""
+    episodes, steps = Episodes(varied), 260
+    state = episodes.seeded(1, 3)
+    lesion = state.world.scenery.lesion
+    assert len(lesion.unique()) >= 2
+    over, measures = torch.zeros(3, dtype=torch.bool), None
+    with torch.inference_mode():
+        for _ in range(steps):
+            state, outcome = episodes.step(state, varied.script(state), in_place=True)
+            over |= outcome.done
+            if over.all():
+                break
+    measures = outcome.measures
+    assert measures["success"].tolist() == [1.0] * 3
+    assert torch.equal(state.world.scenery.lesion, lesion)
+    ablation, paths = varied.surroundings.ablation, varied.surroundings.paths_mm.numpy()
+    points = ablation.patch.points_mm
+    for i in range(3):
+        burnt = points[state.world.scenery.dose.dose[i].numpy() >= ablation.cut_dose]
+        apart = [np.linalg.norm(burnt[:, None] - path[None], axis=2).min(1).max() for path in paths]
+        assert int(np.argmin(apart)) == lesion[i]
+        assert apart[lesion[i]] < 1.0
+
+
+def test_a_reset_draws_another_lesion_and_fresh_tissue(varied):
+    episodes = Episodes(varied)
+    state = episodes.seeded(5, 40)
+    before = state.world.scenery.lesion
+    mask = torch.arange(40) % 2 == 0
+    state = episodes.reset(state, mask)
+    after = state.world.scenery.lesion
+    assert torch.equal(after[~mask], before[~mask])
+    assert not torch.equal(after[mask], before[mask])
+    assert torch.equal(state.world.scenery.dose.ring, after)
+
+
+def test_impossible_lesions_are_one_line():
+    vary = Randomisation(lesion_mm=400.0, lesions=3)
+    with pytest.raises(InputError, match="up to 400 mm; expected at most"):
+        CircleAblation(CircleAblationConfig(world=WorldConfig(randomisation=vary)))

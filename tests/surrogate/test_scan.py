@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgisoft.surrogate.direction import advance, trace
-from surgisoft.surrogate.scan import clamp_scan, last_nonzero, play_scan
+from surgisoft.surrogate.scan import clamp_scan, last_nonzero, linear_scan, play_scan
 
 
 def walk(steps: int, seed: int, chambers: int = 2, runs: int = 2) -> torch.Tensor:
@@ -68,3 +68,28 @@ def test_direction_steps_as_it_traces(steps, seed):
         anchor, direction = advance(anchor, direction, pressure[:, t], band)
         assert torch.equal(anchor, anchors[:, t])
         assert torch.equal(direction, directions[:, t])
+
+
+@given(st.integers(1, 70), st.integers(0, 10_000), st.sampled_from([torch.float64, torch.cdouble]))
+def test_linear_scan_is_the_loop(steps, seed, dtype):
+    """With factors of their own a step, shared by the channels, zeros and ones among them."""
+    generator = torch.Generator().manual_seed(seed)
+    factor = torch.rand(2, steps, 1, generator=generator).mul(1.4).sub(0.2).clamp(0, 1).to(dtype)
+    if dtype == torch.cdouble:
+        factor = factor * torch.exp(1j * torch.rand(2, steps, 1, generator=generator))
+    addend, start = walk(steps, seed, 3).to(dtype), walk(1, seed + 1, 3)[:, 0].to(dtype)
+    y, expected = start, []
+    for t in range(steps):
+        y = factor[:, t] * y + addend[:, t]
+        expected.append(y)
+    assert torch.allclose(linear_scan(factor, addend, start), torch.stack(expected, 1), atol=1e-12)
+
+
+def test_linear_scan_has_the_loops_gradient():
+    generator = torch.Generator().manual_seed(0)
+    inputs = (
+        torch.rand(2, 11, 1, dtype=torch.float64, generator=generator).requires_grad_(),
+        torch.randn(2, 11, 3, dtype=torch.float64, generator=generator).requires_grad_(),
+        torch.randn(2, 3, dtype=torch.float64, generator=generator).requires_grad_(),
+    )
+    assert torch.autograd.gradcheck(linear_scan, inputs)

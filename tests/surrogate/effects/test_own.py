@@ -1,0 +1,119 @@
+"""Effects of the users' own: the documentation's example, by file and by package."""
+
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.effects import (
+    known_effects,
+    make_effect,
+    named_effect,
+    own,
+    register_effect_file,
+)
+from surgisoft.surrogate.model import ArmModel
+from tests.surrogate.effects.arms import FACTS
+
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
+EXAMPLE = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.S)[1]
+
+
+@pytest.fixture(autouse=True)
+def _no_files_but_the_tests_own(monkeypatch):
+    monkeypatch.setattr(own, "FILES", {})
+
+
+@pytest.fixture
+def slack(tmp_path) -> Path:
+    path = tmp_path / "slack.py"
+    path.write_text(EXAMPLE)
+    return path
+
+
+def arm() -> ArmModel:
+    """A small arm with the documentation's effect."""
+    spec = ArmSpec(3, 2, (-10.0,) * 3, (50.0,) * 3)
+    effect = make_effect("slack", FACTS)
+    effect.loss.data.fill_(0.3)
+    network = ConstantCurvature(torch.tensor(spec.low), torch.tensor(spec.high), 2)
+    network.set_rest(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 70.0]]))
+    return ArmModel(spec, network, {"slack": effect}, torch.eye(3)[:2], {"rmse_mm": 0.1})
+
+
+def test_the_documentations_effect_works(slack):
+    assert register_effect_file(slack) == "slack" == named_effect(str(slack))
+    assert "slack" in known_effects()
+    effect = make_effect("slack", FACTS)
+    x = torch.tensor([[-10.0, 0.0, 20.0]])
+    memory = effect.rest(x)
+    assert torch.equal(effect.apply(x, memory), x)
+    assert torch.equal(effect.columns(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
+    effect.loss.data.fill_(0.5)
+    assert effect.apply(x, memory).tolist() == [[-5.0, 0.0, 20.0]]
+    assert effect.plausible()
+
+
+def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
+    register_effect_file(slack)
+    saved, folder = arm(), tmp_path / "model"
+    save_model(saved, folder)
+    own.FILES.clear()
+    with pytest.raises(
+        InputError, match=r"slack\.py, which opening a model does not run.*--effect"
+    ):
+        load_model(folder)
+    assert not own.FILES
+    slack.write_text(EXAMPLE + "\n# changed\n")
+    register_effect_file(slack)
+    with pytest.raises(InputError, match=r"not the file that its effect 'slack' was made with"):
+        load_model(folder)
+    slack.write_text(EXAMPLE)
+    register_effect_file(slack)
+    dp = torch.tensor([[-5.0, 3.0, 30.0]])
+    one, other = (m.step(m.initial_state(), dp, 0.1)[1] for m in (saved, load_model(folder)))
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "complaint"),
+    [
+        ("creep.py", EXAMPLE, "an effect 'creep' is there already"),
+        ("network.py", EXAMPLE, "an effect 'network' is there already"),
+        ("my-effect.py", EXAMPLE, "plain name"),
+        ("empty.py", "x = 1", "expected one complete Effect in the file, found none"),
+        ("broken.py", "1 / 0", r"does not run \(ZeroDivisionError"),
+        ("exits.py", "import sys; sys.exit(3)", r"does not run \(SystemExit"),
+        ("lost.py", EXAMPLE.replace('"material"', '"muscle"'), "expected a 'stage' of line"),
+        ("half.py", EXAMPLE.replace("def apply", "def applied"), "found none"),
+    ],
+)
+def test_a_bad_file_is_told_in_one_line_and_leaves_nothing(tmp_path, name, text, complaint):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        register_effect_file(tmp_path / name)
+    assert not own.FILES
+
+
+def test_a_missing_file_is_told():
+    with pytest.raises(InputError, match="no such file"):
+        named_effect("nowhere/slack.py")
+
+
+def test_installed_packages_offer_effects_and_hide_none_of_ours(monkeypatch):
+    value = "surgisoft.surrogate.effects.creep:Creep"
+    entries = {name: EntryPoint(name, value, own.GROUP) for name in ("seep", "hysteresis")}
+    monkeypatch.setattr(own, "offered", lambda: entries)
+    assert known_effects()["seep"].__name__ == "Creep"
+    assert known_effects()["hysteresis"].__name__ == "Hysteresis"
+    assert type(make_effect("seep", FACTS)).__name__ == "Creep"
+    wrong = EntryPoint("seep", "surgisoft.errors:InputError", own.GROUP)
+    monkeypatch.setattr(own, "offered", lambda: {"seep": wrong})
+    with pytest.raises(InputError, match="expected a subclass of"):
+        make_effect("seep", FACTS)

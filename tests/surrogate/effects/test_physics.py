@@ -1,0 +1,254 @@
+"""Each effect against a closed form that it was not written with."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
+
+RANGE = ArmFacts(torch.zeros(3), torch.full((3,), 50.0), torch.zeros(3), torch.zeros(5, 3))
+STRAIGHT = torch.tensor([[0.0, 0.0, 10.0 * k] for k in range(9)])
+LENGTH, RADIUS = 80.0, 50.0
+TURN = torch.linspace(0, math.pi / 2, 13)
+QUARTER = RADIUS * torch.stack([1 - TURN.cos(), 0 * TURN, TURN.sin()], -1)
+"""Key points on a quarter circle from the base, up and over to +x."""
+
+
+def arm(rest_mm: torch.Tensor, gravity=None) -> ArmFacts:
+    """An arm with these key points at rest, (n, 3) mm."""
+    return ArmFacts(torch.zeros(3), torch.ones(3), torch.zeros(3), rest_mm, gravity)
+
+
+def with_strength(effect, **values):
+    """The effect with strengths set by name."""
+    for name, value in values.items():
+        effect.strengths()[name].data.copy_(torch.as_tensor(value).expand_as(getattr(effect, name)))
+    return effect
+
+
+def run(effect, loads, dt_s=0.01):
+    """(T, m) answers in loads to loads (T,) of chamber 1 or (T, 3), from rest."""
+    loads = torch.as_tensor(loads, dtype=torch.float32)
+    if loads.ndim == 1:
+        loads = torch.stack([loads, 0 * loads, 0 * loads], -1)
+    x = (50 * loads).unsqueeze(0)
+    dt = torch.full(x.shape[:2], dt_s)
+    memory = effect.scan(effect.rest(torch.zeros(1, 3)), x, Context(dt))
+    return (effect.apply(x, memory) / 50)[0].detach()
+
+
+def pose(effect, points, memory=None):
+    """(n, 3) key points after a body or sensor effect."""
+    memory = points.new_zeros(1, 0) if memory is None else memory
+    return effect.apply(points.unsqueeze(0), memory)[0].detach()
+
+
+def test_line_lag_reaches_63_percent_after_its_time_constant():
+    lag = with_strength(make_effect("line_lag", RANGE, up_s=0.5, down_s=2.0, dead_s=1e-4), share=1)
+    answer = run(lag, torch.cat([torch.ones(1000), torch.zeros(400)]))[:, 0]
+    assert answer[49] == pytest.approx(1 - math.exp(-1), abs=1e-3)
+    assert answer[1000 + 199] == pytest.approx(math.exp(-1), abs=1e-3)
+
+
+def test_line_lag_delays_by_dead_time_and_time_constant():
+    """The area over a step response is the sum of all delays."""
+    lag = with_strength(make_effect("line_lag", RANGE, up_s=0.5, down_s=0.5, dead_s=0.3), share=1)
+    answer = run(lag, torch.ones(8000), dt_s=0.001)[:, 0]
+    assert float((1 - answer).sum() * 0.001) == pytest.approx(0.8, abs=2e-3)
+    assert float(answer[100]) < 0.03
+
+
+def test_creep_after_a_step_is_its_spectrum_in_closed_form():
+    creep = with_strength(make_effect("creep", RANGE, tau_s=5.0, width=1.5), amount=0.2)
+    t = 0.5 * np.arange(1, 401)
+    tau = 10 ** np.linspace(-0.45, 2.55, 11)
+    share = np.exp(-0.5 * (np.log(tau / 5.0) / 1.5) ** 2)
+    wanted = 1 + 0.2 * (share / share.sum() * (1 - np.exp(-t[:, None] / tau))).sum(1)
+    answer = run(creep, torch.ones(400), dt_s=0.5)[:, 0]
+    assert np.allclose(answer, wanted, atol=1e-5)
+
+
+def test_rate_dependence_holds_back_a_ramp_by_its_rate():
+    viscous = with_strength(make_effect("rate_dependence", RANGE, tau_s=0.1), viscous=0.05)
+    thinning = with_strength(make_effect("rate_dependence", RANGE, tau_s=0.1), thinning=0.05)
+    ramp = 0.25 * 0.001 * torch.arange(3000)
+    assert float((ramp - run(viscous, ramp, 0.001)[:, 0])[-1]) == pytest.approx(0.0125, rel=0.01)
+    assert float((ramp - run(thinning, ramp, 0.001)[:, 0])[-1]) == pytest.approx(0.025, rel=0.01)
+    assert float(run(viscous, torch.ones(3000))[-1, 0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_softening_leaves_the_first_loading_and_softens_the_second():
+    soft = with_strength(make_effect("softening", RANGE, width=0.3), own=0.2)
+    sweep = torch.cat(
+        [torch.linspace(0, 1, 11), torch.linspace(1, 0, 11), torch.linspace(0, 1, 11)]
+    )
+    answer = run(soft, sweep)[:, 0]
+    assert torch.equal(answer[:11], sweep[:11])
+    assert float(answer[-6]) == pytest.approx(0.5 * (1 + 0.2 * (1 - math.exp(-0.75 / 0.3))), 1e-4)
+    assert float(answer[-1]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_stiffening_takes_its_share_at_full_load_and_starts_as_a_cubic():
+    stiff = with_strength(make_effect("stiffening", RANGE, steepness=0.01), own=0.2, bend=0.1)
+    answer = run(stiff, [1.0, 0.5])[:, 0]
+    assert float(answer[0]) == pytest.approx(0.7, abs=1e-5)
+    assert float(answer[1]) == pytest.approx(0.5 * (1 - 0.3 * 0.25), abs=1e-3)
+    alike = run(with_strength(make_effect("stiffening", RANGE), bend=0.1), torch.ones(1, 3))
+    assert torch.allclose(alike, torch.ones(1, 3))
+
+
+def test_dead_zone_is_flat_at_rest_and_short_by_the_threshold_beyond():
+    dead = with_strength(make_effect("dead_zone", RANGE, width=0.05), threshold=0.05)
+    answer = run(dead, [0.001, 1.0, -1.0])[:, 0]
+    assert abs(float(answer[0])) < 1e-5
+    assert answer[1:].tolist() == pytest.approx([0.95, -0.95], abs=1e-4)
+
+
+def test_gains_and_coupling_by_hand():
+    gain = with_strength(make_effect("gain_mismatch", RANGE), gain=[0.1, 0.0, -0.2])
+    assert run(gain, [[0.5, 0.5, 0.5]])[0].tolist() == pytest.approx([0.55, 0.5, 0.4])
+    coupled = with_strength(make_effect("coupling", RANGE), linear=0.1, quadratic=0.2)
+    assert run(coupled, [[0.5, 1.0, 0.0]])[0].tolist() == pytest.approx(
+        [0.5 - 0.1 - 0.2, 1.0 - 0.05 - 0.05, -0.15 - 0.25]
+    )
+
+
+def test_pairs_couple_one_way_each():
+    """The quadratic losses come row by row: chamber 1 by 2, 1 by 3, 2 by 1, ..."""
+    losses = [0.1, 0.0, 0.3, 0.0, 0.0, 0.5]
+    paired = with_strength(make_effect("coupling", RANGE, pairs=True), quadratic=losses)
+    answer = run(paired, [[0.5, 1.0, 0.0]])[0].tolist()
+    assert answer == pytest.approx([0.5 - 0.1, 1.0 - 0.3 * 0.25, -0.5])
+
+
+def test_play_loop_has_its_area():
+    """Sweeping by +-A opens a play of radius r by 2 r over a height of 2 (A - r)."""
+    play = make_effect("hysteresis", RANGE, radii=(0.3,), ring=True, pairs=False)
+    with torch.no_grad():
+        play.turned[0, 0] = 0.5
+    cycle = 0.5 + 0.4 * torch.sin(torch.linspace(0, 4 * math.pi, 8001))
+    answer = run(play, cycle)[:, 0].numpy()[4000:]
+    x = cycle.numpy()[4000:]
+    area = abs(np.sum((answer[1:] + answer[:-1]) / 2 * np.diff(x)))
+    # In loads the half range is 1/2, so the radius is 0.15 and the amplitude 0.4.
+    assert area == pytest.approx(0.5 * 4 * 0.15 * (0.4 - 0.15), rel=1e-3)
+
+
+def test_inertia_overshoots_and_swings_as_an_oscillator_does():
+    frequency, damping = 2.0, 0.2
+    mode = make_effect("inertia", RANGE, frequency_Hz=frequency, damping=damping)
+    t = 0.01 * np.arange(1, 301)
+    w, root = 2 * np.pi * frequency, np.sqrt(1 - damping**2)
+    swing = np.cos(w * root * t) + damping / root * np.sin(w * root * t)
+    wanted = 1 - np.exp(-damping * w * t) * swing
+    answer = run(with_strength(mode, share=1), torch.ones(300))[:, 0].numpy()
+    assert np.allclose(answer, wanted, atol=1e-4)
+    assert answer.max() == pytest.approx(1 + np.exp(-np.pi * damping / root), abs=1e-3)
+
+
+@pytest.mark.parametrize("rest_mm", [STRAIGHT, STRAIGHT[1:]])
+def test_payload_bends_a_level_arm_as_a_cantilever(rest_mm):
+    """F s^2 (3L - s) / 6EI and w s^2 (6L^2 - 4Ls + s^2) / 24EI; the base may lack a marker."""
+    s = rest_mm[:, 2] / LENGTH
+    payload = make_effect("payload", arm(rest_mm, (-1.0, 0.0, 0.0)))
+    tip = pose(with_strength(payload, tip_sag=2.0, body_sag=0.0), rest_mm)
+    body = pose(with_strength(payload, tip_sag=0.0, body_sag=2.0), rest_mm)
+    assert torch.allclose(tip[:, 0], -2.0 * s**2 * (3 - s) / 2, atol=0.01)
+    assert torch.allclose(body[:, 0], -2.0 * s**2 * (6 - 4 * s + s**2) / 3, atol=0.01)
+    assert torch.equal(tip[:, 1:], rest_mm[:, 1:])
+
+
+def test_payload_leaves_a_hanging_arm():
+    payload = make_effect("payload", arm(STRAIGHT, (0.0, 0.0, 1.0)))
+    assert torch.allclose(
+        pose(with_strength(payload, tip_sag=5.0, body_sag=5.0), STRAIGHT), STRAIGHT
+    )
+
+
+def test_payload_bends_a_quarter_circle_as_castigliano_says():
+    """Against the clamp's tangent by pi / 4 P R^3 / EI, across it by 1 / 2 P R^3 / EI.
+
+    The tip load's moment about the slice at the angle a from the clamp is P R cos a.
+    """
+    payload = make_effect("payload", arm(QUARTER, (0.0, 0.0, -1.0)))
+    length = payload.length_mm
+    bent = pose(with_strength(payload, tip_sag=1.0), QUARTER)
+    unit = 3 * RADIUS**3 / length**3
+    down = QUARTER[-1, 2] - bent[-1, 2]
+    across = bent[-1, 0] - QUARTER[-1, 0]
+    assert float(down) == pytest.approx(unit * math.pi / 4, rel=0.01)
+    assert float(across) == pytest.approx(unit * 0.5, rel=0.01)
+
+
+def test_contact_holds_the_point_at_a_rigid_support_and_bends_the_rest():
+    facts = arm(STRAIGHT)
+    tilted = STRAIGHT + 0.1 * torch.outer(STRAIGHT[:, 2], torch.tensor([1.0, 0.0, 0.0]))
+    hold = with_strength(make_effect("contact", facts, point=5, offset_mm=3.0), share=1.0)
+    held = pose(hold, tilted)
+    moved = (tilted - held)[:, 0]
+    assert float(held[5, 0]) == pytest.approx(3.0, abs=1e-3)
+    # A cantilever under a force at c: s^2 (3 c - s) up to it, c^2 (3 s - c) beyond.
+    s, c = STRAIGHT[:, 2], 50.0
+    wanted = torch.where(s < c, s**2 * (3 * c - s), c**2 * (3 * s - c)) / (2 * c**3)
+    assert torch.allclose(moved, 2.0 * wanted, atol=0.03)
+    free = with_strength(make_effect("contact", facts, point=5, offset_mm=6.0), share=1.0)
+    assert torch.equal(pose(free, tilted), tilted)
+
+
+def test_misalignment_is_a_similarity():
+    off = make_effect("misalignment", arm(STRAIGHT))
+    with_strength(off, turn=[0.1, -0.2, 0.05], shift=[1.0, 2.0, 3.0], scale=0.02)
+    turned = Rotation.from_rotvec([0.1, -0.2, 0.05]).apply(QUARTER.numpy())
+    assert np.allclose(pose(off, QUARTER), 1.02 * turned + [1, 2, 3], atol=1e-4)
+
+
+def test_drift_after_ten_minutes_is_its_amplitude_and_saturates():
+    drift = make_effect("drift", arm(STRAIGHT), tau_s=300.0)
+    with_strength(drift, turn=[0.02, 0.0, 0.01], shift=[0.5, 0.0, 0.0])
+    context = Context(torch.tensor([[0.0, 600.0, 1e6]]))
+    points = QUARTER.expand(1, 3, -1, -1)
+    memory = drift.scan(drift.rest(points[:, 0]), points, context)
+    answer = drift.apply(points, memory)[0].detach().numpy()
+    assert np.allclose(answer[0], QUARTER, atol=1e-6)
+    turned = Rotation.from_rotvec([0.02, 0, 0.01]).apply(QUARTER.numpy()) + np.array([0.5, 0, 0])
+    assert np.allclose(answer[1], turned, atol=1e-3)
+    assert float(drift.grown(torch.tensor(1e6)).detach()) == pytest.approx(1 / (1 - math.exp(-2)))
+
+
+def test_drift_goes_on_where_a_new_run_begins():
+    drift = make_effect("drift", arm(STRAIGHT))
+    points = QUARTER.expand(2, 3, -1, -1)
+    t = torch.tensor([[0.0, 1.0, 2.0], [500.0, 501.0, 502.0]])
+    dt = torch.tensor([[0.0, 1.0, 1.0]] * 2)
+    assert torch.equal(drift.scan(drift.rest(points[:, 0]), points, Context(dt, t))[..., 0], t)
+
+
+def test_warm_rooms_change_the_gain_and_unknown_ones_nothing():
+    warm = with_strength(make_effect("drift", RANGE, kind="temperature"), gain=0.1, offset=0.02)
+    x = torch.full((1, 3, 3), 25.0)
+    room = torch.tensor([[22.0, 27.0, torch.nan]])
+    memory = warm.scan(warm.rest(x[:, 0]), x, Context(torch.ones(1, 3), None, room))
+    answer = warm.apply(x, memory)[0, :, 0] / 50
+    assert answer.tolist() == pytest.approx([0.5, 0.5 + 0.5 * (0.05 + 0.02), 0.5])
+    assert warm.stage == "material"
+
+
+def test_twist_moves_a_bent_arm_out_of_its_plane_by_the_area_under_it():
+    """1 / L int (r - r(0)) x dr is twice the area between arc and chord, over the length."""
+    twist = with_strength(make_effect("twist", arm(QUARTER)), linear=0.1)
+    answer = pose(twist, QUARTER, torch.ones(1, 1)) - QUARTER
+    area = RADIUS**2 * (math.pi / 4 - 0.5)
+    assert abs(float(answer[-1, 1])) == pytest.approx(0.1 * 2 * area / twist_length(), rel=0.01)
+    assert float(answer[:, [0, 2]].abs().max()) < 1e-4
+    assert torch.allclose(pose(twist, STRAIGHT_13, torch.ones(1, 1)), STRAIGHT_13)
+
+
+STRAIGHT_13 = torch.outer(torch.linspace(0, 60, 13), torch.tensor([0.0, 0.0, 1.0]))
+
+
+def twist_length() -> float:
+    """Sum of the quarter circle's chords, mm."""
+    return float(QUARTER.diff(dim=0).norm(dim=-1).sum())

@@ -1,15 +1,15 @@
 """What each effect would change in a model's prediction, to first order in its strengths."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.surrogate.effects import EFFECTS, Effect
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.effects import Context, Effect, known_effects
+from surgisoft.surrogate.model import ArmModel, context_of
 
 MORE = "_more"
 """Ending of the name of a second instance of an effect that the model has already."""
@@ -25,6 +25,20 @@ class Candidate:
     """The effect, at zero strength."""
     columns: np.ndarray
     """(S, n, 3, K) change of the key points with each strength, mm."""
+    more: bool = False
+    """Whether the columns make an effect that the model has already stronger."""
+
+    @torch.no_grad()
+    def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:
+        """The effect at strengths (K,); None for more of one that the model has."""
+        if self.more:
+            return None
+        effect, first = copy.deepcopy(self.effect), 0
+        for parameter in effect.strengths().values():
+            part = amplitudes[first : first + parameter.numel()]
+            parameter.copy_(torch.as_tensor(part, dtype=parameter.dtype).view_as(parameter))
+            first += parameter.numel()
+        return effect
 
 
 def key_of(model: ArmModel, name: str) -> str:
@@ -45,6 +59,8 @@ def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
 class Signals:
     """What the stages of a model see along a history, every row, and its slope on some."""
 
+    context: Context
+    """Times and chamber pressure of every row."""
     line: Tensor
     """(R, T, m) actuation behind the line effects."""
     material: Tensor
@@ -55,6 +71,8 @@ class Signals:
     """(R, T, n, 3) key points, mm."""
     slope: Tensor
     """(S, n, 3, m) change of key points with the effective actuation, mm a unit."""
+    rest: dict[str, Tensor]
+    """The signal of each stage at rest, (R, m) or (R, n, 3)."""
 
 
 @torch.no_grad()
@@ -64,22 +82,44 @@ def signals(problem: Problem) -> Signals:
     trace = model.trace(history)
     effective = model.effective(trace.pressure, trace.memory)
     points = model.network(effective, trace.direction)
-    start, dt = model.initial_state(history.runs).memory, history.dt_s
+    start = model.initial_state(history.runs).memory
+    context = replace(context_of(history), pressure=trace.pressure)
     stages = {}
     for stage in ("body", "sensor"):
         for name, effect in model.stage(stage):
-            points = effect.apply(points, effect.scan(start[name], points, dt))
+            points = effect.apply(points, effect.scan(start[name], points, context))
         stages[stage] = points
     at, direction = problem.rows(effective), problem.rows(trace.direction)
-    units = torch.eye(model.spec.chambers)
-    slope = torch.stack(
-        [
-            torch.func.jvp(lambda p: model.network(p, direction), (at,), (unit.expand_as(at),))[1]
-            for unit in units
-        ],
-        dim=-1,
+    slope = network_slope(model, at, direction)
+    rest = rest_signals(model, history.runs)
+    return Signals(
+        context, trace.pressure, effective, stages["body"], stages["sensor"], slope, rest
     )
-    return Signals(trace.pressure, effective, stages["body"], stages["sensor"], slope)
+
+
+def network_slope(model: ArmModel, effective: Tensor, direction: Tensor) -> Tensor:
+    """(S, n, 3, m) change of key points with the effective actuation (S, m), mm a unit."""
+    with torch.enable_grad():
+        at = effective.detach().clone().requires_grad_(True)
+        points = model.network(at, direction).flatten(1)
+        parts = [torch.autograd.grad(p.sum(), at, retain_graph=True)[0] for p in points.unbind(1)]
+    return torch.stack(parts, 1).unflatten(1, (model.spec.key_points, 3))
+
+
+def rest_signals(model: ArmModel, runs: int) -> dict[str, Tensor]:
+    """What each stage's effects, added behind the others, see of an arm at rest: (R, ...)."""
+    memory, answer = model.initial_state(runs).memory, {}
+    signal = model.rest.expand(runs, -1)
+    for stage in ("line", "material"):
+        for name, effect in model.stage(stage):
+            signal = effect.apply(signal, memory[name])
+        answer[stage] = signal = model.chambers(signal)
+    points = model.network(signal, torch.zeros_like(signal))
+    for stage in ("body", "sensor"):
+        for name, effect in model.stage(stage):
+            points = effect.apply(points, memory[name])
+        answer[stage] = points
+    return answer
 
 
 @torch.no_grad()
@@ -90,11 +130,33 @@ def columns_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
     them is taken to follow.
     """
     at = getattr(signal, effect.stage)
-    memory = effect.scan(effect.rest(at[:, 0]), at, problem.history.dt_s)
+    memory = effect.scan(effect.rest(signal.rest[effect.stage]), at, signal.context)
     changes = effect.columns(problem.rows(at), problem.rows(memory))
     if effect.stage in ("line", "material"):
         changes = torch.einsum("snjm,ksm->ksnj", signal.slope, changes)
     return changes.movedim(0, -1).numpy()
+
+
+@torch.no_grad()
+def more_of(problem: Problem, signal: Signals, name: str) -> Candidate | None:
+    """An effect that the model has already, stronger or weaker: one column for each output.
+
+    For an effect on the actuation one for each chamber too, in turn.
+    """
+    model, effect = problem.model, problem.model.effects[name]
+    if effect.stage != "material":
+        return None
+    trace = model.trace(problem.history)
+    before = trace.pressure
+    for other, part in model.stage("material"):
+        after = part.apply(before, trace.memory[other])
+        if other == name:
+            change = problem.rows(after - before)
+            break
+        before = after
+    each = torch.diag_embed(change).movedim(-1, 0)
+    columns = torch.einsum("snjm,ksm->ksnj", signal.slope, torch.cat([change[None], each[:-1]]))
+    return Candidate(name, effect, columns.movedim(0, -1).numpy(), more=True)
 
 
 def candidates(problem: Problem, names: list[str] | None = None) -> list[Candidate]:
@@ -102,8 +164,13 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
     model, signal = problem.model, signals(problem)
     points = problem.rows(signal.body)
     answer = []
-    for name in names or EFFECTS:
-        for effect in EFFECTS[name].candidates(model.facts, points):
+    for name in model.effects:
+        more = more_of(problem, signal, name) if names is None or name in names else None
+        if more is not None and more.columns.any():
+            answer.append(more)
+    known = known_effects()
+    for name in names or known:
+        for effect in known[name].candidates(model.facts, points):
             columns = columns_of(problem, signal, effect)
             power = np.nanmean(columns**2, axis=(0, 1, 2))
             kept = power > 1e-12 * max(power.max(), 1e-30)

@@ -6,6 +6,7 @@ linear, so everything that a set of columns can do on held-out blocks follows fr
 that are computed once: trying a set costs a small linear solve.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +14,15 @@ from scipy import linalg
 
 from surgisoft.diagnosis.discrepancy import kernel
 
-INDUCING = 150
+INDUCING = 120
 """Features of the surrogate's error (Nystroem: Williams & Seeger 2001)."""
 ROOM = 3.0
 """Factor on the validated error that the flexible function may reach at ease."""
-RIDGE = 1e-4
-"""Ridge on amplitudes, as a share of a column's own power."""
+PERSISTENCE = (5.0, 50.0, 500.0)
+"""Rows over which what is left may hang together: so many times more than as white noise does it
+hold the flexible function back. Of several the one is taken that does best on held-out blocks."""
+RIDGES = (1e-4, 1e-2, 1e-1)
+"""Ridges on amplitudes, shares of a column's own power; the best on held-out blocks is taken."""
 
 
 def static_features(x, d, number: int = INDUCING, seed: int = 0) -> np.ndarray:
@@ -46,7 +50,8 @@ class Fold:
 class CrossValidation:
     """Held-out errors of sets of columns."""
 
-    folds: list[Fold]
+    levels: list[list[Fold]]
+    """The folds for each of PERSISTENCE."""
     counts: np.ndarray
     """(B,) measured key points in each block."""
     columns: int
@@ -68,46 +73,34 @@ class CrossValidation:
         block: (S,) block of each row; fold: (B,) fold of each block; surrogate_mm and noise_mm:
         (n,) RMS errors of each key point's distance.
         """
-        field = np.concatenate([residual[..., None], columns], axis=3).astype(np.float32)
         seen = np.isfinite(residual).all(2)
-        count = field.shape[3]
-        blocks = int(fold.shape[0])
-        features = features.astype(np.float32)
-        folds = []
+        field = np.concatenate([residual[..., None], columns], axis=3).astype(np.float32)
+        mean = np.array(
+            [np.square(residual[seen[:, k], k]).sum(1).mean() for k in range(len(seen.T))]
+        )
+        prior = np.maximum(surrogate_mm, 0.1 * noise_mm) ** 2 * ROOM**2
+        ridges = [(noise_mm**2 + rows * mean) / prior for rows in PERSISTENCE]
+        levels: list[list[Fold]] = [[] for _ in ridges]
         for number in np.unique(fold):
-            held = fold[block] == number
-            gram = np.zeros((count, count))
             where = np.flatnonzero(fold == number)
-            judged = np.zeros((len(where), count, count))
-            for k in range(field.shape[1]):
-                fit, test = ~held & seen[:, k], held & seen[:, k]
-                if not fit.any():
-                    continue
-                ridge = (noise_mm[k] / (ROOM * max(surrogate_mm[k], 0.1 * noise_mm[k]))) ** 2
-                inside, outside = features[fit], features[test]
-                normal = inside.T @ inside + ridge * np.eye(inside.shape[1], dtype=np.float32)
-                factor = linalg.cho_factor(normal, lower=True, check_finite=False)
-                flat = field[fit, k].reshape(int(fit.sum()), -1)
-                static = linalg.cho_solve(factor, inside.T @ flat, check_finite=False)
-                rest = (flat - inside @ static).reshape(-1, count)
-                gram += flat.reshape(-1, count).T.astype(np.float64) @ rest
-                away = field[test, k].reshape(int(test.sum()), -1) - outside @ static
-                away = away.reshape(len(away), 3, count)
-                for i, b in enumerate(where):
-                    part = away[block[test] == b].reshape(-1, count)
-                    judged[i] += part.T @ part
-            folds.append(Fold(gram, judged, where))
-        counts = np.bincount(block, weights=seen.sum(1), minlength=blocks)
-        return cls(folds, counts, count - 1)
+            parts = _split(features.astype(np.float32), field, seen, fold[block] == number, block)
+            for level, ridge in zip(levels, ridges, strict=True):
+                level.append(_fold(parts, ridge, where, field.shape[3]))
+        counts = np.bincount(block, weights=seen.sum(1), minlength=len(fold))
+        return cls(levels, counts, field.shape[3] - 1)
 
     def losses(self, picked: list[int] | np.ndarray = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances of each block, mm^2, with the picked columns."""
         index = np.asarray(picked, int) + 1
+        ridges = RIDGES if len(index) > 1 else RIDGES[:1]
+        tried = itertools.product(self.levels, ridges)
+        return min((self._losses(folds, index, ridge) for folds, ridge in tried), key=np.sum)
+
+    def _losses(self, folds: list[Fold], index: np.ndarray, ridge: float) -> np.ndarray:
         answer = np.zeros(len(self.counts))
-        for fold in self.folds:
-            amplitude = self._amplitudes(fold.gram, index)
-            mix = np.concatenate([[1.0], -amplitude])
-            rows = np.concatenate([[0], index])
+        rows = np.concatenate([[0], index])
+        for fold in folds:
+            mix = np.concatenate([[1.0], -_amplitudes(fold.gram, index, ridge)])
             part = fold.judged[:, rows[:, None], rows[None]]
             answer[fold.blocks] = np.einsum("bij,i,j->b", part, mix, mix)
         return answer
@@ -115,14 +108,51 @@ class CrossValidation:
     def amplitudes(self, picked: list[int] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the picked columns, mean over the folds."""
         index = np.asarray(picked, int) + 1
-        return np.mean([self._amplitudes(fold.gram, index) for fold in self.folds], axis=0)
+        tried = itertools.product(self.levels, RIDGES)
+        folds, ridge = min(tried, key=lambda pair: self._losses(pair[0], index, pair[1]).sum())
+        return np.mean([_amplitudes(fold.gram, index, ridge) for fold in folds], axis=0)
 
-    @staticmethod
-    def _amplitudes(gram: np.ndarray, index: np.ndarray) -> np.ndarray:
-        if not len(index):
-            return np.zeros(0)
-        normal = gram[index[:, None], index[None]]
-        normal = 0.5 * (normal + normal.T)
-        size = np.sqrt(np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-30)))
-        scaled = normal / size[:, None] / size[None] + RIDGE * np.eye(len(index))
-        return linalg.solve(scaled, gram[index, 0] / size, assume_a="pos") / size
+
+def _split(features, field, seen, held, block) -> list[tuple]:
+    """What the static fit of each key point needs, for any ridge."""
+    answer, known = [], {}
+    for k in range(field.shape[1]):
+        fit, test = ~held & seen[:, k], held & seen[:, k]
+        if not fit.any():
+            continue
+        key = fit.tobytes()
+        if key not in known:
+            known[key] = linalg.eigh(features[fit].T @ features[fit], check_finite=False)
+        values, vectors = known[key]
+        flat = field[fit, k].reshape(int(fit.sum()), -1)
+        turned = vectors.T @ (features[fit].T @ flat)
+        own = flat.reshape(-1, field.shape[3])
+        gram = (own.T @ own).astype(np.float64)
+        tested = field[test, k].reshape(int(test.sum()), -1)
+        answer.append((k, values, turned, gram, features[test] @ vectors, tested, block[test]))
+    return answer
+
+
+def _fold(parts: list[tuple], ridge: np.ndarray, where: np.ndarray, count: int) -> Fold:
+    """One fold with a ridge (n,) on the static part of each key point."""
+    gram, judged = np.zeros((count, count)), np.zeros((len(where), count, count))
+    for k, values, turned, own, outside, tested, block in parts:
+        shrunk = (turned / (np.maximum(values, 0.0) + ridge[k])[:, None]).astype(np.float32)
+        left = turned.reshape(-1, count).T @ shrunk.reshape(-1, count)
+        gram += own - left
+        away = (tested - outside @ shrunk).reshape(len(tested), 3, count)
+        for i, b in enumerate(where):
+            part = away[block == b].reshape(-1, count)
+            judged[i] += part.T @ part
+    return Fold(gram, judged, where)
+
+
+def _amplitudes(gram: np.ndarray, index: np.ndarray, ridge: float) -> np.ndarray:
+    """(k,) least-squares amplitudes of the columns at an index."""
+    if not len(index):
+        return np.zeros(0)
+    normal = gram[index[:, None], index[None]]
+    normal = 0.5 * (normal + normal.T)
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-30)))
+    scaled = normal / size[:, None] / size[None] + ridge * np.eye(len(index))
+    return linalg.solve(scaled, gram[index, 0] / size, assume_a="pos") / size

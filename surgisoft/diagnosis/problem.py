@@ -15,7 +15,7 @@ from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
-ROWS = 3000
+ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
 BLOCK_S = 20.0
 """Length of a block of time that is held out as a whole, s."""

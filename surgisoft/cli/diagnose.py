@@ -1,0 +1,88 @@
+"""`surgisoft diagnose`: which physical effect is the model missing?"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.progress import progress
+
+
+@app.command()
+def diagnose(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
+    ],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the whole diagnosis here.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write an HTML report with pictures here.")
+    ] = None,
+    effect_files: Annotated[
+        list[Path] | None,
+        typer.Option("--effect-file", metavar="FILE.py", help="Also try an effect of your own."),
+    ] = None,
+) -> None:
+    """Diagnose a model: name the physical effect that it is missing, or say why not.
+
+    Looks at the first three quarters of each recording; the last quarter stays locked for `amend`.
+    """
+    import torch
+
+    from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
+    from surgisoft.measurement.histories import outside_range
+    from surgisoft.measurement.recording import load_recordings
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.effects import register_effect_file
+
+    check_free(json_file, "verdict")
+    check_folder(report)
+    for path in effect_files or []:
+        register_effect_file(path)
+    arm = load_model(model)
+    measured = load_recordings(
+        recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
+    )
+    torch.set_num_threads(1)
+    with progress("diagnose") as tell:
+        stages = iter(range(1, 100))
+        found = diagnose_model(arm, measured, lambda text: tell(next(stages), 5, text))
+    for note in outside_range(arm.spec, measured):
+        typer.echo(f"surgisoft: warning: {note}", err=True)
+    if json_file:
+        write_text(json_file, json.dumps(found.to_json(), indent=2) + "\n")
+    _show(found)
+    if report:
+        from surgisoft.diagnosis.diagnosis_report import write_report
+
+        title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
+        print(f"wrote {write_report(found, report, title)}")
+
+
+def _show(found) -> None:
+    """The verdict, the ranking and what to do next."""
+    verdict, error = found.verdict, found.error_mm
+    print(f"{verdict.kind}: {verdict.sentence}")
+    print(
+        f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
+        f"ceiling {error.ceiling:.4f} mm (best on held-out blocks)"
+    )
+    for check in found.checks:
+        print(f"check: {check}")
+    print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {'held-out RMSE':>24s}")
+    for row in found.ranking:
+        low, high = row.ci95
+        print(
+            f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "
+            f"{100 * row.gain_unique:6.1f}% {row.heldout_rmse_mm:10.4f} [{low:.4f}, {high:.4f}] mm"
+        )
+    if found.next_experiment:
+        plan = found.next_experiment
+        pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
+        print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, tells {pairs}")
+    print(f"{found.seconds:.1f} s")

@@ -1,0 +1,295 @@
+"""`diagnose`: which physical effect is the model missing?
+
+1. Pose: the model's residual on the open three quarters of the recordings, thinned, in blocks.
+2. Columns: what each effect, in each of its shapes, would change to first order.
+3. Race: held-out errors of every effect, the surrogate's own error always beside it.
+4. Gates: beyond chance for the whole family of effects, and large enough to matter.
+5. One effect after another, until the gates are silent; rivals and leftovers decide the answer.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from surgisoft.diagnosis.blackbox import BlackBox, black_box
+from surgisoft.diagnosis.candidates import Candidate, candidates
+from surgisoft.diagnosis.confidence import confidence
+from surgisoft.diagnosis.gates import first_shares, studentised
+from surgisoft.diagnosis.problem import Problem, pose
+from surgisoft.diagnosis.ranking import Race, Standing
+from surgisoft.diagnosis.static_error import StaticError, static_error
+from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
+from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.model import ArmModel
+
+CHANCE = 0.02
+"""Largest chance, over all effects together, at which an effect is named."""
+LEAST_GAIN = 0.25
+"""Least share of the squared error above the floor that the first effect explains."""
+NEXT_GAIN = 0.15
+"""Least share of the first such error that a further effect explains."""
+LEAST_LOG_GAIN = 0.08
+"""Least mean fall of the log error of a block."""
+MOST_EFFECTS = 3
+"""Most effects that one diagnosis names."""
+RIVAL_SHARE = 0.9
+"""Share of bootstrap samples in which the first must beat another that explains nearly as much."""
+RIVAL_GAIN = 0.8
+"""Share of the first's gain from which another counts as a rival."""
+EXPLAINED = 0.62
+"""Share of what is explainable that named effects must explain, or something else is missing."""
+UNKNOWN_SHARE = 0.35
+"""Share of the error above the floor that a black box must explain where no effect does."""
+OFF_SIZE = 2.2
+"""Factor on the validated error from which a static error is more than the surrogate's own."""
+TRAINED = 2.0
+"""Factor on the floor from which an error of the surrogate's own is too much."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the gates let through, and what the answer is made from."""
+
+    problem: Problem
+    race: Race
+    first: list[Standing]
+    """All effects on top of nothing."""
+    named: list[Standing]
+    """The effects that passed, in order, each on top of those before it."""
+    rivals: list[str]
+    """Effects that explain the data about as well as the first."""
+    unique: dict[str, float]
+    box: BlackBox
+    static: StaticError
+    """The surrogate's own error before and after the named effects."""
+
+    @property
+    def picked(self) -> tuple[int, ...]:
+        """Columns of the named effects."""
+        return sum((standing.option.picked for standing in self.named), ())
+
+
+def diagnose(
+    model: ArmModel, recordings: list[Recording], progress: Progress | None = None
+) -> Diagnosis:
+    """Name the effects that a model is missing on recordings of its own arm."""
+    begin = time.perf_counter()
+    report = progress or (lambda text: None)
+    report("predicting")
+    problem = pose(model, recordings, part="open")
+    report("columns of the effects")
+    found = find(problem, candidates(problem), report)
+    return replace(answer(found), seconds=time.perf_counter() - begin)
+
+
+def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
+    """Run the race and the gates."""
+    report("held-out errors")
+    race = Race.of(problem, some)
+    first = standings = race.standings()
+    named: list[Standing] = []
+    base: tuple[int, ...] = ()
+    start = race.excess(race.losses())
+    while standings and len(named) < MOST_EFFECTS:
+        passed = [s for s in standings if _passes(race, base, s, start, bool(named))]
+        if not passed:
+            break
+        named.append(passed[0])
+        base += passed[0].option.picked
+        standings = race.standings(base, tuple(s.effect for s in named))
+    report("black box")
+    return Findings(
+        problem=problem,
+        race=race,
+        first=first,
+        named=named,
+        rivals=_rivals(race, first, named),
+        unique=race.unique_gains(first),
+        box=black_box(problem),
+        static=static_error(problem, race, base),
+    )
+
+
+def _passes(race: Race, base: tuple[int, ...], s: Standing, start: float, later: bool) -> bool:
+    """Whether one effect on top of a base is beyond chance and large enough."""
+    share = (race.losses(base).sum() - s.losses.sum()) / start
+    return bool(
+        s.p_value <= CHANCE
+        and s.log_gain.mean() >= LEAST_LOG_GAIN
+        and share >= (NEXT_GAIN if later else LEAST_GAIN)
+    )
+
+
+def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[str]:
+    """Effects that would do about as well in the place of the first one named."""
+    if not named:
+        return []
+    best = named[0]
+    answer = []
+    for other in first:
+        if other.effect == best.effect or other.gain < RIVAL_GAIN * best.gain:
+            continue
+        pair = np.stack([-best.log_gain, -other.log_gain])
+        if first_shares(pair)[0] < RIVAL_SHARE:
+            answer.append(other.effect)
+    return answer
+
+
+def answer(found: Findings) -> Diagnosis:
+    """Put what was found into words."""
+    race, problem = found.race, found.problem
+    counts = race.validation.counts
+    before = float(np.sqrt(np.nanmean(np.square(problem.residual).sum(2))))
+    floor = float(np.sqrt(np.mean(problem.noise_mm**2)))
+    reached = race.rmse_mm(race.losses(found.picked))
+    numbers = statistics(found)
+    sure = confidence(numbers)
+    kind, effects = _kind(found, numbers)
+    levels = ErrorLevels(before, floor, min(reached, found.box.rmse_mm, before))
+    ranking = tuple(
+        _ranked(found, standing, sure if place == 0 else min(sure, 1.0 - sure))
+        for place, standing in enumerate(_order(found))
+    )
+    sentence = _sentence(kind, effects, levels, reached, sure, found)
+    return Diagnosis(
+        verdict=Verdict(kind, effects, sentence),
+        error_mm=levels,
+        ranking=ranking,
+        ambiguous_with=tuple(found.rivals) if kind == "ambiguous" else (),
+        checks=tuple(_checks(found)),
+        statistics=numbers | {"blocks": len(counts)},
+    )
+
+
+def _order(found: Findings) -> list[Standing]:
+    """All effects, the named ones first."""
+    names = [standing.effect for standing in found.named]
+    named = {standing.effect: standing for standing in found.first}
+    return [named[n] for n in names] + [s for s in found.first if s.effect not in names]
+
+
+def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
+    """The kind of the answer and the effects that it names."""
+    names = tuple(standing.effect for standing in found.named)
+    if names:
+        if numbers["explained"] < EXPLAINED:
+            return "unknown_effect", ()
+        if found.rivals and len(names) == 1:
+            return "ambiguous", (names[0], *found.rivals)
+        return ("several" if len(names) > 1 else "identified"), names
+    if numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE:
+        return "unknown_effect", ()
+    if numbers["static_size"] >= OFF_SIZE and numbers["before_over_floor"] >= TRAINED:
+        return "unknown_effect", ()
+    if numbers["static_share"] >= 0.5 and numbers["before_over_floor"] >= TRAINED:
+        return "surrogate_undertrained", ()
+    return "nothing_missing", ()
+
+
+def statistics(found: Findings) -> dict:
+    """The numbers that the answer and its confidence are made from."""
+    race, problem = found.race, found.problem
+    floor = race.floor.sum()
+    raw = float(np.nansum(np.square(problem.residual)))
+    null = race.losses()
+    after = race.losses(found.picked)
+    best = found.named[0] if found.named else (found.first[0] if found.first else None)
+    others = [s for s in found.first if best is not None and s.effect != best.effect]
+    runner = others[0] if others else None
+    margin, share = 0.0, 1.0
+    if best is not None and runner is not None:
+        gap = best.log_gain - runner.log_gain
+        margin = float(studentised(gap[None])[0])
+        share = float(first_shares(np.stack([-best.log_gain, -runner.log_gain]))[0])
+    reachable = min(found.box.losses.sum(), after.sum())
+    room = max(null.sum() - max(reachable, floor), 1e-9)
+    return {
+        "before_over_floor": float(np.sqrt(raw / floor)),
+        "static_share": float((raw - null.sum()) / max(raw - floor, 1e-9 * raw)),
+        "static_size": found.static.before,
+        "static_size_after": found.static.after,
+        "gain": float(best.gain) if best else 0.0,
+        "log_gain": float(best.log_gain.mean()) if best else 0.0,
+        "p_value": float(best.p_value) if best else 1.0,
+        "runner_gain": float(runner.gain) if runner else 0.0,
+        "margin": margin,
+        "first_share": share,
+        "unique": float(found.unique.get(best.effect, 0.0)) if best else 0.0,
+        "explained": float((null.sum() - after.sum()) / room) if found.named else 0.0,
+        "explained_above_floor": float((null.sum() - after.sum()) / race.excess(null)),
+        "box_share": float((null.sum() - found.box.losses.sum()) / race.excess(null)),
+        "box_p": found.box.p_value,
+        "named": len(found.named),
+        "rivals": len(found.rivals),
+    }
+
+
+def _ranked(found: Findings, standing: Standing, sure: float) -> Ranked:
+    """One row of the ranking."""
+    race = found.race
+    rng = np.random.default_rng(0)
+    count = len(race.floor)
+    weights = rng.multinomial(count, np.full(count, 1 / count), size=400)
+    draws = np.sqrt((weights @ standing.losses) / (weights @ race.validation.counts))
+    return Ranked(
+        effect=standing.effect,
+        confidence=round(float(sure), 4),
+        gain_alone=float(standing.gain),
+        gain_unique=float(found.unique.get(standing.effect, 0.0)),
+        heldout_rmse_mm=race.rmse_mm(standing.losses),
+        ci95=(float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))),
+        p_value=float(standing.p_value),
+        log_gain=float(standing.log_gain.mean()),
+        parameters=race.parameters(standing),
+    )
+
+
+def _checks(found: Findings) -> list[str]:
+    """What is weak about the data."""
+    problem, answer = found.problem, []
+    if problem.floor_source == "second differences":
+        answer.append(
+            "the noise is not stated and no holds show it: it was taken from second differences "
+            "in time; state noise_mm in the sidecar for a better floor"
+        )
+    missing = float(np.isnan(problem.measured).mean())
+    if missing > 0.2:
+        answer.append(f"{100 * missing:.0f} % of the key points are missing")
+    return answer
+
+
+def _sentence(kind: Kind, effects, levels: ErrorLevels, reached: float, sure: float, found) -> str:
+    """The verdict in words."""
+    error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
+    if kind == "identified":
+        return (
+            f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached:.3g} mm remain on "
+            f"held-out blocks; {error}"
+        )
+    if kind == "several":
+        together = " and ".join(effects)
+        return (
+            f"{together} are missing (confidence {sure:.2f} in the first): with them "
+            f"{reached:.3g} mm remain on held-out blocks; {error}"
+        )
+    if kind == "ambiguous":
+        return (
+            f"cannot tell {' from '.join(effects)} with these recordings: each would leave about "
+            f"{reached:.3g} mm on held-out blocks; {error}"
+        )
+    if kind == "unknown_effect":
+        best = found.first[0].effect if found.first else "none"
+        return (
+            f"something is missing and it is none of the known effects ({best} comes nearest): a "
+            f"black box or the surrogate's own correction explains more than any of them; {error}"
+        )
+    if kind == "surrogate_undertrained":
+        return (
+            f"the network itself is off (its validated error says so too): fit it longer or to "
+            f"more data before looking for effects; {error}"
+        )
+    return f"nothing is missing that these recordings could show; {error}"

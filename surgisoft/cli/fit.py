@@ -29,7 +29,11 @@ def fit(
     ] = "pressure+direction",
     effects: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME...", help="Physical effects to add: hysteresis."),
+        typer.Option(
+            metavar="NAME...",
+            help="Physical effects of the line or the material to add, such as hysteresis, or a "
+            "file with one of your own (docs/effects.md).",
+        ),
     ] = None,
     network: Annotated[
         Literal["haw_nn", "constant_curvature", "recurrent"],
@@ -60,6 +64,7 @@ def fit(
     from surgisoft.measurement.histories import arm_spec, check_fits, history_of
     from surgisoft.measurement.recording import check_same_arm, load_recordings
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
+    from surgisoft.surrogate.effects import named_effect
     from surgisoft.surrogate.fit import FitConfig
     from surgisoft.surrogate.fit import fit as fit_model
     from surgisoft.surrogate.network import parse_widths
@@ -75,7 +80,7 @@ def fit(
     config = FitConfig(
         network=network,
         inputs=inputs,
-        effects=tuple(name for item in effects or [] for name in item.split(",")),
+        effects=tuple(named_effect(name) for item in effects or [] for name in item.split(",")),
         hidden=parse_widths(widths),
         epochs=epochs,
         seed=seed,

@@ -187,3 +187,45 @@ def test_truth_is_not_made_of_plays():
     """The test's own arm: relays only, so that the model's form is not simply found again."""
     path = np.array([[0.0, 0, 0], [30, 0, 0], [0, 0, 0]])
     assert np.abs(shape(path, 5.0)[0] - shape(path, 5.0)[2]).max() > 0.1
+
+
+def lagging(rows: int, seed: int, dt_s: float = 0.1):
+    """A run of an arm whose line lags by 0.4 s in filling and 1.2 s in emptying, stepped in NumPy.
+
+    The command jumps after 0.5 to 4 s: (times, command, key points with noise).
+    """
+    rng = np.random.default_rng(seed)
+    levels = [
+        np.tile(rng.uniform(SPEC.low, SPEC.high), (rng.integers(5, 40), 1)) for _ in range(99)
+    ]
+    command = np.concatenate(levels)[:rows]
+    chamber, path = np.zeros(3), []
+    for row in command:
+        tau = np.where(row > chamber, 0.4, 1.2)
+        chamber = row + (chamber - row) * np.exp(-dt_s / tau)
+        path.append(chamber)
+    points = shape(np.array(path), 0.0) + rng.normal(0, NOISE, (rows, 3, 3))
+    return torch.arange(rows) * dt_s, torch.tensor(command), torch.tensor(points)
+
+
+def test_a_lag_of_the_line_is_fitted_through_whole_runs():
+    runs = [lagging(400, seed) for seed in range(8)]
+    train, valid = (
+        pack(*([run[k] for run in part] for k in range(3))) for part in (runs[:6], runs[6:])
+    )
+    config = FitConfig(
+        inputs="pressure", effects=("line_lag",), hidden=(48, 48), epochs=60, batch=128
+    )
+    result = fit(train, valid, SPEC, config)
+    stage = result.stages[-1]
+    assert stage.kept
+    assert stage.valid_rmse_mm < 0.25 * stage.simpler_rmse_mm
+    found = {q.name: q.value for q in result.model.effects["line_lag"].quantities()}
+    assert found["share"] == pytest.approx(1.0, abs=0.1)
+    assert found["tau_up_s"] == pytest.approx(0.4, rel=0.4)
+    assert found["tau_down_s"] == pytest.approx(1.2, rel=0.4)
+
+
+def test_effects_behind_the_network_are_left_to_amend(walks):
+    with pytest.raises(InputError, match=r"payload acts on the body.*surgisoft amend --effect pay"):
+        fit(walks[0], None, SPEC, FitConfig(effects=("payload",)))

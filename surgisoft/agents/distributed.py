@@ -77,9 +77,9 @@ def _device() -> torch.device:
 @contextlib.contextmanager
 def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
     """This process among those that torchrun started, and its device."""
-    kind = torch.device(device)
-    if kind.type not in ("cpu", "cuda"):
+    if device.split(":")[0] not in ("cpu", "cuda"):
         raise InputError(f"--device '{device}': expected cpu or cuda")
+    kind = torch.device(device)
     if kind.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"--device '{device}': PyTorch sees no GPU here; use --device cpu")
     count = int(os.environ.get("WORLD_SIZE", "1"))

@@ -11,9 +11,9 @@ from surgisoft.errors import InputError, unknown_name
 class Preset:
     """Hyper-parameters of one PPO for each agent (Schulman et al. 2017), and of its networks."""
 
-    envs: int = 1024
+    envs: int = 256
     """Episodes that run side by side."""
-    rollout: int = 24
+    rollout: int = 12
     """Steps of each episode between two updates."""
     epochs: int = 5
     """Passes over those steps in an update."""
@@ -44,7 +44,7 @@ class Preset:
     """First standard deviation of the actions, in outputs."""
     last_noise: float | None = 0.03
     """The deviation falls to this, evenly in its logarithm, until the end; None: it is learned."""
-    evaluate_every: int = 25
+    evaluate_every: int = 100
     """Updates between two evaluations."""
     evaluation_episodes: int = 32
     """Episodes of an evaluation."""
@@ -85,13 +85,20 @@ STEPS: dict[str, int] = {
     "track_circle": 20_000_000,
     "track_square": 20_000_000,
     "laser_plane": 20_000_000,
-    "circle_ablation": 6_000_000,
+    "circle_ablation": 2_000_000,
 }
 """Task -> steps that the `fast` preset trains it unless told otherwise."""
 PAPER_STEPS = 20_000_000
 """Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
 
-TASK_CHANGES: dict[str, dict] = {}
+TASK_CHANGES: dict[str, dict] = {
+    "circle_ablation": {
+        "rollout": 16,
+        "last_noise": 0.05,
+        "evaluate_every": 50,
+        "evaluation_episodes": 16,
+    },
+}
 """Task -> fields in which its `fast` preset differs."""
 
 

@@ -1,0 +1,99 @@
+"""`surgisoft train` as one types it; several processes; every wrong turn in one line."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from surgisoft.agents.run_folder import LAST, RunFolder
+from surgisoft.cli import run as surgisoft
+
+SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]
+
+
+def test_trains_and_says_what_stands(tmp_path, capsys):
+    folder, file = tmp_path / "run", tmp_path / "task.toml"
+    file.write_text("[follow]\nsize_mm = 12.0\n[world.randomisation]\nstart_kPa = 1.0\n")
+    code = surgisoft(["train", *SMALL, "--seed", "7", "--config", str(file), "-o", str(folder)])
+    assert code == 0
+    assert f"wrote {folder}: 576 steps" in capsys.readouterr().out
+    config = json.loads((folder / "config.json").read_text())
+    assert config["seed"] == 7
+    assert config["hyper_parameters"]["envs"] == 16
+    assert config["arms"]["arm"]["effects"] == ["hysteresis"]
+    assert set(config["versions"]) == {"surgisoft", "python", "torch", "rsl-rl-lib"}
+    task = RunFolder(folder).task()
+    assert task.config.size_mm == 12.0
+    assert task.world.config.randomisation.start_kPa == 1.0
+    rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [row["steps"] for row in rows] == [192, 384, 576]
+    assert [*(folder / "tensorboard").glob("events*")]
+    assert surgisoft(["train", "--resume", str(folder)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "--task is missing"),
+        (["--task", "nope"], "unknown task 'nope': known are"),
+        ([*SMALL, "--preset", "nope"], "unknown preset 'nope': known are fast, paper"),
+        ([*SMALL, "--scene", "x"], "this task has no scene"),
+        ([*SMALL, "--arm", "nowhere"], "no arm model there"),
+        ([*SMALL, "--minutes", "-1"], "minutes is -1"),
+        ([*SMALL, "--device", "abacus"], "abacus"),
+        ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
+        (["--resume", "nowhere"], "no training run there"),
+        (["--resume", "nowhere", "--seed", "1"], "leave --seed out"),
+        (["--task", "track_circle", "--envs", "0"], "--envs"),
+    ],
+)
+def test_wrong_turns_are_one_line_and_leave_nothing(arguments, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert surgisoft(["train", *arguments]) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bad_field_is_told_with_its_line(tmp_path, capsys):
+    file = tmp_path / "task.toml"
+    file.write_text("[follow]\nsize = 12.0\n")
+    code = surgisoft(["train", *SMALL, "--config", str(file), "-o", str(tmp_path / "run")])
+    assert code == 2
+    assert f"{file}:2: follow.size: unknown field" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_two_processes_learn_one_policy(tmp_path):
+    """torchrun over gloo: gradients averaged, weights equal, worlds different, resumable."""
+    folder = tmp_path / "run"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def torchrun(*arguments):
+        return subprocess.run(
+            [
+                sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2",
+                "--master-addr", "127.0.0.1", "--master-port", str(port),
+                "-m", "surgisoft.cli", "train", *arguments,
+            ],
+            env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+
+    made = torchrun(*SMALL, "-o", str(folder))
+    assert made.returncode == 0, made.stderr[-2000:]
+    run = RunFolder(folder)
+    saved = run.load(LAST)
+    assert run.config["processes"] == 2
+    assert saved["iteration"] == 2, "576 steps are two turns of two times 192"
+    one, other = (process["world"] for process in saved["processes"])
+    assert not all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+    again = torchrun("--resume", str(folder))
+    assert again.returncode == 0, again.stderr[-2000:]
+    assert surgisoft(["train", "--resume", str(folder)]) == 2, "one process is not two"

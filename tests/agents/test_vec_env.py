@@ -1,0 +1,87 @@
+"""rsl-rl's own runner and ours see the same episodes, stored as they were."""
+
+import copy
+
+import pytest
+import torch
+from rsl_rl.runners import OnPolicyRunner
+
+from surgisoft.agents.distributed import Processes
+from surgisoft.agents.ppo import algorithm_config, gather, make_ppo
+from surgisoft.agents.presets import Preset
+from surgisoft.agents.vec_env import STATE, JointEnv, OneAgentEnv
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.track import TrackConfig
+
+SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
+
+
+@pytest.fixture(scope="module")
+def task():
+    return make_task("track_circle", SHORT)
+
+
+def test_rsl_rls_own_runner_trains_it(task):
+    env = OneAgentEnv(task, 4)
+    config = algorithm_config("arm", Preset(envs=4, rollout=8), Processes())
+    config = {**copy.deepcopy(config), "save_interval": 100, "run_name": "x"}
+    runner = OnPolicyRunner(env, config, log_dir=None, device="cpu")
+    before = [value.clone() for value in runner.alg.actor.parameters()]
+    runner.learn(2, init_at_random_ep_len=True)
+    pairs = zip(before, runner.alg.actor.parameters(), strict=True)
+    assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_actions_are_shares_and_episodes_are_the_tasks_own(task):
+    """Against the task stepped by hand, through time-outs and fresh starts."""
+    env = JointEnv(task, 3, seed=2, action_kPa=0.5)
+    play, state = Episodes(task), env.state
+    rng = torch.Generator().manual_seed(0)
+    ends = 0
+    for _ in range(2 * task.steps):
+        action = torch.randn(3, 3, generator=rng)
+        seen, rewards, dones, extras = env.step({"arm": action})
+        state, outcome = play.step(state, {"arm": 0.5 * action})
+        assert torch.equal(rewards["arm"], outcome.rewards["arm"])
+        assert torch.equal(dones, outcome.done)
+        assert torch.equal(extras["time_outs"], outcome.truncated)
+        state = play.reset(state, outcome.done)
+        assert torch.equal(seen["arm"], play.observe(state)["arm"])
+        assert torch.equal(seen[STATE], seen["arm"])
+        ends += int(dones.sum())
+    assert ends == 6
+
+
+def test_first_episodes_do_not_end_together(task):
+    steps = JointEnv(task, 8, seed=0, action_kPa=1.0).state.world.steps
+    assert len(steps.unique()) == 8
+    assert steps.max() < task.steps
+
+
+def test_stored_observations_are_those_before_the_step(task):
+    preset = Preset(envs=4, rollout=6)
+    env = JointEnv(task, 4, 0, 1.0)
+    agents = make_ppo(env, preset, Processes())
+    seen = env.get_observations()
+    first = seen["arm"].clone()
+    gather(env, agents, seen, 6)
+    stored = agents["arm"].storage
+    assert torch.equal(stored.observations["arm"][0], first)
+    assert not torch.equal(stored.observations["arm"][1], first)
+    # GAE by hand (Schulman et al. 2016, eq. 16), from what is stored.
+    last = agents["arm"].critic(env.get_observations()).detach()
+    advantage = torch.zeros_like(last)
+    for step in reversed(range(6)):
+        goes_on = 1.0 - stored.dones[step].float()
+        after = last if step == 5 else stored.values[step + 1]
+        delta = stored.rewards[step] + preset.gamma * goes_on * after - stored.values[step]
+        advantage = delta + preset.gamma * preset.lam * goes_on * advantage
+        torch.testing.assert_close(stored.returns[step], advantage + stored.values[step])
+
+
+def test_two_agents_are_told_to_take_the_joint_one():
+    with pytest.raises(InputError, match="use JointEnv"):
+        OneAgentEnv(make_task("circle_ablation"), 2)

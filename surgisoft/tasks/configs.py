@@ -63,7 +63,7 @@ def with_fields(config: Any, **values: Any) -> Any:
     absent = set(values) - found
     if absent:
         raise InputError(
-            f"this task has no {', '.join(sorted(absent))}: leave --{sorted(absent)[0]} out"
+            f"this task has no {', '.join(sorted(absent))}: leave '{sorted(absent)[0]}' out"
         )
     return changed
 

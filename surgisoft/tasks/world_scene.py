@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import surgisoft
+from surgisoft.errors import unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap, AblationState
 from surgisoft.scene.batched import BatchClearance, BatchedScene
@@ -19,6 +20,7 @@ from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesions import lesions_like
 from surgisoft.scene.rays import RayHit
+from surgisoft.scene.refereed import RefereedScene
 from surgisoft.scene.tissue import Tissue
 from surgisoft.tasks.streams import Stream
 from surgisoft.tasks.world_arm import ArmPart, Randomisation
@@ -27,6 +29,8 @@ _PACKAGE = Path(surgisoft.__file__).parent
 _HOME = _PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent
 PHANTOM = _HOME / "scenes" / "phantom_liver"
 """The scene that comes with the project: in the installed package, or beside it in a checkout."""
+GEOMETRIES = ("batched", "fcl")
+"""Who may decide about clearance and the beam's hit."""
 LASER, ENDOSCOPE = "laser", "endoscope"
 """Names of the arm that carries the beam and of the one that carries the camera."""
 BEAM_BEYOND_MM = 50.0
@@ -63,6 +67,13 @@ class SceneryConfig:
     """The ring counts as cut where it is this deep, mm."""
     band_mm: float = 2.0
     """Width of the ring's band, mm."""
+    geometry: str = "batched"
+    """Who decides about clearance and the beam's hit: `batched`, or `fcl`, the referee, one
+    environment after the other. The endoscope's lines of sight are batched either way."""
+
+    def __post_init__(self):
+        if self.geometry not in GEOMETRIES:
+            raise unknown_name("geometry", self.geometry, GEOMETRIES)
 
 
 class Surroundings:
@@ -84,6 +95,7 @@ class Surroundings:
         config, spec, self.device = config or SceneryConfig(), scene.spec, torch.device(device)
         radii = {mount.tool: 0.5 * mount.diameter_mm for mount in spec.mounts}
         self.geometry = BatchedScene(scene.bodies, radii, device, engine=engine)
+        self.judge = judge_of(config.geometry, self.geometry)
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
@@ -146,8 +158,8 @@ class Surroundings:
     def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> Scenery:
         lines = {name: part.line_mm for name, part in parts.items()}
         beam, eye = parts[LASER], parts[ENDOSCOPE]
-        clearance = self.geometry.clearance(lines)
-        hit = self.geometry.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+        clearance = self.judge.clearance(lines)
+        hit = self.judge.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
         pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
         ring = (self.rings_mm[lesion], self.ring_normals[lesion])
         seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)
@@ -156,6 +168,13 @@ class Surroundings:
     def _beam(self, scenery: Scenery, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
         on = scenery.hit.on_organ & (scenery.hit.body == self.organ)
         return scenery.hit.point_mm, parts[LASER].tip_direction, on
+
+
+def judge_of(geometry: str, engine: BatchedScene) -> BatchedScene | RefereedScene:
+    """Who decides: the batched engine itself, or FCL about the same bodies and arms."""
+    if geometry == "batched":
+        return engine
+    return RefereedScene(engine.bodies, engine.radii_mm, engine.device)
 
 
 def _may_change(tensor: Tensor) -> bool:

@@ -10,11 +10,16 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import surgisoft
 from surgisoft.errors import InputError
+from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.collision import Referee
+from surgisoft.scene.refereed import RefereedScene
 from surgisoft.tasks.follow import FollowConfig
 from surgisoft.tasks.parallel import parallel_env
 from surgisoft.tasks.registry import TASKS
 from surgisoft.tasks.single import ONE_ARM, BatchedEnv, SingleEnv
 from surgisoft.tasks.track import TrackConfig
+from surgisoft.tasks.world_scene import PHANTOM
 
 SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
 every_task = pytest.mark.parametrize("name", TASKS)
@@ -53,6 +58,43 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
     for one, other in zip(run(), run(), strict=True):
         for a, b in zip(one, other, strict=True):
             assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("geometry", ["fcl", "batched"])
+def test_the_geometry_asked_for_decides(geometry, monkeypatch):
+    """Every clearance and hit of an episode is an answer of that engine, and of no other."""
+    env = surgisoft.parallel_env("circle_ablation", geometry=geometry)
+    around, asked = env.task.surroundings, []
+    referee = Referee(around.geometry.bodies)
+    assert isinstance(around.judge, RefereedScene if geometry == "fcl" else BatchedScene)
+    for name in ("clearance", "cast"):
+        ask = getattr(around.judge, name)
+        monkeypatch.setattr(
+            around.judge,
+            name,
+            lambda *a, ask=ask, name=name, **k: asked.append(name) or ask(*a, **k),
+        )
+    env.reset(seed=3)
+    env.step({agent: np.full(3, 2.0, np.float32) for agent in env.agents})
+    assert asked.count("clearance") == 2
+    arms, scenery = env._state.world.arms, env._state.world.scenery
+    shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
+    exact = referee.clearance(shapes).least_mm
+    near = {"fcl": 1e-4, "batched": 0.5}[geometry]
+    assert scenery.clearance.least_mm.item() == pytest.approx(exact, abs=near)
+
+
+def test_scene_and_arm_are_named_in_one_call(tmp_path):
+    with pytest.raises(InputError, match="there is no such scene"):
+        surgisoft.parallel_env("circle_ablation", scene=tmp_path / "none")
+    with pytest.raises(InputError, match="no arm model there"):
+        surgisoft.parallel_env("track_circle", arm=tmp_path / "none")
+    with pytest.raises(InputError, match="this task has no scene"):
+        surgisoft.parallel_env("track_circle", scene=tmp_path)
+    with pytest.raises(InputError, match=r"embree.*batched, fcl"):
+        surgisoft.parallel_env("circle_ablation", geometry="embree")
+    env = surgisoft.parallel_env("circle_ablation", scene=PHANTOM, arm="default")
+    assert env.task.spec.name == "phantom_liver"
 
 
 def test_agents_leave_when_the_time_is_out():

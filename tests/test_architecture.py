@@ -14,10 +14,10 @@ MAY_IMPORT = {
     "measurement": {"surrogate"},
     "measurement/rig": {"measurement"},
     "diagnosis": {"surrogate", "measurement", "report"},
-    "studies": {"surrogate", "measurement", "diagnosis"},
+    "studies": {"surrogate", "measurement", "diagnosis", "report"},
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
-    "agents": {"scene", "surrogate", "measurement", "tasks"},
+    "agents": {"scene", "surrogate", "measurement", "tasks", "report"},
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
@@ -29,6 +29,7 @@ MAY_IMPORT = {
         "diagnosis",
         "studies",
         "replay",
+        "report",
     },
 }
 """What each part may import beside itself and the ground; the nearest folder's row counts."""

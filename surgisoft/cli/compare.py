@@ -9,6 +9,12 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.errors import InputError
+
+AXES_SHOWN = 5
+"""Axes that the terminal lists; the page and the JSON file have all of them."""
+LEAST_SHOWN = 0.02
+"""Smallest share of the error for which the terminal lists an axis."""
 
 
 @app.command()
@@ -22,17 +28,23 @@ def compare(
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write pictures of loops, bodies and errors here."),
+        typer.Option(metavar="DIR", help="Write report.html and its pictures here."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Write both bodies for the Rerun viewer here."),
     ] = None,
 ) -> None:
-    """Compare an arm model with measurements: the error, and where it sits."""
+    """Compare an arm model with measurements: the error, and what it depends on."""
+    check_free(json_file, "rmse_mm")
+    check_folder(report)
+    _check_replay(replay)
+
     from surgisoft.diagnosis.compare import compare as compare_model
     from surgisoft.measurement.histories import outside_range
     from surgisoft.measurement.recording import load_recordings
     from surgisoft.surrogate.checkpoint import load_model
 
-    check_free(json_file, "rmse_mm")
-    check_folder(report)
     arm = load_model(model)
     measured = load_recordings(
         recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
@@ -40,42 +52,73 @@ def compare(
     result, rest = compare_model(arm, measured)
     for note in outside_range(arm.spec, measured):
         typer.echo(f"surgisoft: warning: {note}", err=True)
-    if json_file:
-        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+    print(result.sentence)
     print(arm.summary())
     _show(result)
+    if json_file:
+        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+    title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
     if report:
+        from surgisoft.diagnosis.compare_page import compare_page
         from surgisoft.diagnosis.pictures import draw_all
+        from surgisoft.report import write_page
 
         backbone = arm.backbone() if arm.spec.key_points > 1 else None
-        title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
-        for path in draw_all(rest, backbone, arm.spec.unit, report, title):
+        drawn = draw_all(rest, backbone, arm.spec.unit, report, title)
+        page = compare_page(result, rest, title, arm.summary(), drawn)
+        for path in [write_page(page, report / "report.html"), *drawn]:
             print(f"wrote {path}")
+    if replay:
+        from surgisoft.replay.comparison import write_comparison
+
+        points = (rest.measured_mm, rest.predicted_mm)
+        write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
+        print(f"wrote {replay}")
+
+
+def _check_replay(path: Path | None) -> None:
+    """Say before the work what would stop it after."""
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .rrd")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a file to write")
+    check_folder(path.parent)
 
 
 def _show(result) -> None:
-    floor = result.floor
-    known = "unknown" if floor.rmse_mm is None else f"{floor.rmse_mm:.4f} mm (from {floor.source})"
     tip = f"tip {result.tip_rmse_mm:.4f} mm"
     if math.isnan(result.tip_rmse_mm):
         tip = "tip not measured"
     print(
-        f"RMSE {result.rmse_mm:.4f} mm, {tip}, noise floor {known}, "
-        f"{result.samples} samples"
+        f"RMSE {result.rmse_mm:.4f} mm, {tip}, {_floor(result)}, {result.samples} samples"
         + (f", {result.missing} rows without key points" if result.missing else "")
     )
-    print(f"MSE of a coordinate {result.mse_mm2:.5f} mm2")
+    parts = ", ".join(f"{name} {value:.4f}" for name, value in result.components_mm.items())
+    print(f"MSE of a coordinate {result.mse_mm2:.5f} mm2; RMS {parts} mm")
     points = " ".join(
         "-" if math.isnan(value) else f"{value:.4f}" for value in result.per_key_point_mm
     )
     print(f"key points base to tip: {points} mm")
-    axis = None
-    for band in result.bands:
-        name = "" if band.axis == axis else band.axis
-        axis = band.axis
-        print(f"  {name:12s} {band.label:28s} {band.rmse_mm:8.4f} mm {band.samples:8d} samples")
+    if result.time_shift is not None:
+        low, high = result.time_shift.ci95_s
+        shift = result.time_shift.seconds
+        print(f"the arm trails the model by {shift:.3f} s ({low:.3f} .. {high:.3f})")
+    for each in result.axes[:AXES_SHOWN]:
+        if each.share >= LEAST_SHOWN:
+            counted = "alone" if each.static else "beyond actuation"
+            low, high = (f"{100 * value:.0f}" for value in each.ci95)
+            share = f"{100 * each.share:3.0f} % ({low} .. {high})"
+            print(f"  {each.axis:16s} explains {share:16s} {counted}")
     for moment in result.worst:
         print(
             f"  worst: {moment.error_mm:.3f} mm at key point {moment.key_point}, "
             f"{moment.recording} t = {moment.t_s:.2f} s"
         )
+
+
+def _floor(result) -> str:
+    if result.floor.rmse_mm is None:
+        return "noise floor unknown"
+    return f"noise floor {result.floor.rmse_mm:.4f} mm (from {result.floor.source})"

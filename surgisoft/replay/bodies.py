@@ -1,4 +1,4 @@
-"""Soft arms that move: short cylinders along the centreline, with bands at the key points."""
+"""Soft arms that move: short sleeves along the centreline, with bands at the key points."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ import rerun as rr
 
 from surgisoft.replay.colours import ARM_COLOURS, BAND_COLOURS, CHARRED, SHAFT_COLOUR
 from surgisoft.replay.recording import Columns
+from surgisoft.replay.shapes import tube
 from surgisoft.scene import frames
 from surgisoft.tasks.episode_parts import ArmLog
 
 BORE_MM = 1.5
-"""Radius of the dark mark on the tip: the paper's arm has a channel 3 mm across (mm)."""
+"""Radius of the channel in the tip: the paper's is 3 mm across (mm)."""
 BAND_MM = 1.4
 """Length of the band at a key point (mm)."""
+TIP_MM = 1.2
+"""Length of the bevelled end (mm)."""
+SOCKET_MM = 3.0
+"""What stands behind an arm that has no shaft (mm)."""
+SIDES = 40
+"""Corners of a sleeve's section."""
 SOLID = rr.components.FillMode.Solid
 
 
@@ -22,27 +29,21 @@ def log_arm(columns: Columns, name: str, arm: ArmLog, rows: np.ndarray) -> None:
     colour = ARM_COLOURS.get(name, ARM_COLOURS["arm"])
     band = BAND_COLOURS.get(name, BAND_COLOURS["arm"])
     radius, base = arm.radius_mm, arm.mount[:3, 3]
-    if arm.shaft_mm > 0.0:
-        behind = base - arm.shaft_mm * arm.mount[:3, 2]
-        _log_rod(columns.recording, f"/arms/{name}/shaft", behind, base, 1.02 * radius)
+    behind = base - max(arm.shaft_mm, SOCKET_MM) * arm.mount[:3, 2]
+    _log_rod(columns.recording, f"/arms/{name}/shaft", behind, base, 1.02 * radius)
     body = arm.line_mm[rows][:, 1 if arm.shaft_mm > 0.0 else 0 :]
-    log_cylinders(columns, f"/arms/{name}/body", rows, *joined(body, radius), radius, colour)
+    _log_sleeves(columns, f"/arms/{name}/body", rows, body, radius, colour)
+    tip, aim = arm.points_mm[rows][:, -1], arm.tip_direction[rows]
+    _log_tip(columns, f"/arms/{name}/tip", rows, tip, aim, radius, colour)
     middles, axes = key_planes(arm.points_mm[rows], body)
-    # The bands at the ends stay short of the ends, so that each face is drawn by one body only.
+    # The bands at the ends stay short of them, so that each face is drawn by one body only.
     middles[:, 0] += 0.7 * BAND_MM * axes[:, 0]
-    middles[:, -1] -= 0.7 * BAND_MM * axes[:, -1]
-    lengths = np.full(middles.shape[:2], BAND_MM)
-    ends = (middles, axes, lengths)
-    log_cylinders(columns, f"/arms/{name}/key_points", rows, *ends, 1.03 * radius, band)
-    tip, aim = arm.points_mm[rows][:, -1:], arm.tip_direction[rows][:, None]
-    mark = (tip, aim, np.full((len(rows), 1), 0.3))
-    log_cylinders(columns, f"/arms/{name}/tip", rows, *mark, BORE_MM, CHARRED)
+    middles[:, -1] -= 1.5 * BAND_MM * axes[:, -1]
+    _log_bands(columns, f"/arms/{name}/key_points", rows, middles, axes, 1.03 * radius, band)
     if not np.array_equal(arm.seen_mm, arm.points_mm):
-        seen = arm.seen_mm[rows]
+        seen, entity = arm.seen_mm[rows], f"/arms/{name}/measured"
         positions = rr.Points3D.columns(positions=seen.reshape(-1, 3))
-        columns.send(
-            f"/arms/{name}/measured", rows, positions.partition([seen.shape[1]] * len(rows))
-        )
+        columns.send(entity, rows, positions.partition([seen.shape[1]] * len(rows)))
 
 
 def joined(line_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -72,17 +73,69 @@ def key_planes(points_mm: np.ndarray, line_mm: np.ndarray) -> tuple[np.ndarray, 
     return points_mm.copy(), frames.normalise(ahead)
 
 
-def log_cylinders(
-    columns: Columns, entity: str, rows, middles, axes, lengths, radius_mm: float, colour
+def _log_sleeves(
+    columns: Columns, entity: str, rows, line_mm: np.ndarray, radius_mm: float, colour
 ) -> None:
-    """Cylinders (R, C, ...) of one radius and colour, in the log's `rows` (R,)."""
+    """The body along lines (R, K, 3): one open sleeve, drawn K - 1 times in each row."""
+    middles, axes, lengths = joined(line_mm, radius_mm)
+    middles[:, -1] -= 0.5 * TIP_MM * axes[:, -1]
+    lengths[:, -1] -= TIP_MM
+    vertices, faces, normals = _sleeve(radius_mm)
+    still = rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=faces,
+        vertex_normals=normals,
+        albedo_factor=colour,
+    )
+    columns.recording.log(entity, still, static=True)
+    scales = np.ones((lengths.size, 3))
+    scales[:, 2] = lengths.reshape(-1)
+    poses = rr.InstancePoses3D.columns(
+        translations=middles.reshape(-1, 3),
+        quaternions=turns_from_z(axes.reshape(-1, 3)),
+        scales=scales,
+    )
+    columns.send(entity, rows, poses.partition([lengths.shape[1]] * len(rows)))
+
+
+def _sleeve(radius_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and normals of an open cylinder of length 1 about the origin, along z."""
+    around = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    out = np.stack((np.cos(around), np.sin(around), 0.0 * around), axis=1)
+    half = np.array([0.0, 0.0, 0.5])
+    vertices = np.concatenate((radius_mm * out - half, radius_mm * out + half))
+    a, b = np.arange(SIDES), np.roll(np.arange(SIDES), -1)
+    faces = np.concatenate((np.stack((a, b, b + SIDES), 1), np.stack((a, b + SIDES, a + SIDES), 1)))
+    return vertices, faces, np.concatenate((out, out))
+
+
+def _log_tip(columns: Columns, entity: str, rows, tip_mm, aim, radius_mm: float, colour) -> None:
+    """The bevelled end with its channel, at tips (R, 3) mm along (R, 3)."""
+    line = np.array([[0.0, 0.0, -1.5 * TIP_MM], [0.0, 0.0, -0.5 * TIP_MM], [0.0, 0.0, 0.0]])
+    vertices, faces, normals = tube(line, radius_mm, BORE_MM)
+    hole = np.linalg.norm(vertices[:, :2], axis=1) <= 1.01 * BORE_MM
+    hole &= vertices[:, 2] > -1.2 * BORE_MM
+    colours = np.where(hole[:, None], CHARRED, colour).astype(np.uint8)
+    still = rr.Mesh3D(
+        vertex_positions=vertices,
+        triangle_indices=faces,
+        vertex_normals=normals,
+        vertex_colors=colours,
+    )
+    columns.recording.log(entity, still, static=True)
+    poses = rr.InstancePoses3D.columns(translations=tip_mm, quaternions=turns_from_z(aim))
+    columns.send(entity, rows, poses)
+
+
+def _log_bands(columns: Columns, entity: str, rows, middles, axes, radius_mm: float, colour):
+    """A short cylinder at each key point: middles and axes (R, n, 3)."""
     count = middles.shape[1]
-    still = rr.Cylinders3D.from_fields(radii=radius_mm, colors=colour, fill_mode=SOLID)
+    still = rr.Cylinders3D.from_fields(
+        lengths=BAND_MM, radii=radius_mm, colors=colour, fill_mode=SOLID
+    )
     columns.recording.log(entity, still, static=True)
     moving = rr.Cylinders3D.columns(
-        lengths=lengths.reshape(-1),
-        centers=middles.reshape(-1, 3),
-        quaternions=turns_from_z(axes.reshape(-1, 3)),
+        centers=middles.reshape(-1, 3), quaternions=turns_from_z(axes.reshape(-1, 3))
     )
     columns.send(entity, rows, moving.partition([count] * len(rows)))
 

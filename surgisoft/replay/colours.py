@@ -14,6 +14,8 @@ BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196
 """The bands that mark an arm's key points."""
 SHAFT_COLOUR = (88, 94, 102)
 LESION_COLOUR = (214, 172, 118)
+LESION_TINT = 0.35
+"""How far tissue inside the ring goes from the organ's colour to the lesion's."""
 PLAN_COLOUR = (255, 214, 64)
 """Where something should be: ring, path, target."""
 REAL_COLOUR = (70, 225, 240)
@@ -52,10 +54,11 @@ def paler(colour: tuple[int, int, int], share: float = 0.5) -> tuple[int, int, i
     return tuple(round(share * part + (1.0 - share) * 40) for part in colour)
 
 
-def tissue_colours(heat: np.ndarray, base: tuple[int, int, int]) -> np.ndarray:
+def tissue_colours(heat: np.ndarray, base: np.ndarray | tuple[int, int, int]) -> np.ndarray:
     """(V, 4) uint8 of tissue at `heat` (V,), its dose as a share of the threshold of ablation.
 
-    It turns pale on the way to the threshold and is charred beyond.
+    `base` (3,) or (V, 3) is its colour untouched. It turns pale on the way to the threshold and is
+    charred beyond.
     """
     share = np.clip(heat, 0.0, 1.0)[:, None]
     colour = np.array(base) + (np.array(BLANCHED) - np.array(base)) * share

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from surgisoft.scene import frames
+from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.render import corner_normals
 from surgisoft.tasks.episode_parts import DoseLog
@@ -37,6 +38,9 @@ class DosedSurface:
     samples: np.ndarray
     """(V, NEIGHBOURS) samples of the dose that each vertex takes the mean of; P for none."""
 
+    inside: np.ndarray
+    """(V,) bool: inside the ring, so of the lesion."""
+
     def heat(self, dose: np.ndarray, threshold: float) -> np.ndarray:
         """(V,) dose at the vertices as a share of the threshold, for doses (P,), J/mm^2."""
         padded = np.append(dose, 0.0) / threshold
@@ -63,7 +67,9 @@ def dosed_surface(mesh: Mesh, dose: DoseLog, edge_mm: float = EDGE_MM) -> DosedS
         count += made.shape[0] * made.shape[1]
     points, normals = np.moveaxis(np.concatenate(vertices), 1, 0)
     _, samples = tree.query(points, NEIGHBOURS, distance_upper_bound=NEAR_MM)
-    return DosedSurface(points, np.concatenate(faces), frames.normalise(normals), replaced, samples)
+    inside = np.append(dose.zone == LESION, False)[samples[:, 0]]
+    faces = np.concatenate(faces)
+    return DosedSurface(points, faces, frames.normalise(normals), replaced, samples, inside)
 
 
 def _longest(pieces: np.ndarray) -> np.ndarray:

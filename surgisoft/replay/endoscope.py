@@ -9,11 +9,12 @@ import numpy as np
 import rerun as rr
 from scipy.spatial import cKDTree
 
-from surgisoft.replay.colours import CONE_COLOUR
+from surgisoft.replay.colours import CONE_COLOUR, LESION_TINT
 from surgisoft.replay.recording import Columns
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.render import Renderer
 from surgisoft.tasks.episode import EpisodeLog
@@ -28,6 +29,10 @@ PICTURES_HZ = 2.5
 JPEG_QUALITY = 82
 FRUSTUM_MM = 16.0
 """Length of the drawn frustum (mm)."""
+LESION_LINEAR = np.array([0.62, 0.34, 0.16])
+BLANCHED_LINEAR = np.array([0.62, 0.50, 0.42])
+CHARRED_LINEAR = np.array([0.015, 0.012, 0.010])
+"""Linear colours of tissue in the picture."""
 SAMPLE_MM = 0.4
 """A pixel takes its dose from a sample within this distance (mm)."""
 
@@ -90,7 +95,7 @@ def _visible_beam(log: EpisodeLog, row: int) -> np.ndarray | None:
 
 
 class _Paint:
-    """Colours the organ in the picture by the dose of a row."""
+    """Colours the organ in the picture: the lesion by its tint, and all by the dose of a row."""
 
     def __init__(self, log: EpisodeLog):
         self.dose = log.dose
@@ -98,23 +103,21 @@ class _Paint:
             self.tree = cKDTree(self.dose.points_mm)
             self.low = self.dose.points_mm.min(axis=0) - SAMPLE_MM
             self.high = self.dose.points_mm.max(axis=0) + SAMPLE_MM
+            self.tint = LESION_TINT * np.append(self.dose.zone == LESION, False)[:, None]
 
     def at(self, row: int):
-        """For `Renderer.image`; None before anything has got a dose."""
+        """For `Renderer.image`."""
         if self.dose is None:
             return None
-        dose = self.dose.at(row)
-        if not dose.any():
-            return None
-        share = np.append(dose / self.dose.threshold_j_per_mm2, 0.0)
-        blanched, charred = np.array([0.62, 0.50, 0.42]), np.array([0.015, 0.012, 0.010])
+        share = np.append(self.dose.at(row) / self.dose.threshold_j_per_mm2, 0.0)[:, None]
 
         def recolour(_faces, points, colours):
-            heat = np.zeros((len(points), 1))
             near = ((points >= self.low) & (points <= self.high)).all(axis=1)
             _, sample = self.tree.query(points[near], distance_upper_bound=SAMPLE_MM)
-            heat[near, 0] = share[sample]
-            pale = colours + (blanched - colours) * np.clip(heat, 0.0, 1.0)
-            return np.where(heat >= 1.0, charred, pale)
+            heat, base = share[sample], colours[near]
+            base = base + (LESION_LINEAR - base) * self.tint[sample]
+            pale = base + (BLANCHED_LINEAR - base) * np.clip(heat, 0.0, 1.0)
+            colours[near] = np.where(heat >= 1.0, CHARRED_LINEAR, pale)
+            return colours
 
         return {self.dose.body: recolour}

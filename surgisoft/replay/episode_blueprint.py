@@ -92,12 +92,14 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
 
 
 def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
-    """Where the 3D view looks from and to (3,) mm: all soft arms and the work in it.
+    """Where the 3D view looks from and to (3,) mm: the arms and the work in it.
 
     With two arms it looks across both, from the side that the lesion faces; a lone arm is seen
     from the front, a little from above.
     """
-    lines = [arm.line_mm[:, 1 if arm.shaft_mm > 0.0 else 0 :] for arm in log.arms.values()]
+    alone = len(log.arms) == 1
+    lines = [arm.line_mm for arm in log.arms.values()]
+    lines = [line[:, 0 if alone else line.shape[1] // 3 :] for line in lines]
     points = [line[np.isfinite(line).all((1, 2))].reshape(-1, 3) for line in lines]
     work = log.path_mm if len(log.path_mm) else log.target_mm
     points = np.concatenate((*points, work[np.isfinite(work).all(1)]))

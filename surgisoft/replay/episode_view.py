@@ -13,6 +13,8 @@ import rerun as rr
 from surgisoft.replay.bodies import log_arm
 from surgisoft.replay.colours import (
     BEAM_COLOUR,
+    LESION_COLOUR,
+    LESION_TINT,
     PLAN_COLOUR,
     REAL_COLOUR,
     ROLE_COLOURS,
@@ -129,8 +131,10 @@ def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) ->
     moments = np.union1d(finite_rows(log, DOSE_HZ), [0])
     before = np.searchsorted(log.dose.rows, moments, side="right")
     rows = moments[np.diff(before, prepend=-1) > 0]
+    tint = LESION_TINT * surface.inside[:, None]
+    untouched = (1.0 - tint) * np.array(base) + tint * np.array(LESION_COLOUR)
     colours = [
-        tissue_colours(surface.heat(log.dose.at(int(row)), log.dose.threshold_j_per_mm2), base)
+        tissue_colours(surface.heat(log.dose.at(int(row)), log.dose.threshold_j_per_mm2), untouched)
         for row in rows
     ]
     count = len(surface.vertices_mm)

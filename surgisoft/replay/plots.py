@@ -57,8 +57,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     others = {name: values for name, values in log.measures.items() if name not in taken}
     made = [Plot("Path error (mm)", _lines("error", errors), _corner(errors, "righttop"))]
     for name, arm in log.arms.items():
-        title = f"Pressure of {name} (kPa), thin: commanded"
-        made.append(Plot(title, _pressures(name, arm)))
+        made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm)))
     if shares:
         title = "Ring cut, ring in sight (share)"
         made.append(Plot(title, _lines("share", shares), "rightbottom"))

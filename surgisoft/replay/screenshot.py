@@ -36,11 +36,12 @@ def take_screenshot(
     view: str | None = None,
     cursor: tuple[str, float] | None = None,
     size: tuple[int, int] = WINDOW,
+    wait_s: float = NOTICES_S,
 ) -> None:
     """Draw an .rrd file into a .png: one view by its name, or the whole window.
 
     `cursor` is a timeline and the place on it, s or a whole number; `size` the window in points,
-    two pixels each for the whole window, at most `size[0]` wide in the file.
+    which are pixels of the file; before it, `wait_s` for the viewer's notices to go.
     """
     picture = Path(picture)
     if picture.suffix.lower() != ".png":
@@ -51,10 +52,10 @@ def take_screenshot(
     arguments = (str(recording), "--bind", LOCAL, "--port", str(port), "--headless")
     with running(*arguments, "--window-size", f"{size[0]}x{size[1]}") as viewer:
         wait_for_port(viewer, port)
-        write_atomically(picture, _draw(port, view, cursor, max(size)))
+        write_atomically(picture, _draw(port, view, cursor, max(size), wait_s))
 
 
-def _draw(port: int, view: str | None, cursor, max_size: int) -> bytes:
+def _draw(port: int, view: str | None, cursor, max_size: int, wait_s: float) -> bytes:
     """Ask the running viewer for the picture, once its views are there and their data have come."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -73,7 +74,7 @@ def _draw(port: int, view: str | None, cursor, max_size: int) -> bytes:
         if cursor is not None:
             place = {"sequence" if isinstance(cursor[1], int) else "duration": cursor[1]}
             client.set_time(cursor[0], **place, play_state="paused")
-        time.sleep(NOTICES_S)
+        time.sleep(wait_s)
         shown = None if view is None else found
         picture, before = client.take_screenshot(shown, max_size=max_size), b""
         while picture != before and time.monotonic() < end:

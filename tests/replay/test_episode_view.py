@@ -1,0 +1,276 @@
+"""A real cut as a replay: what is in the file is what is in the log, and it can be seen."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.replay.bodies import TIP_MM, joined, turns_from_z
+from surgisoft.replay.colours import (
+    BLANCHED,
+    CHARRED,
+    LESION_COLOUR,
+    LESION_TINT,
+    ROLE_COLOURS,
+    tissue_colours,
+)
+from surgisoft.replay.dosed_surface import dosed_surface
+from surgisoft.replay.endoscope import CAMERA, PIXELS
+from surgisoft.replay.episode_view import write_replay
+from surgisoft.replay.screenshot import take_screenshot
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.rays import EmbreeSurface
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.episode import EpisodeRecorder
+from surgisoft.tasks.episode_file import save_episode
+from surgisoft.tasks.registry import make_task
+from tests.replay.reading import column, entities
+
+STEPS = 46
+
+
+def recorded(name: str, steps: int, seed: int = 4):
+    """The first steps of a scripted episode."""
+    task = make_task(name)
+    with torch.inference_mode():
+        play = Episodes(task)
+        state = play.seeded(seed, 1)
+        recorder = EpisodeRecorder(task, state, driver="scripted", seed=seed)
+        for _ in range(steps):
+            actions = task.script(state)
+            state, outcome = play.step(state, actions, in_place=True)
+            recorder.step(state, outcome, actions)
+    return recorder.log()
+
+
+@pytest.fixture(scope="module")
+def log():
+    return recorded("circle_ablation", STEPS)
+
+
+@pytest.fixture(scope="module")
+def replay(log, tmp_path_factory):
+    return write_replay(log, tmp_path_factory.mktemp("replay") / "cut.rrd")
+
+
+def test_plots_hold_every_step_of_the_log(log, replay):
+    for name, arm in log.arms.items():
+        for i in range(3):
+            held = column(replay.path, f"/plots/pressure/{name}/p{i + 1}", "Scalars:scalars")
+            assert list(held) == list(range(log.rows))
+            np.testing.assert_allclose(np.ravel([*held.values()]), arm.pressure_kPa[:, i])
+    for entity, values in (
+        ("clearance/clearance_mm", log.clearance_mm),
+        ("share/completion", log.measures["completion"]),
+        ("error/beam_error_mm", log.measures["beam_error_mm"]),
+        ("reward/laser/aim", log.rewards["laser"]["aim"]),
+        ("reward/endoscope/view", log.rewards["endoscope"]["view"]),
+    ):
+        held = column(replay.path, f"/plots/{entity}", "Scalars:scalars")
+        known = np.flatnonzero(np.isfinite(values))
+        assert list(held) == known.tolist()
+        np.testing.assert_allclose(np.ravel([*held.values()]), values[known])
+
+
+def test_both_timelines_tell_the_same_moment(log, replay):
+    entity = "/plots/clearance/clearance_mm"
+    seconds = column(replay.path, entity, "Scalars:scalars", "time")
+    np.testing.assert_allclose(np.array([*seconds]) * 1e-9, log.time_s, atol=1e-9)
+
+
+def test_bodies_beam_and_camera_stand_where_the_log_says(log, replay):
+    for name, arm in log.arms.items():
+        centres = column(replay.path, f"/arms/{name}/body", "InstancePoses3D:translations")
+        turns = column(replay.path, f"/arms/{name}/body", "InstancePoses3D:quaternions")
+        scales = column(replay.path, f"/arms/{name}/body", "InstancePoses3D:scales")
+        assert list(centres) == list(range(log.rows))
+        row = STEPS // 2
+        axis = Rotation.from_quat(turns[row][-1]).apply([0.0, 0.0, 1.0])
+        end = np.array(centres[row][-1]) + (0.5 * scales[row][-1][2] + TIP_MM) * axis
+        np.testing.assert_allclose(end, arm.line_mm[row, -1], atol=1e-3)
+    beam = column(replay.path, "/beam", "LineStrips3D:strips")
+    radii = column(replay.path, "/beam", "LineStrips3D:radii")
+    for row in range(log.rows):
+        np.testing.assert_allclose(beam[row][0][0], log.arms["laser"].line_mm[row, -1], atol=1e-4)
+        np.testing.assert_allclose(beam[row][0][1], log.beam.end_mm[row], atol=1e-4)
+        assert (radii[row][0] > 0.2) == log.beam.on[row]
+    eyes = column(replay.path, CAMERA, "Transform3D:translation")
+    tips = log.arms["endoscope"].line_mm[:, -1]
+    np.testing.assert_allclose(np.array([eyes[row][0] for row in range(log.rows)]), tips, atol=1e-4)
+    events = column(replay.path, "/events", "TextLog:text", "time")
+    assert len(events) == len({event.time_s for event in log.events})
+    assert "lesion in sight" in str(events)
+
+
+def test_the_real_path_is_drawn_where_the_beam_burnt(log, replay):
+    pieces = column(replay.path, "/path/real", "LineStrips3D:strips")
+    burning = np.flatnonzero(log.beam.on[1:] & log.beam.on[:-1]) + 1
+    assert list(pieces) == burning.tolist()
+    for row in burning:
+        np.testing.assert_allclose(pieces[row][0], log.beam.end_mm[row - 1 : row + 1], atol=1e-4)
+
+
+def test_the_organ_is_charred_where_it_was_burnt(log, replay):
+    entity = f"/bodies/{log.dose.body}/dose"
+    vertices = np.array(column(replay.path, entity, "Mesh3D:vertex_positions")[-1])
+    vertices = vertices.reshape(-1, 3)
+    colours = column(replay.path, entity, "Mesh3D:vertex_colors")
+    rows = sorted(colours)
+    assert rows[0] == 0
+    assert 3 <= len(rows) <= 12  # only moments at which something changed
+
+    def red(row):
+        return np.array(colours[row], dtype=np.uint32) >> 24
+
+    untouched, tinted = ROLE_COLOURS["organ"][0], LESION_COLOUR[0]
+    assert set(red(0)) == {untouched, int(untouched + LESION_TINT * (tinted - untouched))}
+    middle = log.path_mm.mean(axis=0)
+    inside = np.linalg.norm(vertices - middle, axis=1) < 9.0
+    assert set(red(0)[inside]) == {max(red(0))}
+    assert set(red(0)[np.linalg.norm(vertices - middle, axis=1) > 12.0]) == {untouched}
+    last, dose = rows[-1], log.dose
+    burnt = dose.points_mm[dose.at(last) > 2.0 * dose.threshold_j_per_mm2]
+    assert len(burnt) > 20
+    away = np.linalg.norm(vertices[:, None] - burnt[None], axis=2).min(axis=1)
+    dark = red(last) == CHARRED[0]
+    assert dark[away < 0.1].mean() > 0.9
+    assert not dark[away > 1.0].any()
+
+
+def test_fine_triangles_are_the_faces_that_they_replace(log):
+    body = next(body for body in log.bodies if body.name == log.dose.body)
+    mesh = Mesh(body.vertices_mm, body.faces)
+    surface = dosed_surface(mesh, log.dose)
+    fine = Mesh(surface.vertices_mm, surface.faces)
+    whole = mesh.face_areas_mm2[surface.replaced].sum()
+    assert fine.face_areas_mm2.sum() == pytest.approx(whole, rel=1e-6)
+    facing = np.einsum("fk,fk->f", fine.face_normals, surface.normals[surface.faces].mean(axis=1))
+    assert np.all(facing > 0.0)
+    even = surface.heat(np.full(len(log.dose.points_mm), 3.0), 1.5)
+    assert set(np.round(even, 9)) == {0.0, 2.0}
+    start = surface.vertices_mm[::97] + 0.5 * surface.normals[::97]
+    distance, face = EmbreeSurface(mesh).first_hit(start, -surface.normals[::97], 2.0)
+    assert np.all(face >= 0)
+    np.testing.assert_allclose(distance, 0.5, atol=0.02)
+
+
+def test_endoscope_pictures_are_few_and_show_the_organ(log, replay):
+    files = column(replay.path, f"{CAMERA}/picture", "EncodedImage:blob")
+    assert 2.0 <= len(files) / log.time_s[-1] <= 3.0
+    picture = Image.open(io.BytesIO(bytes(files[max(files)][0])))
+    assert picture.size == (PIXELS, PIXELS)
+    red, green, _ = np.moveaxis(np.asarray(picture).astype(int), -1, 0)
+    assert ((red > 60) & (red > 1.5 * green)).mean() > 0.2
+    assert red[0, 0] < 10  # the corners of the round picture are black
+
+
+def test_a_replay_is_small(replay):
+    # The meshes count once; what comes on top a minute is less than 5 MB.
+    assert replay.megabytes < 1.6 + 5.0 * replay.duration_s / 60.0
+    assert "MB a minute" in str(replay)
+
+
+def test_an_arm_alone_has_no_scene_in_its_replay(tmp_path):
+    log = recorded("track_square", 20)
+    replay = write_replay(log, tmp_path / "square.rrd")
+    found = entities(replay.path)
+    assert {"/arms/arm/body", "/path/planned", "/path/real", "/plots/reward/arm/track"} <= found
+    assert not any(name.startswith(("/beam", "/bodies", "/endoscope")) for name in found)
+    target = column(replay.path, "/path/target", "Points3D:positions")
+    held = np.array([target[row][0] for row in range(log.rows)])
+    np.testing.assert_allclose(held, log.target_mm, atol=1e-4)
+
+
+def test_bent_tubes_have_no_gaps():
+    """Points just inside the skin of an arc's torus lie in one of its cylinders."""
+    angle, radius, bend = np.linspace(0.0, 1.2, 21), 7.5, 60.0
+    zero = 0.0 * angle
+    line = bend * np.stack((1.0 - np.cos(angle), zero, np.sin(angle)), axis=1)
+    middles, axes, lengths = (x[0] for x in joined(line[None], radius))
+    for at in np.linspace(0.05, 1.15, 301):
+        out = np.array([-np.cos(at), 0.0, np.sin(at)])
+        centre = bend * np.array([1.0 - np.cos(at), 0.0, np.sin(at)])
+        for side in (-1.0, 1.0):
+            point = centre + side * 0.985 * radius * out
+            along = np.einsum("ck,ck->c", point - middles, axes)
+            off = np.linalg.norm(point - middles - along[:, None] * axes, axis=1)
+            assert ((np.abs(along) <= 0.5 * lengths + 1e-9) & (off <= radius)).any()
+    start = middles[0] - 0.5 * lengths[0] * axes[0]
+    end = middles[-1] + 0.5 * lengths[-1] * axes[-1]
+    np.testing.assert_allclose((start, end), (line[0], line[-1]), atol=1e-9)
+
+
+def test_turns_bring_the_z_axis_onto_each_axis():
+    axes = np.random.default_rng(0).normal(size=(200, 3))
+    axes = np.vstack((axes / np.linalg.norm(axes, axis=1)[:, None], [[0, 0, -1], [0, 0, 1]]))
+    turned = Rotation.from_quat(turns_from_z(axes)).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(turned, axes, atol=1e-5)
+
+
+def test_tissue_pales_then_chars():
+    colours = tissue_colours(np.array([0.0, 0.999999, 1.0, 9.0]), (100, 50, 40))
+    np.testing.assert_array_equal(colours[0], (100, 50, 40, 255))
+    np.testing.assert_allclose(colours[1, :3], BLANCHED, atol=1)
+    np.testing.assert_array_equal(colours[2:, :3], (CHARRED, CHARRED))
+
+
+def test_the_replay_can_be_seen(log, replay, tmp_path):
+    """Rendered by the native viewer; the scene shows liver, arms, ring and beam."""
+    picture = tmp_path / "scene.png"
+    try:
+        end = ("time", float(log.time_s[-1]))
+        take_screenshot(replay.path, picture, "Scene", end, wait_s=0.5)
+    except InputError as error:
+        if "mesa-vulkan-drivers" in str(error):
+            pytest.skip(f"no driver to draw with: {error}")
+        raise
+    image = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    red, green, blue = np.moveaxis(image, -1, 0)
+    liver = (red > 50) & (red > 1.7 * green) & (red > 1.7 * blue)
+    silicone = (red > 120) & (np.abs(red - green) < 40) & (blue < green)
+    endoscope = (blue > 90) & (blue > 1.25 * red) & (blue > 1.05 * green)
+    beam = (green > 150) & (green > 1.5 * red) & (green > 1.3 * blue)
+    assert 0.1 < liver.mean() < 0.6
+    assert silicone.mean() > 0.02
+    assert endoscope.mean() > 0.02
+    assert beam.mean() > 1e-4
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 1000
+
+
+def test_the_command_finds_the_newest_and_says_what_is_wrong(log, replay, tmp_path, capsys):
+    def told(*arguments):
+        assert run(["replay", *map(str, arguments)]) == 2
+        return capsys.readouterr().err
+
+    run_folder = tmp_path / "run"
+    assert "no such file or folder" in told(run_folder)
+    (run_folder / "replays").mkdir(parents=True)
+    assert "holds no replay" in told(run_folder)
+    other = tmp_path / "notes.txt"
+    other.write_text("x")
+    assert "expected a replay" in told(other)
+    (tmp_path / "false.rrd").write_text("nothing")
+    assert "no Rerun recording" in told(tmp_path / "false.rrd")
+    assert "expected WIDTHxHEIGHT" in told(replay.path, "--size", "big")
+    assert "at most one" in told(replay.path, "--web", "--screenshot", tmp_path / "a.png")
+    assert "give --screenshot" in told(replay.path, "--time", "3")
+    picture = tmp_path / "a.png"
+    assert "expected 0 to 4.6 s" in told(replay.path, "--screenshot", picture, "--time", "99")
+    assert "replay already" in told(replay.path, "--save", tmp_path / "b.rrd")
+    assert not list(tmp_path.glob("a.png"))
+
+
+def test_a_log_becomes_a_replay_by_command(tmp_path, capsys):
+    path = tmp_path / "log.npz"
+    save_episode(recorded("laser_plane", 8), path)
+    began = time.perf_counter()
+    assert run(["replay", str(path), "--save", str(tmp_path / "log.rrd")]) == 0
+    assert time.perf_counter() - began < 20.0
+    assert "MB a minute" in capsys.readouterr().out
+    assert "/arms/arm/key_points" in entities(tmp_path / "log.rrd")

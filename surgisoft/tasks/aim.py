@@ -44,9 +44,14 @@ def body_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
 
     The shape is in lengths of 50 mm from the arm's nominal base.
     """
+    shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
+    return shape, *pressure_part(arm, part)
+
+
+def pressure_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
+    """Commands and measured pressures, -1..1 over the range, and directions of change, (B, m)."""
     half = 0.5 * (arm.high - arm.low)
     return (
-        ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1),
         (part.command - arm.low) / half - 1.0,
         (part.seen_kPa - arm.low) / half - 1.0,
         part.arm.direction,

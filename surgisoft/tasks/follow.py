@@ -13,18 +13,13 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.aim import pressure_part
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.paths import PATHS
-from surgisoft.tasks.solver import least_squares
+from surgisoft.tasks.seek import seek
 from surgisoft.tasks.streams import Stream
-from surgisoft.tasks.tree import rows, tree_map
+from surgisoft.tasks.walk import Round, fresh_round
 from surgisoft.tasks.world import World
-from surgisoft.tasks.world_arm import ArmPart
-
-STUCK_MM = 1e-3
-"""A solver that leaves more than this tries again (mm)."""
-OFFSETS_KPA = (1.0, -1.0)
-"""Where it begins then, beside the present pressures (kPa): beyond every dead band."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +55,6 @@ class FollowConfig:
                 raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
 
 
-@dataclass(frozen=True, eq=False)
-class Round:
-    """How a batch of episodes goes round."""
-
-    start: Tensor
-    """(B,) 0..1: share of the path where it begins."""
-    way: Tensor
-    """(B,) +1 or -1: which way round."""
-
-
 class Follow:
     """One arm in empty space, one of whose points follows a path."""
 
@@ -99,15 +84,11 @@ class Follow:
         self._rest = self.arm.model.rest_mm.to(centre_mm)
 
     def goal(self, stream: Stream) -> tuple[Stream, Round]:
-        stream, draw = stream.uniform(0.0, 1.0, 2)
-        if not self.config.any_start:
-            return stream, Round(torch.zeros_like(draw[:, 0]), torch.ones_like(draw[:, 0]))
-        return stream, Round(draw[:, 0], torch.where(draw[:, 1] < 0.5, 1.0, -1.0))
+        return fresh_round(stream, self.config.any_start)
 
     def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
         """(B, 3) mm, world frame: where the point should be `ahead` steps from now."""
-        walked = (state.world.steps + ahead - self.approach).clamp(min=0).float() / self.loop
-        share = state.goal.start + state.goal.way * walked
+        share = state.goal.share(state.world.steps + ahead, self.approach, self.loop)
         flat = self.config.size_mm * PATHS[self.config.path](share)
         return self.centre + torch.nn.functional.pad(flat, (0, 1))
 
@@ -127,13 +108,10 @@ class Follow:
         part = state.world.arms["arm"]
         point = self.marker(part.seen_mm)
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
-        half = 0.5 * (self.arm.high - self.arm.low)
         parts = [
             (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
             *(error.asinh() for error in errors),
-            (part.command - self.arm.low) / half - 1.0,
-            (part.seen_kPa - self.arm.low) / half - 1.0,
-            part.arm.direction,
+            *pressure_part(self.arm, part),
             2.0 * state.world.steps[:, None] / self.steps - 1.0,
         ]
         return {"arm": torch.cat(parts, 1)}
@@ -162,30 +140,10 @@ class Follow:
         return self.target_mm(state)[:, None], point[:, None]
 
     def script(self, state: TaskState) -> dict[str, Tensor]:
-        """Damped least squares for the pressures that put the point on the next target.
+        """Damped least squares for the pressures that put the point on the next target."""
 
-        The direction of change makes the arm jump where a chamber turns round, so where the solver
-        is stuck it tries again from pressures that turn all chambers one way or the other.
-        """
-        with torch.inference_mode(False):
-            part = tree_map(torch.clone, state.world.arms["arm"])
-            target = self.target_mm(tree_map(torch.clone, state), 1)
-            best, error = self._solved(part, target, 0.0)
-            stuck = (error > STUCK_MM).nonzero()[:, 0]
-            for offset in OFFSETS_KPA if len(stuck) else ():
-                tried, missed = self._solved(rows(part, stuck), target[stuck], offset)
-                better = missed < error[stuck]
-                best = best.index_copy(0, stuck, tried.where(better[:, None], best[stuck]))
-                error = error.index_copy(0, stuck, missed.where(better, error[stuck]))
-            return {"arm": self.arm.action_for(part, best, self.dt_s)}
-
-    def _solved(self, part: ArmPart, target: Tensor, offset: float) -> tuple[Tensor, Tensor]:
-        """Pressures (B, m) kPa for targets (B, 3) mm, sought from `offset` kPa off, and errors."""
-        low, high = self.arm.within_reach(part, self.dt_s)
-
-        def residual(pressure: Tensor) -> Tensor:
-            points = self.arm.foresee(part, pressure, self.dt_s)
+        def error(points: Tensor, target: Tensor) -> Tensor:
             return (self.marker(points) - target)[:, : self._directions]
 
-        pressure = least_squares(residual, part.pressure + offset, low, high)
-        return pressure, residual(pressure).norm(dim=1)
+        part, target = state.world.arms["arm"], self.target_mm(state, 1)
+        return {"arm": seek(self.arm, part, target, error, self.dt_s)}

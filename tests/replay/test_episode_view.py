@@ -131,7 +131,7 @@ def test_the_organ_is_charred_where_it_was_burnt(log, replay):
     untouched, tinted = ROLE_COLOURS["organ"][0], LESION_COLOUR[0]
     assert set(red(0)) == {untouched, int(untouched + LESION_TINT * (tinted - untouched))}
     middle = log.path_mm.mean(axis=0)
-    inside = np.linalg.norm(vertices - middle, axis=1) < 9.0
+    inside = np.linalg.norm(vertices - middle, axis=1) < 8.5
     assert set(red(0)[inside]) == {max(red(0))}
     assert set(red(0)[np.linalg.norm(vertices - middle, axis=1) > 12.0]) == {untouched}
     last, dose = rows[-1], log.dose

@@ -155,4 +155,4 @@ def _amplitudes(gram: np.ndarray, index: np.ndarray, ridge: float) -> np.ndarray
     normal = 0.5 * (normal + normal.T)
     size = np.sqrt(np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-30)))
     scaled = normal / size[:, None] / size[None] + ridge * np.eye(len(index))
-    return linalg.solve(scaled, gram[index, 0] / size, assume_a="pos") / size
+    return np.linalg.solve(scaled, gram[index, 0] / size) / size

@@ -17,7 +17,7 @@ from surgisoft.surrogate.model import ArmModel
 
 ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
-BLOCK_S = 20.0
+BLOCK_S = 10.0
 """Length of a block of time that is held out as a whole, s."""
 BLOCK_ROWS = 8
 """Fewest of the fitted rows in a block."""

@@ -25,9 +25,9 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 
-AROUND = 8
+AROUND = 16
 """Directions of the support that a diagnosis tries."""
-DEPTHS = (0.5, 0.8)
+DEPTHS = (0.5, 0.65, 0.8, 0.9)
 """Quantiles of the body's excursion at which it puts the support."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
@@ -74,15 +74,15 @@ class Contact(Memoryless):
         made = []
         if not len(points):
             return made
-        for point in sorted({n - 1, n // 2, max(n - 2, 0)}):
-            for turn in range(AROUND):
-                azimuth = 2 * math.pi * turn / AROUND
-                normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
-                out = points[:, point] @ normal
-                if float(out.max() - out.min()) <= 0.0:
-                    continue
-                for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
-                    made.append(cls(facts, point, azimuth, 0.0, offset))
+        point = max(n - 2, 0)
+        for turn in range(AROUND):
+            azimuth = 2 * math.pi * turn / AROUND
+            normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
+            out = points[:, point] @ normal
+            if float(out.max() - out.min()) <= 0.0:
+                continue
+            for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
+                made.append(cls(facts, point, azimuth, 0.0, offset))
         return made
 
     @property

@@ -1,0 +1,87 @@
+"""Held-out errors of sets of columns, against fitting each fold anew."""
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis import cross_validation
+from surgisoft.diagnosis.cross_validation import PERSISTENCE, RIDGES, ROOM, CrossValidation
+
+ROWS, POINTS, COLUMNS, BLOCKS = 120, 2, 3, 10
+
+
+@pytest.fixture
+def data():
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(ROWS, 6))
+    columns = rng.normal(size=(ROWS, POINTS, 3, COLUMNS))
+    residual = 0.3 * rng.normal(size=(ROWS, POINTS, 3)) + 0.8 * columns[..., 1]
+    residual += np.einsum("sf,fpc->spc", features, 0.1 * rng.normal(size=(6, POINTS, 3)))
+    residual[5, 1] = np.nan
+    residual[40:44, 0] = np.nan
+    block = np.arange(ROWS) * BLOCKS // ROWS
+    return features, residual, columns, block, np.arange(BLOCKS) % 5
+
+
+def brute(data, picked, rows, share, surrogate, noise):
+    """(B,) held-out sums of squares by joint ridge regression, fold by fold."""
+    features, residual, columns, block, fold = data
+    seen = np.isfinite(residual).all(2)
+    answer = np.zeros(BLOCKS)
+    mean = [np.square(residual[seen[:, k], k]).sum(1).mean() for k in range(POINTS)]
+    for number in range(5):
+        held = fold[block] == number
+        size = features.shape[1]
+        unknowns = POINTS * 3 * size + len(picked)
+        normal, right = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        parts = []
+        for k in range(POINTS):
+            ridge = (noise[k] ** 2 + rows * mean[k]) / (ROOM * surrogate[k]) ** 2
+            for c in range(3):
+                design = np.zeros((ROWS, unknowns))
+                first = (3 * k + c) * size
+                design[:, first : first + size] = features
+                design[:, POINTS * 3 * size :] = columns[:, k, c, picked]
+                fit = ~held & seen[:, k]
+                normal += design[fit].T @ design[fit]
+                normal[range(first, first + size), range(first, first + size)] += ridge
+                right += design[fit].T @ residual[fit, k, c]
+                parts.append((k, c, design))
+        # The ridge on amplitudes is a share of what the static part leaves of each column.
+        static, own = slice(0, POINTS * 3 * size), slice(POINTS * 3 * size, unknowns)
+        left = normal[own, own] - normal[own, static] @ np.linalg.solve(
+            normal[static, static], normal[static, own]
+        )
+        normal[own, own] += share * np.diag(np.diag(left))
+        solution = np.linalg.solve(normal, right)
+        for k, c, design in parts:
+            test = held & seen[:, k]
+            error = residual[test, k, c] - design[test] @ solution
+            answer += np.bincount(block[test], weights=error**2, minlength=BLOCKS)
+    return answer
+
+
+@pytest.mark.parametrize("picked", [[], [1], [0, 1, 2]])
+def test_losses_are_those_of_joint_fits(data, picked):
+    surrogate, noise = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    found = CrossValidation.of(*data, surrogate, noise)
+    shares = RIDGES if len(picked) > 1 else RIDGES[:1]
+    tried = [
+        brute(data, picked, rows, share, surrogate, noise)
+        for rows in PERSISTENCE
+        for share in shares
+    ]
+    assert found.losses(picked) == pytest.approx(min(tried, key=np.sum), rel=2e-4)
+
+
+def test_the_right_column_has_its_amplitude(data):
+    found = CrossValidation.of(*data, np.array([0.3, 0.5]), np.array([0.1, 0.1]))
+    assert found.amplitudes([1])[0] == pytest.approx(0.8, abs=0.1)
+    assert found.losses([1]).sum() < 0.3 * found.losses([]).sum()
+    assert found.losses([0]).sum() > 0.95 * found.losses([]).sum()
+
+
+def test_features_have_the_discrepancys_covariance():
+    rng = np.random.default_rng(1)
+    x, d = rng.uniform(-1, 1, (60, 3)), rng.choice([-1.0, 1.0], (60, 3))
+    features = cross_validation.static_features(x, d, number=60)
+    assert features @ features.T == pytest.approx(cross_validation.kernel(x, d, x, d), abs=1e-4)

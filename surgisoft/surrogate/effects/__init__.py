@@ -57,6 +57,7 @@ __all__ = [
     "Memoryless",
     "Quantity",
     "Stage",
+    "free_name",
     "known_effects",
     "make_effect",
     "named_effect",
@@ -92,10 +93,20 @@ def named_effect(given: str) -> str:
 
 
 def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
-    """The named effect for an arm."""
-    if name in EFFECTS:
-        return EFFECTS[name](facts, **config)
+    """The named effect for an arm; a model's second of a kind is named `kind#2`."""
+    kind = own.kind_of(name)
+    if kind in EFFECTS:
+        return EFFECTS[kind](facts, **config)
     known = known_effects()
-    if name not in known:
-        raise unknown_name("effect", name, known)
-    return known[name](facts, **config)
+    if kind not in known:
+        raise unknown_name("effect", kind, known)
+    return known[kind](facts, **config)
+
+
+def free_name(kind: str, taken) -> str:
+    """What a model that has the effects `taken` calls one more of a kind: `creep`, `creep#2`."""
+    number, name = 1, kind
+    while name in taken:
+        number += 1
+        name = f"{kind}#{number}"
+    return name

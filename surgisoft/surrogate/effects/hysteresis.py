@@ -25,6 +25,8 @@ from surgisoft.surrogate.scan import play_scan
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
 """Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
 the half range (a larger radius never moves)."""
+OTHERS = (0.0, -0.2, -0.4)
+"""Shares of the other chambers in a line that a diagnosis tries."""
 FEW_RADII = (0.04, 0.10, 0.22, 0.44, 0.74)
 """Radii where a diagnosis asks whether there is any play."""
 
@@ -41,11 +43,14 @@ class Hysteresis(Effect):
         radii: tuple[float, ...] = RADII,
         ring: bool = False,
         pairs: bool = True,
+        others: float = 0.0,
     ):
         """Radii of the plays, in units of half a line's range.
 
         ring: the chambers are alike and stand in a ring, so that one chamber's weights, turned,
-        are those of all; pairs: lines along pairs of neighbours beside those along one chamber.
+        are those of all; pairs: lines along pairs of neighbours beside those along one chamber;
+        others: share of the other chambers in each line to start from, negative where a chamber
+        that bends the arm shortens the wall on the other side.
         """
         super().__init__(facts)
         chambers = len(facts.low)
@@ -59,6 +64,10 @@ class Hysteresis(Effect):
         lines = first_lines(chambers)
         if not self.pairs:
             lines = lines[:chambers]
+        self.others = float(others)
+        if self.others:
+            lines = lines + self.others * (lines.sum(1, keepdim=True) - lines)
+            lines = lines / lines.abs().sum(1, keepdim=True)
         self.linear = nn.Parameter(lines)
         self.bent = nn.Parameter(lines.new_zeros(len(lines), chambers, chambers))
         if self.ring:
@@ -76,11 +85,11 @@ class Hysteresis(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        """Alike chambers, each with lines of its own, and with those of pairs too."""
-        return [
-            cls(facts, FEW_RADII, ring=True, pairs=False),
-            cls(facts, FEW_RADII, ring=True, pairs=True),
-        ][: 1 if len(facts.low) == 1 else 2]
+        """Alike chambers, whose lines are stretched the other way by the rest of them or not."""
+        if len(facts.low) == 1:
+            return [cls(facts, FEW_RADII, ring=True, pairs=False)]
+        alone = [cls(facts, FEW_RADII, True, False, others) for others in OTHERS]
+        return [*alone, cls(facts, FEW_RADII, True, True, OTHERS[1])]
 
     def use_chambers(self, use: Tensor) -> None:
         self.use.copy_(use)
@@ -144,7 +153,12 @@ class Hysteresis(Effect):
             return torch.cat([x.flatten(0, 1) for x in moved])
 
     def config(self) -> dict:
-        return {"radii": list(self.radii), "ring": self.ring, "pairs": self.pairs}
+        return {
+            "radii": list(self.radii),
+            "ring": self.ring,
+            "pairs": self.pairs,
+            "others": self.others,
+        }
 
     def quantities(self) -> list[Quantity]:
         weight = (self.turned[self.turns] if self.ring else self.weight).detach()

@@ -41,6 +41,7 @@ GRID = (
     (0.5, 2.0, 0.02),
     (0.2, 0.2, 0.2),
     (0.5, 1.0, 0.4),
+    (0.9, 3.3, 0.1),
 )
 """(filling, emptying, dead time) that a diagnosis tries, s."""
 

@@ -78,6 +78,11 @@ def register_effect_file(path: str | Path, taken=()) -> str:
     return name
 
 
+def kind_of(name: str) -> str:
+    """The kind of a model's effect: a second one of a kind is named `kind#2`."""
+    return name.split("#")[0]
+
+
 def offered() -> dict:
     """Entry points of effects in installed packages by name; none is loaded."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}
@@ -107,9 +112,9 @@ def _check(kind, label: str) -> None:
 def files_of(names) -> dict[str, dict]:
     """Path and hash of those named effects that came from files, for a checkpoint."""
     return {
-        name: {"path": FILES[name].path, "sha256": FILES[name].sha256}
-        for name in names
-        if name in FILES
+        kind: {"path": FILES[kind].path, "sha256": FILES[kind].sha256}
+        for kind in map(kind_of, names)
+        if kind in FILES
     }
 
 

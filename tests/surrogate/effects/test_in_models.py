@@ -5,7 +5,7 @@ import torch
 
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from surgisoft.surrogate.effects import STAGES, known_effects, make_effect
+from surgisoft.surrogate.effects import STAGES, free_name, known_effects, make_effect
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
@@ -50,6 +50,21 @@ def test_stepping_is_predicting_and_bit_equal_after_saving(names, tmp_path):
         dp = seen.pressure[:, t] - state.pressure
         state, points = arm.step(state, dp, dt[:, t], seen.temperature_C[:, t])
         assert torch.allclose(points, predicted[:, t], atol=2e-3)
+
+
+def test_two_effects_of_a_kind_act_in_one_model(tmp_path):
+    arm = model(("creep", "payload"))
+    facts = arm.facts
+    name = free_name("creep", arm.effects)
+    assert name == "creep#2"
+    assert free_name("creep", ("creep", "creep#2")) == "creep#3"
+    more = dict(arm.effects) | {name: stir(make_effect(name, facts), seed=8)}
+    twice = ArmModel(SPEC, arm.network, more, REST_MM, {"rmse_mm": 1.0})
+    save_model(twice.eval(), tmp_path / "arm")
+    again, seen = load_model(tmp_path / "arm"), history(1, 30)
+    assert list(again.effects) == ["creep", "creep#2", "payload"]
+    assert torch.equal(again.predict(seen), twice.predict(seen))
+    assert not torch.allclose(again.predict(seen), arm.predict(seen), atol=1e-3)
 
 
 def test_effects_act_in_the_order_of_the_chain():

@@ -129,6 +129,8 @@ class EpisodeRecorder:
         self._dose: list[tuple[np.ndarray, np.ndarray]] = []
         self._last_dose: np.ndarray | None = None
         self._mounts = {name: self._of(part.mount) for name, part in state.world.arms.items()}
+        lesion = state.world.scenery.lesion
+        self._lesion = 0 if lesion is None else int(self._of(lesion))
         self._ending = ""
         self._add(state, task.measures(state), {}, {})
 
@@ -169,7 +171,7 @@ class EpisodeRecorder:
             arms={name: self._arm(name, rows) for name in task.world.arms},
             targets_mm=rows["targets"],
             actuals_mm=rows["actuals"],
-            path_mm=np.zeros((0, 3), np.float32) if near is None else _array(near.path_mm),
+            path_mm=self._path(near),
             measures=_below(rows, "measures/"),
             rewards={agent: _below(rows, f"rewards/{agent}/") for agent in task.agents},
             limits={} if near is None else _limits(near),
@@ -246,8 +248,14 @@ class EpisodeRecorder:
             "bodies": tuple(_body(body) for body in near.geometry.bodies),
         }
 
+    def _path(self, near: Surroundings | None) -> np.ndarray:
+        """(M, 3) mm: the ring's path of this episode's lesion."""
+        if near is None:
+            return np.zeros((0, 3), np.float32)
+        return near.paths_mm[self._lesion].detach().cpu().numpy().copy()
+
     def _dose_log(self, near: Surroundings) -> DoseLog:
-        ablation, patch = near.ablation, near.ablation.patch
+        ablation, patch = near.ablation, near.ablation.patches[self._lesion]
         counts = np.array([len(sample) for sample, _ in self._dose])
         rows = np.flatnonzero(counts)
         samples, doses = zip(*self._dose, strict=True)
@@ -273,10 +281,6 @@ class EpisodeRecorder:
 
 _ARM_ROWS = ("command", "pressure", "points_mm", "seen_mm", "line_mm", "tip_direction")
 """What of a `world_arm.ArmPart` is kept in every row."""
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().copy()
 
 
 def _below(rows: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -9,12 +9,15 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.episode import EpisodeLog, EpisodeRecorder
 from surgisoft.tasks.episode_events import find_events
 from surgisoft.tasks.episode_file import load_episode, save_episode
 from surgisoft.tasks.episode_parts import ArmLog, BeamLog, DoseLog
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.tree import rows
+from surgisoft.tasks.world import WorldConfig
+from surgisoft.tasks.world_arm import Randomisation
 
 STEPS = 22
 
@@ -128,6 +131,23 @@ def test_the_recorder_follows_its_episode_in_a_batch_that_shrinks():
     assert one.beam is None
     assert one.dose is None
     assert one.arms["arm"].radius_mm == 7.5
+
+
+def test_each_episode_has_the_ring_of_its_own_lesion():
+    vary = Randomisation(lesion_mm=4.0, lesions=3)
+    task = make_task("circle_ablation", CircleAblationConfig(world=WorldConfig(randomisation=vary)))
+    with torch.inference_mode():
+        state = Episodes(task).seeded(1, 8)
+        logs = [EpisodeRecorder(task, state, i, driver="none", seed=1).log() for i in range(8)]
+    starts = {tuple(log.path_mm[0].round(3)) for log in logs}
+    assert len(starts) == 3
+    for log in logs:
+        # The target lies on the path, and so does the band that counts as the ring.
+        near = np.linalg.norm(log.path_mm - log.target_mm, axis=1).min()
+        assert near < 0.2
+        band = log.dose.points_mm[log.dose.zone == 1]
+        away = np.linalg.norm(band[::50, None] - log.path_mm, axis=2).min(axis=1)
+        assert away.max() < 1.1
 
 
 def test_steps_after_the_end_are_left_out():

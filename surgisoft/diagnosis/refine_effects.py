@@ -1,0 +1,81 @@
+"""Put named effects into a model, or fit those anew that it has, on a problem's rows."""
+
+import copy
+from dataclasses import dataclass
+
+from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.refine import Fit, free_parameters, refine
+from surgisoft.diagnosis.refine_intervals import Parameter, intervals
+from surgisoft.diagnosis.refine_large import refine_large
+from surgisoft.diagnosis.refine_start import starts
+from surgisoft.errors import InputError
+from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.model import ArmModel
+
+LARGE = 24
+"""Most free values of an effect that are all fitted; of more, the strengths are."""
+FIRST_ITERATIONS = 4
+"""Steps from each start before the best of them goes on."""
+ROUNDS = 2
+"""Rounds in turns where effects with few and with many values are fitted together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model with effects fitted to a problem."""
+
+    model: ArmModel
+    """A model of its own: nothing is shared with the one that it came from."""
+    parameters: tuple[Parameter, ...]
+    """What was fitted, in physical units with intervals."""
+    refitted: tuple[str, ...]
+    """Effects among them that the model had before."""
+
+
+def fit_effects(problem: Problem, names: list[str]) -> Fitted:
+    """Fit the named effects in a problem's model; one that it lacks is added first."""
+    model = copy.deepcopy(problem.model)
+    if model.remembers:
+        raise InputError(
+            "effects are for models with a static network; the recurrent baseline takes none"
+        )
+    names = list(dict.fromkeys(names))
+    refitted = tuple(name for name in names if name in model.effects)
+    for name in names:
+        if name not in model.effects:
+            model = _added(problem.with_model(model), name)
+    large = [name for name in names if is_large(model.effects[name])]
+    small = [name for name in names if name not in large]
+    fits: dict[tuple[str, ...], Fit] = {}
+    for _ in range(ROUNDS if small and large or len(large) > 1 else 1):
+        for name in large:
+            fits[name,] = refine_large(model, problem, name)
+        if small:
+            fits[tuple(small)] = refine(model, problem, small)
+    parameters = []
+    for keys, fit in fits.items():
+        effects = {key: model.effects[key] for key in keys}
+        free = free_parameters(model, keys)
+        if len(keys) == 1 and keys[0] in large:
+            free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].strengths().items()}
+        parameters += intervals(effects, free, fit, problem.block)
+    order = {name: position for position, name in enumerate(names)}
+    parameters.sort(key=lambda parameter: order[parameter.effect])
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted)
+
+
+def is_large(effect: Effect) -> bool:
+    """Whether an effect has so many values that its strengths alone are fitted."""
+    values = [*effect.strengths().values(), *effect.shapes().values()]
+    return sum(p.numel() for p in values) > LARGE
+
+
+def _added(problem: Problem, name: str) -> ArmModel:
+    """The problem's model with one effect more, roughly fitted, from the best of a few starts."""
+    tried = []
+    for model in starts(problem, name):
+        if is_large(model.effects[name]):
+            tried.append((refine_large(model, problem, name).misfit, model))
+        else:
+            tried.append((refine(model, problem, [name], FIRST_ITERATIONS).misfit, model))
+    return min(tried, key=lambda one: one[0])[1]

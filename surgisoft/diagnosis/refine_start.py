@@ -1,0 +1,55 @@
+"""Where a fit of an effect starts: the shapes that do best on held-out blocks."""
+
+import copy
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.candidates import candidates, key_of, with_effect
+from surgisoft.diagnosis.cross_validation import CrossValidation, static_features
+from surgisoft.diagnosis.problem import Problem
+from surgisoft.errors import InputError
+from surgisoft.surrogate.model import ArmModel
+
+
+def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
+    """Models with the named effect in its best few shapes, amplitudes fitted; parts are copies.
+
+    The shapes are ranked by the error that each leaves on held-out blocks beside the surrogate's
+    own error.
+    """
+    tried = candidates(problem, [name])
+    if not tried:
+        raise InputError(
+            f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "
+            "record motion that it would show in"
+        )
+    ends = np.cumsum([0] + [candidate.columns.shape[-1] for candidate in tried])
+    validation = CrossValidation.of(
+        static_features(problem.pressure, problem.direction),
+        problem.residual,
+        np.concatenate([candidate.columns for candidate in tried], axis=-1),
+        problem.block,
+        problem.fold,
+        problem.surrogate_mm,
+        problem.noise_mm,
+    )
+    picks = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    losses = [validation.losses(pick).sum() for pick in picks]
+    answer = []
+    for best in np.argsort(losses)[:number]:
+        effect = copy.deepcopy(tried[best].effect)
+        amplitudes = torch.from_numpy(validation.amplitudes(picks[best])).float()
+        begin = 0
+        with torch.no_grad():
+            for strength in effect.strengths().values():
+                end = begin + strength.numel()
+                strength.copy_(amplitudes[begin:end].view_as(strength))
+                begin = end
+        answer.append(with_effect(copy.deepcopy(problem.model), name, effect))
+    return answer
+
+
+def key_for(model: ArmModel, name: str) -> str:
+    """Key of a named effect in a model that has it, or that it would get."""
+    return name if name in model.effects else key_of(model, name)

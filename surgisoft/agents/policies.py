@@ -66,13 +66,18 @@ DRIVERS: dict[str, Callable[[], Driver]] = {"scripted": Scripted, "random": Rand
 
 def open_driver(name: str, task: Task) -> Driver:
     """A driver by name, or the policy of a training run's folder, which must fit the task."""
+    check_driver(name)
     if name in DRIVERS:
         return DRIVERS[name]()
-    folder = Path(name)
-    if not folder.exists():
-        if folder.name == name:
-            raise unknown_name("driver", name, [*DRIVERS, "the folder of a training run"])
-        raise InputError(f"{name}: no such folder; expected a training run, scripted or random")
     from surgisoft.agents.learned import LearnedPolicy
 
-    return LearnedPolicy(folder, task)
+    return LearnedPolicy(Path(name), task)
+
+
+def check_driver(name: str) -> None:
+    """Raise unless that is a driver's name or something on disk."""
+    if name in DRIVERS or Path(name).exists():
+        return
+    if Path(name).name == name:
+        raise unknown_name("driver", name, [*DRIVERS, "the folder of a training run"])
+    raise InputError(f"{name}: no such folder; expected a training run, scripted or random")

@@ -1,3 +1,16 @@
 """Import every module of commands, so that each registers itself on the app."""
 
-from surgisoft.cli import benchmark, collect, compare, diagnose, fit, import_, replay, scene, train  # noqa: F401
+# ruff: noqa: F401
+
+from surgisoft.cli import (
+    benchmark,
+    collect,
+    compare,
+    diagnose,
+    evaluate,
+    fit,
+    import_,
+    replay,
+    scene,
+    train,
+)

@@ -1,0 +1,206 @@
+"""`surgisoft evaluate`: how well drivers do a task, in simulation or on the virtual rig."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError, unknown_name
+
+PLACES = ("simulation", "rig")
+"""Where episodes are played."""
+
+
+@app.command()
+def evaluate(
+    drivers: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DRIVER...", help="scripted, random, or a training run's folder; side by side."
+        ),
+    ],
+    task: Annotated[
+        str | None, typer.Option(metavar="TASK", help="Task; default: the run's own.")
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=1, max=100_000, help="Episodes to play.")] = 20,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31, help="Seed of the episodes, the same for each driver.")
+    ] = 0,
+    on: Annotated[str, typer.Option(help="simulation, or rig: arms on the virtual rig.")] = PLACES[
+        0
+    ],
+    referee: Annotated[
+        bool, typer.Option(help="Contact, clearance and beam by FCL, where there is a scene.")
+    ] = True,
+    specimen: Annotated[
+        int | None, typer.Option(min=0, max=2**31, help="On the rig: which arm was cast; 0.")
+    ] = None,
+    hidden: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[:X]", help="On the rig: a hidden effect and its strength."),
+    ] = None,
+    cameras: Annotated[
+        bool, typer.Option(help="On the rig: key points are measured; else foreseen by the model.")
+    ] = True,
+    arm: Annotated[
+        str | None, typer.Option(metavar="MODEL", help="Arm model of all arms; default: the own.")
+    ] = None,
+    scene: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Scene; default: the liver phantom.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="TOML with fields of the task's configuration."),
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Replay (.rrd) of the first driver's first episode."),
+    ] = None,
+) -> None:
+    """Play episodes with each driver and say how well they went, with 95 % intervals."""
+    _check_files(json_file, replay)
+    rig = _rig_config(on, specimen, hidden, cameras)
+    own, table = _task(drivers, task, config, arm, scene)
+    place = own
+    if rig is not None:
+        from surgisoft.agents.on_rig import on_rig
+
+        place = on_rig(own, rig)
+    results, log = _evaluated(place, drivers, episodes, seed, referee, on, replay is not None)
+    print(f"{own.name}, {on}: {episodes} episodes of seed {seed}; mean [95 % interval]")
+    _show(results)
+    if json_file:
+        from surgisoft.tasks.configs import config_table
+
+        about = {
+            "task": own.name,
+            "task_config": table,
+            "on": on,
+            "rig": rig and config_table(rig),
+            "seed": seed,
+            "episodes": episodes,
+            "dt_s": own.world.config.dt_s,
+            "confidence": 0.95,
+        }
+        about["drivers"] = {result.driver: result.to_json() for result in results}
+        write_text(json_file, json.dumps(about, indent=2) + "\n")
+        print(f"wrote {json_file}")
+    if replay:
+        from surgisoft.replay.episode_view import write_replay
+
+        with progress("replay") as report:
+            write_replay(log, replay, report=report)
+        print(f"wrote {replay}")
+
+
+def _check_files(json_file: Path | None, replay: Path | None) -> None:
+    check_free(json_file, "drivers")
+    for path in (json_file, replay):
+        check_folder(path and path.absolute().parent)
+    if replay is not None and replay.suffix != ".rrd":
+        raise InputError(f"{replay}: suffix '{replay.suffix}', expected .rrd")
+
+
+def _rig_config(on: str, specimen: int | None, hidden: list[str] | None, cameras: bool):
+    """The bench that is asked for, None in simulation."""
+    if on not in PLACES:
+        raise unknown_name("place", on, PLACES)
+    if on != "rig":
+        if specimen is not None or hidden or not cameras:
+            raise InputError("--specimen, --hidden and --no-cameras are for --on rig")
+        return None
+    from surgisoft.agents.on_rig import RigConfig
+
+    pairs = tuple(_hidden(text) for text in hidden or ())
+    return RigConfig(seed=specimen or 0, hidden=pairs, cameras=cameras)
+
+
+def _hidden(text: str) -> tuple[str, float]:
+    """`creep:0.5` as name and strength; without a number 1."""
+    name, colon, strength = text.partition(":")
+    try:
+        return name, float(strength) if colon else 1.0
+    except ValueError:
+        raise InputError(f"--hidden {text}: expected NAME or NAME:STRENGTH") from None
+
+
+def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | None, scene):
+    """The task to play and its configuration as a table; a run brings its own."""
+    from surgisoft.agents.policies import DRIVERS, check_driver
+    from surgisoft.agents.run_folder import RunFolder
+    from surgisoft.tasks.configs import config_of, config_table, read_config, with_fields
+    from surgisoft.tasks.registry import TASKS, make_task
+
+    for name in drivers:
+        check_driver(name)
+    runs = [RunFolder(name) for name in drivers if name not in DRIVERS]
+    if task is None and not runs:
+        raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
+    task = task or runs[0].config["task"]
+    brought = [run for run in runs if run.config["task"] == task]
+    for run in runs:
+        if run not in brought:
+            trained = run.config["task"]
+            typer.echo(f"surgisoft: warning: {run.path} was trained on {trained}", err=True)
+    if config is not None:
+        own = read_config(task, config)
+    else:
+        own = brought[0].plan().task_config if brought else config_of(task)
+    given = {"arm": arm, "scene": None if scene is None else str(scene)}
+    own = with_fields(own, **{name: value for name, value in given.items() if value is not None})
+    return make_task(task, own), config_table(own)
+
+
+def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool, on: str, log):
+    """Each driver's evaluation, and the first one's first episode as a log if one is asked for."""
+    from surgisoft.agents.evaluate import evaluate as evaluate_driver
+    from surgisoft.agents.policies import open_driver
+    from surgisoft.agents.record import FirstEpisode
+
+    opened = {name: open_driver(name, task) for name in drivers}
+    first = FirstEpisode(task, drivers[0], seed, on) if log else None
+    results = []
+    for name, driver in opened.items():
+        watch = first if name == drivers[0] else None
+        with progress(f"evaluate {name}") as report:
+            results.append(
+                evaluate_driver(
+                    task, name, driver, episodes, seed, referee, progress=report, watch=watch
+                )
+            )
+    return results, first.log() if first else None
+
+
+def _show(results) -> None:
+    from surgisoft.agents.evaluate import RATES
+
+    names = list(dict.fromkeys(name for result in results for name in result.overall))
+    width = max(26, *(len(Path(result.driver).name) + 2 for result in results))
+    titles = "".join(f"{Path(result.driver).name:>{width}s}" for result in results)
+    print(f"{'':20s}{titles}")
+    for name in names:
+        cells = [_cell(result.overall.get(name), name in RATES) for result in results]
+        print(f"{name:20s}" + "".join(f"{cell:>{width}s}" for cell in cells))
+    for result in results:
+        if result.verdicts is not None:
+            facts = result.to_json()["referee"]
+            print(
+                f"referee on {Path(result.driver).name}: {facts['instants']:,} instants; the "
+                f"batched path differs on contact at {facts['contact_differs']}, on what the beam "
+                f"meets at {facts['beam_differs']}, on where within {facts['beam_off_mm']:.1g} mm"
+            )
+
+
+def _cell(value, rate: bool) -> str:
+    if value is None or not value.episodes:
+        return "-"
+    if rate:
+        return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
+    return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"

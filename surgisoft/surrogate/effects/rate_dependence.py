@@ -24,7 +24,7 @@ from surgisoft.surrogate.scan import linear_scan
 
 SLOW = 0.01
 """Rate r_0 below which the shear-thinning term is linear, 1/s."""
-GRID = (0.1, 0.3, 1.0)
+GRID = (0.04, 0.12, 0.4)
 """Filter times that a diagnosis tries, s."""
 
 

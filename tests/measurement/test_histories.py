@@ -1,0 +1,36 @@
+"""Recordings as histories: what comes with the actuation."""
+
+import numpy as np
+import torch
+
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recording import Recording
+
+
+def recording(name: str, temperature=None) -> Recording:
+    """Two runs of three and two rows, the second long after the first."""
+    return Recording(
+        name,
+        np.array([0.0, 1.0, 2.0, 100.0, 101.0]),
+        np.arange(5.0)[:, None],
+        np.zeros((5, 2, 3)),
+        run=np.array([0, 0, 0, 1, 1]),
+        temp_C=temperature,
+    )
+
+
+def test_temperature_goes_with_its_rows_and_is_missing_where_it_was():
+    warm = recording("warm", np.array([20.0, 21.0, np.nan, 23.0, 24.0]))
+    history = history_of([warm, recording("unknown")])
+    nan = torch.nan
+    expected = [[20.0, 21.0, nan], [23.0, 24.0, 24.0], [nan] * 3, [nan] * 3]
+    assert torch.allclose(history.temperature_C, torch.tensor(expected), equal_nan=True)
+    second = history.select(torch.tensor([1]))
+    assert second.temperature_C.tolist() == [[23.0, 24.0]]
+    assert second.t_s.tolist() == [[100.0, 101.0]]
+
+
+def test_without_any_temperature_there_is_none():
+    assert history_of([recording("unknown")]).temperature_C is None
+    nowhere = recording("missing", np.full(5, np.nan))
+    assert history_of([nowhere]).temperature_C is None

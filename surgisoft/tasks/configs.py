@@ -10,11 +10,13 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.laser_plane import LaserPlaneConfig
 from surgisoft.tasks.track import SQUARE, TrackConfig
+from surgisoft.tasks.track_body import TrackBodyConfig
 from surgisoft.toml_config import Where, from_table, read_toml
 
 CONFIGS: dict[str, Any] = {
     "track_circle": TrackConfig(),
     "track_square": SQUARE,
+    "track_body": TrackBodyConfig(),
     "laser_plane": LaserPlaneConfig(),
     "circle_ablation": CircleAblationConfig(),
 }

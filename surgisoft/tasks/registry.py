@@ -9,10 +9,12 @@ from surgisoft.tasks.base import Task
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.laser_plane import laser_plane
 from surgisoft.tasks.track import track_circle, track_square
+from surgisoft.tasks.track_body import TrackBody
 
 TASKS: dict[str, Callable[..., Task]] = {
     "track_circle": track_circle,
     "track_square": track_square,
+    "track_body": TrackBody,
     "laser_plane": laser_plane,
     "circle_ablation": CircleAblation,
 }

@@ -44,7 +44,7 @@ def _linearised(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tenso
     with torch.inference_mode(False), torch.enable_grad():
         place = at.clone().requires_grad_(True)
         value = residual(place)
-        slopes = [
-            torch.autograd.grad(part.sum(), place, retain_graph=True)[0] for part in value.unbind(1)
-        ]
-    return value.detach(), torch.stack(slopes, 1)
+        one = torch.eye(value.shape[1], dtype=value.dtype, device=value.device)
+        each = one[:, None].expand(-1, len(value), -1)
+        slopes = torch.autograd.grad(value, place, each, is_grads_batched=True)[0]
+    return value.detach(), slopes.movedim(0, 1)

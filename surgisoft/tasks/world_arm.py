@@ -188,6 +188,15 @@ class Arm:
         """
         return self.bent(part, pressure, dt_s)[1] + part.offset_mm
 
+    def settled(self, pressure: Tensor) -> Tensor:
+        """Key points (B, n, 3) mm, world frame, nominal mount: (B, m) kPa held since ever.
+
+        What the model gives without any change of pressure before; its memory adds to that.
+        """
+        state = self.model.initial_state(len(pressure), pressure)
+        _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
+        return frames.apply(self.pose, points)
+
     def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
         state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)

@@ -12,6 +12,7 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
+from surgisoft.surrogate.default import default_arm
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
@@ -22,6 +23,7 @@ from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.solver import least_squares
 from surgisoft.tasks.streams import streams
 from surgisoft.tasks.track import TrackConfig, track_circle
+from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
 from surgisoft.tasks.tree import rows, tree_map
 from surgisoft.tasks.world import WorldConfig
 from surgisoft.tasks.world_arm import Randomisation
@@ -155,7 +157,7 @@ def test_observations_are_of_order_one_and_asking_changes_nothing(name):
         assert episodes.observe(state)[agent].abs().max() > 0.0
 
 
-@pytest.mark.parametrize("name", ["track_circle", "track_square", "laser_plane"])
+@pytest.mark.parametrize("name", ["track_circle", "track_square", "laser_plane", "track_body"])
 def test_the_script_follows_to_a_hundredth_of_a_millimetre(name):
     """Mean over whole episodes from all sides; largest where a chamber turns its direction."""
     episodes = Episodes(task_of(name))
@@ -205,6 +207,26 @@ def test_the_target_goes_round_once_at_even_speed():
     np.testing.assert_allclose((path[:, :2] - task.centre[:2]).norm(dim=1), 10.0, atol=1e-4)
     assert (path[:, 2] == path[0, 2]).all()
     assert path[30 + 50, 1] - task.centre[1] == pytest.approx(10.0, abs=1e-4)
+
+
+def test_the_bodys_target_is_a_shape_of_the_arm_by_hand():
+    """Two sine waves of 12 s and 7 s about 20 kPa, given to the arm model alone."""
+    task = TrackBody()
+    state = Episodes(task).seeded(4, 2)
+    phase, model = state.goal.phase.double(), default_arm()
+    for step, moved_s in ((10, 0.0), (30, 0.0), (91, 6.1)):
+        now = replace(state, world=replace(state.world, steps=torch.full((2,), step)))
+        wave = [
+            15.0 * share * (2.0 * math.pi * (moved_s / period + phase[:, i])).sin()
+            for i, (share, period) in enumerate(((0.6, 12.0), (0.4, 7.0)))
+        ]
+        pressure = (20.0 + sum(wave)).float()
+        still = model.initial_state(2, pressure)
+        _, points = model.step(still, torch.zeros(2, 3), 0.1)
+        torch.testing.assert_close(task.target_mm(now), points, rtol=0, atol=2e-3)
+        own = now.world.arms["arm"].points_mm
+        gap = (own - points).norm(dim=2)[:, 1:]
+        torch.testing.assert_close(task.errors_mm(now), gap, rtol=0, atol=4e-3)
 
 
 def test_paths_by_hand():
@@ -294,6 +316,7 @@ def test_the_script_is_the_same_for_one_and_for_many():
         (lambda: FollowConfig(size_mm=-1.0), "size_mm is -1.0"),
         (lambda: FollowConfig(loop_s=math.nan), "loop_s is nan"),
         (lambda: LaserPlaneConfig(distance_mm=0.0), "distance_mm is 0.0"),
+        (lambda: TrackBodyConfig(slow_s=0.0), "slow_s is 0.0"),
     ],
 )
 def test_bad_input_is_one_line(make, message):

@@ -74,7 +74,8 @@ class Contact(Memoryless):
         made = []
         if not len(points):
             return made
-        point = max(n - 2, 0)
+        # The lowest of several key points hardly moves.
+        point = max(n - 2, min(1, n - 1))
         for turn in range(AROUND):
             azimuth = 2 * math.pi * turn / AROUND
             normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])

@@ -1,13 +1,24 @@
 """One set of promises over every effect and its candidates."""
 
 import copy
+import dataclasses
 
 import pytest
 import torch
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import STAGES, Context, known_effects, make_effect
-from tests.surrogate.effects.arms import FACTS, REST_MM, at, context, facts, signal, stir, variants
+from tests.surrogate.effects.arms import (
+    FACTS,
+    REST_MM,
+    at,
+    context,
+    facts,
+    on_points,
+    signal,
+    stir,
+    variants,
+)
 
 VARIANTS = variants()
 EVERY = pytest.mark.parametrize("effect", VARIANTS.values(), ids=VARIANTS)
@@ -178,3 +189,18 @@ def test_any_number_of_chambers(name, chambers):
 def test_unknown_effect_names_the_known_ones():
     with pytest.raises(InputError, match=r"known are .*hysteresis"):
         make_effect("gremlins", FACTS)
+
+
+@pytest.mark.parametrize("name", known_effects())
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_key_points(name, count):
+    """Also an arm with a tip alone, and where the shape at rest is not known yet."""
+    for rest_mm in (REST_MM[-count:], torch.zeros(count, 3)):
+        arm = dataclasses.replace(FACTS, rest_mm=rest_mm)
+        points = REST_MM[-count:] + torch.randn(50, count, 3, generator=torch.manual_seed(0))
+        for effect in [make_effect(name, arm), *known_effects()[name].candidates(arm, points)]:
+            x = points[:18].view(2, 9, count, 3) if on_points(effect) else torch.rand(2, 9, 3) * 40
+            memory = effect.scan(effect.rest(x[:, 0]), x, context(2, 9))
+            columns = effect.columns(x, memory)
+            assert columns.isfinite().all()
+            assert stir(effect).apply(x, memory).shape == columns.shape[1:]

@@ -1,0 +1,183 @@
+"""Numbers of episodes and their intervals, held against tables, simulation and the command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.agents.evaluate import bootstrap, episode_table, summary, wilson
+from surgisoft.agents.referee import Contact, Verdict
+from surgisoft.agents.rollout import Rollout
+from surgisoft.cli import run
+from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.registry import make_task
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("share", "count", "low", "high"),
+    [(0.0, 10, 0.0, 0.2775), (0.5, 10, 0.2366, 0.7634), (0.99, 100, 0.9455, 0.9982)],
+)
+def test_wilson_interval_as_in_tables(share, count, low, high):
+    """Newcombe 1998, table I (method 3), and scipy.stats.binomtest(...).proportion_ci('wilson')."""
+    assert wilson(share, count) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_wilson_agrees_with_scipy():
+    stats = pytest.importorskip("scipy.stats")
+    for hits, count in ((1, 3), (7, 20), (199, 200)):
+        interval = stats.binomtest(hits, count).proportion_ci(method="wilson")
+        assert wilson(hits / count, count) == pytest.approx((interval.low, interval.high))
+
+
+def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
+    rng, inside = np.random.default_rng(1), 0
+    for _ in range(200):
+        low, high = bootstrap(rng.exponential(size=60))
+        inside += low <= 1.0 <= high
+    assert 0.87 <= inside / 200 <= 0.99
+
+
+def test_a_summary_leaves_out_what_does_not_apply():
+    found = summary(np.array([1.0, NAN, 3.0]))
+    assert (found.mean, found.least, found.most, found.episodes) == (2.0, 1.0, 3.0, 2)
+    nothing = summary(np.array([NAN]))
+    assert nothing.episodes == 0
+    assert np.isnan(nothing.mean)
+
+
+def ablation_rollout(**measures):
+    """Two episodes of three steps, the second over after two."""
+    steps = torch.tensor([3, 2])
+    over = torch.tensor([False, True])
+    table = {name: torch.tensor(value) for name, value in measures.items()}
+    return Rollout("circle_ablation", 0.1, steps, {}, over, ~over & over, table)
+
+
+def test_each_measure_is_summed_up_in_its_own_way():
+    task = CircleAblation()
+    need = task.spec.limits.view_fraction
+    played = ablation_rollout(
+        beam_error_mm=[[3.0, 4.0, NAN], [NAN, 1.0, NAN]],
+        completion=[[0.2, 0.5, 1.0], [0.1, 0.3, NAN]],
+        view_fraction=[[need, 0.0, need], [0.0, 0.0, NAN]],
+        success=[[0.0, 0.0, 1.0], [0.0, 0.0, NAN]],
+        clearance_mm=[[5.0, 2.0, 3.0], [4.0, 6.0, NAN]],
+        collided=[[0.0, 0.0, 0.0], [0.0, 1.0, NAN]],
+    )
+    table = episode_table(task, played)
+    expected = {
+        "beam_error_mean_mm": [3.5, 1.0],
+        "beam_error_rms_mm": [12.5**0.5, 1.0],
+        "beam_error_max_mm": [4.0, 1.0],
+        "beam_error_p95_mm": [3.95, 1.0],
+        "completion": [1.0, 0.3],
+        "in_view": [2 / 3, 0.0],
+        "clearance_mm": [2.0, 4.0],
+        "collided": [0.0, 1.0],
+        "success": [1.0, 0.0],
+        "time_s": [0.3, 0.2],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(table[name], values, rtol=1e-6, err_msg=name)
+
+
+def test_the_referee_overrules_the_batched_path():
+    played = ablation_rollout(
+        success=[[0.0, 0.0, 1.0], [0.0, 1.0, NAN]],
+        clearance_mm=[[5.0, 2.0, 3.0], [4.0, 6.0, NAN]],
+        collided=[[0.0, 0.0, 0.0], [0.0, 0.0, NAN]],
+    )
+    hit = Verdict(Contact(0.1, ("laser", "liver")), -0.5, 4, 1, 2.5, 0, 0.0)
+    free = Verdict(None, 3.5, 3, 0, 0.0, 0, 0.0)
+    table = episode_table(CircleAblation(), played, [hit, free])
+    assert table["success"].tolist() == [0.0, 1.0]
+    assert table["collided"].tolist() == [1.0, 0.0]
+    assert table["clearance_mm"].tolist() == [-0.5, 3.5]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A task that is over in two seconds."""
+    file = tmp_path_factory.mktemp("config") / "short.toml"
+    file.write_text("[follow]\nloop_s = 1.5\napproach_s = 0.5\nsize_mm = 2.0\n")
+    return str(file)
+
+
+def test_command_puts_drivers_side_by_side_and_writes_all_numbers(tmp_path, capsys, short):
+    file = tmp_path / "out" / "numbers.json"
+    command = ["evaluate", "scripted", "random", "--task", "track_circle", "--config", short]
+    assert run([*command, "--episodes", "3", "--seed", "4", "--json", str(file)]) == 0
+    printed = capsys.readouterr().out
+    assert "scripted" in printed
+    assert "error_mean_mm" in printed
+    found = json.loads(file.read_text())
+    assert (found["task"], found["on"], found["seed"], found["episodes"]) == (
+        "track_circle", "simulation", 4, 3,
+    )  # fmt: skip
+    assert found["task_config"]["follow"]["loop_s"] == 1.5
+    script, chance = found["drivers"]["scripted"], found["drivers"]["random"]
+    for driver in (script, chance):
+        errors = driver["per_episode"]["error_mean_mm"]
+        overall = driver["overall"]["error_mean_mm"]
+        assert len(errors) == overall["episodes"] == 3
+        assert overall["mean"] == pytest.approx(np.mean(errors))
+        assert overall["low"] <= overall["mean"] <= overall["high"]
+    assert script["overall"]["error_mean_mm"]["most"] < chance["overall"]["error_mean_mm"]["least"]
+    first = file.read_text()
+    assert run([*command, "--episodes", "3", "--seed", "4", "--json", str(file)]) == 0
+    assert file.read_text() == first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["skripted", "--task", "track_circle"], "skripted"),
+        (["scripted"], "--task"),
+        (["scripted", "--task", "track_cirlce"], "track_circle"),
+        (["runs/nowhere", "--task", "track_circle"], "runs/nowhere"),
+        ([".", "--task", "track_circle"], "config.json"),
+        (["scripted", "--task", "track_circle", "--on", "moon"], "rig"),
+        (["scripted", "--task", "track_circle", "--hidden", "creep"], "--on rig"),
+        (["scripted", "--task", "track_circle", "--on", "rig", "--hidden", "creep:much"], "creep"),
+        (["scripted", "--task", "track_circle", "--on", "rig", "--hidden", "gremlins"], "creep"),
+        (["scripted", "--task", "track_circle", "--scene", "x"], "scene"),
+        (["scripted", "--task", "track_circle", "--replay", "x.mp4"], ".rrd"),
+        (["scripted", "--task", "track_circle", "--json", "pyproject.toml"], "pyproject.toml"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(arguments, named, capsys):
+    assert run(["evaluate", *arguments, "--episodes", "1"]) == 2
+    message = capsys.readouterr().err.strip()
+    assert len(message.splitlines()) == 1
+    assert named in message
+
+
+def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
+    from surgisoft.agents.learned import agent_sizes
+    from surgisoft.agents.plan import Plan
+    from surgisoft.agents.policy_network import empty_actor
+    from surgisoft.agents.presets import preset_for
+    from surgisoft.agents.run_folder import BEST, create_run
+    from surgisoft.tasks.configs import read_config
+
+    config, preset = read_config("track_circle", Path(short)), preset_for("fast", "track_circle")
+    task, plan = make_task("track_circle", config), Plan("track_circle", config, "fast", preset, 1)
+    sizes = agent_sizes(task)
+    made = create_run(tmp_path / "run", plan, task, sizes, 1)
+    actor = empty_actor("arm", sizes["arm"]["observation"], sizes["arm"]["chambers"], preset)
+    made.save(BEST, {"iteration": 0, "agents": {"arm": actor.state_dict()}})
+    folder = str(made.path)
+
+    assert run(["evaluate", folder, "--task", "circle_ablation", "--episodes", "1"]) == 2
+    assert "trained on track_circle" in capsys.readouterr().err
+    file = tmp_path / "run.json"
+    assert run(["evaluate", folder, "--episodes", "2", "--json", str(file)]) == 0
+    found = json.loads(file.read_text())
+    assert found["task"] == "track_circle"
+    assert found["task_config"]["follow"]["loop_s"] == 1.5
+    times = found["drivers"][folder]["per_episode"]["time_s"]
+    assert times == pytest.approx([2.0, 2.0])

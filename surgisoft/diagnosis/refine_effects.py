@@ -47,7 +47,7 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     large = [name for name in names if is_large(model.effects[name])]
     small = [name for name in names if name not in large]
     fits: dict[tuple[str, ...], Fit] = {}
-    for _ in range(ROUNDS if small and large or len(large) > 1 else 1):
+    for _ in range(ROUNDS if (small and large) or len(large) > 1 else 1):
         for name in large:
             fits[name,] = refine_large(model, problem, name)
         if small:

@@ -1,11 +1,12 @@
 """Where a fit of an effect starts: the shapes that do best on held-out blocks."""
 
 import copy
+import itertools
 
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.candidates import candidates, key_of, with_effect
+from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.cross_validation import CrossValidation, static_features
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.errors import InputError
@@ -34,7 +35,7 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
         problem.surrogate_mm,
         problem.noise_mm,
     )
-    picks = [np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
     losses = [validation.losses(pick).sum() for pick in picks]
     answer = []
     for best in np.argsort(losses)[:number]:
@@ -48,8 +49,3 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
                 begin = end
         answer.append(with_effect(copy.deepcopy(problem.model), name, effect))
     return answer
-
-
-def key_for(model: ArmModel, name: str) -> str:
-    """Key of a named effect in a model that has it, or that it would get."""
-    return name if name in model.effects else key_of(model, name)

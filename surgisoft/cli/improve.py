@@ -1,0 +1,119 @@
+"""`surgisoft improve`: diagnose and amend, until the error stands at its floor."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.amend import NOT_CLAIMED, claim_other_folder, show_parameters
+from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.progress import progress
+
+
+@app.command()
+def improve(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="NEW", help="Folder of the new model.")
+    ],
+    most: Annotated[
+        int, typer.Option("--max-effects", min=1, help="Most effects that are added.")
+    ] = 6,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write all rounds here.")
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write report.html and waterfall.png here."),
+    ] = None,
+    effect_files: Annotated[
+        list[Path] | None,
+        typer.Option("--effect-file", metavar="FILE.py", help="Also try an effect of your own."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an older NEW.")] = False,
+) -> None:
+    """Improve a model: diagnose, amend, and again, until nothing more is missing.
+
+    The last quarter of each recording judges at the end. Where nothing was added, or the error
+    did not fall beyond chance, nothing is written (exit code 1).
+    """
+    import torch
+
+    from surgisoft.diagnosis.improve import improve as improve_model
+    from surgisoft.measurement.histories import outside_range
+    from surgisoft.measurement.recording import load_recordings
+    from surgisoft.surrogate.checkpoint import load_model, save_model
+    from surgisoft.surrogate.effects import register_effect_file
+
+    claim_other_folder(output, model, force)
+    check_free(json_file, "rounds")
+    check_folder(report)
+    for path in effect_files or []:
+        register_effect_file(path)
+    arm = load_model(model)
+    measured = load_recordings(
+        recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
+    )
+    for note in outside_range(arm.spec, measured):
+        typer.echo(f"surgisoft: warning: {note}", err=True)
+    torch.set_num_threads(1)
+    with progress("improve") as tell:
+        done = []
+
+        def after(each) -> None:
+            done.append(each)
+            tell(len(done), most + 2, each.step or each.verdict)
+
+        result = improve_model(arm, measured, most, after)
+    _show(result)
+    if result.claimed:
+        account = result.to_json() | {
+            "amended_from": model.name,
+            "recordings": [recording.name for recording in measured],
+        }
+        save_model(result.model, output, account, force)
+    if json_file:
+        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+    if report:
+        _write_report(result, report, model.name)
+    print(result.sentence)
+    if not result.claimed:
+        print(f"{output} was not written")
+        raise typer.Exit(NOT_CLAIMED)
+    print(f"wrote {output}: {result.model.summary()}")
+
+
+def _show(result) -> None:
+    """Each round, then the parameters and the errors on the locked part."""
+    for number, done in enumerate(result.rounds, 1):
+        what = f"+ {done.step}" if done.step else "end"
+        rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""
+        print(f"round {number}: {done.verdict}: {done.sentence}")
+        print(f"  {what}{rivals}: error on the open part {done.error_open_mm:.4f} mm")
+    if result.steps:
+        show_parameters(result.parameters)
+        fall = result.locked
+        width = max(len(name) for name, _ in result.steps) + 2
+        print(f"{'before':{width}s} {fall.before:8.4f} mm on the locked part")
+        for name, error in result.steps:
+            print(f"{'+ ' + name:{width}s} {error:8.4f} mm")
+        print(f"{'floor':{width}s} {fall.floor:8.4f} mm")
+
+
+def _write_report(result, folder: Path, name: str) -> None:
+    """The page and the waterfall."""
+    from surgisoft.diagnosis.improve_page import improve_page
+    from surgisoft.diagnosis.waterfall import write_waterfall
+    from surgisoft.report import write_page
+
+    added = " + ".join(step for step, _ in result.steps) or "no more effects"
+    page = improve_page(result, f"{name} with {added}", result.model.summary())
+    print(f"wrote {write_page(page, folder / 'report.html')}")
+    if result.steps:
+        fall, path = result.locked, folder / "waterfall.png"
+        print(f"wrote {write_waterfall(fall.before, result.steps, fall.floor, path)}")

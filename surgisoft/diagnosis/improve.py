@@ -1,0 +1,178 @@
+"""`improve`: diagnose, amend, and again, until the gates are silent.
+
+Every round adds the surest effect of a diagnosis and fits it together with those that were added
+before. The network's last layer is re-tuned at the end, where held-out motion rewards it. All of
+this sees the open part of the recordings only; the locked part is looked at once, at the end, for
+the errors of all rounds, and decides nothing but whether the whole fall is claimed.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+
+from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.refine_effects import fit_effects
+from surgisoft.diagnosis.refine_intervals import Parameter
+from surgisoft.diagnosis.refine_network import retune
+from surgisoft.diagnosis.verdict import Diagnosis
+from surgisoft.errors import InputError
+from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.model import ArmModel
+
+MOST_EFFECTS = 6
+"""Most effects that are added."""
+NETWORK = "network"
+"""Name of the step that re-tunes the network."""
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One round: what a diagnosis said and what was done."""
+
+    verdict: str
+    """Kind of the verdict."""
+    sentence: str
+    """The verdict in words."""
+    step: str | None
+    """The effect that was added or fitted anew, or `network`; None where the loop ended."""
+    rivals: tuple[str, ...]
+    """Effects that would do as well in its place."""
+    confidence: float | None
+    """Confidence in it, 0 to 1."""
+    error_open_mm: float
+    """RMS distance on the open part after the round, mm."""
+    error_mm: float | None = None
+    """The same on the locked part, known when all rounds have ended, mm."""
+
+
+Progress = Callable[[Round], None]
+"""Called after each round."""
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """A model with every effect that the gates let through."""
+
+    model: ArmModel
+    """The new model; the given one where nothing was added."""
+    rounds: tuple[Round, ...]
+    """What happened; the last one says why the loop ended."""
+    parameters: tuple[Parameter, ...]
+    """The fitted parameters of all added effects."""
+    locked: Fall
+    """The error on the locked part, before the first and after the last round."""
+    tracks: tuple[Track, Track]
+    """The error along the open and along the locked part."""
+    seconds: float
+    """Time that it took, s."""
+
+    @property
+    def steps(self) -> list[tuple[str, float]]:
+        """(what was added, error on the locked part after it in mm), in order."""
+        return [(r.step, r.error_mm) for r in self.rounds if r.step is not None]
+
+    @property
+    def claimed(self) -> bool:
+        """Whether something was added and the error fell by it."""
+        return bool(self.steps) and self.locked.claimed
+
+    @property
+    def sentence(self) -> str:
+        """The outcome in words."""
+        if not self.steps:
+            return f"nothing was added: {self.rounds[-1].sentence}"
+        return f"{' + '.join(name for name, _ in self.steps)}: {self.locked.sentence}"
+
+    def to_json(self) -> dict:
+        """Plain values, as `improve --json` writes them."""
+        return {
+            "sentence": self.sentence,
+            "claimed": self.claimed,
+            "effects": [name for name, _ in self.steps if name != NETWORK],
+            "network_retuned": any(name == NETWORK for name, _ in self.steps),
+            "error_mm": asdict(self.locked) | {"ci95": list(self.locked.ci95)},
+            "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
+            "parameters": [parameter.to_json() for parameter in self.parameters],
+            "seconds": self.seconds,
+        }
+
+
+def improve(
+    model: ArmModel,
+    recordings: list[Recording],
+    most_effects: int = MOST_EFFECTS,
+    progress: Progress | None = None,
+) -> Improvement:
+    """Add effect after effect to a model, until no gate lets another through."""
+    if most_effects < 1:
+        raise InputError(f"at most {most_effects} effects: expected 1 or more")
+    begin = time.perf_counter()
+    tell = progress or (lambda done: None)
+    problem = pose(model, recordings, part="open")
+    models, rounds, parameters = [model], [], ()
+    added: list[str] = []
+
+    def note(done: Round) -> None:
+        rounds.append(done)
+        tell(done)
+
+    while len(added) < most_effects:
+        found = diagnose(models[-1], recordings)
+        name, rivals, confidence = next_effect(found)
+        before = problem.with_model(models[-1])
+        done = Round(
+            found.verdict.kind,
+            found.verdict.sentence,
+            None,
+            rivals,
+            confidence,
+            fall_of(before, before).after,
+        )
+        if name is None or name in added:
+            note(done)
+            break
+        fitted = fit_effects(before, [*added, name])
+        fall = fall_of(before, problem.with_model(fitted.model))
+        if not fall.claimed:
+            why = f"{done.sentence}; but {name}, fitted through the whole model, does not help"
+            note(replace(done, sentence=why))
+            break
+        added.append(name)
+        models.append(fitted.model)
+        parameters = fitted.parameters
+        note(replace(done, step=name, error_open_mm=fall.after))
+    tuned = retune(models[-1], problem)
+    if added and tuned.kept:
+        after = fall_of(problem, problem.with_model(tuned.model)).after
+        why = f"held-out motion rewards a re-tuned network by {100 * tuned.gain:.0f} %"
+        models.append(tuned.model)
+        note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
+    locked = pose(model, recordings, EVERY_ROW, part="locked")
+    judged = iter([locked.with_model(one) for one in models[1:]])
+    final, shown = locked, []
+    for done in rounds:
+        final = next(judged) if done.step is not None else final
+        shown.append(replace(done, error_mm=fall_of(locked, final).after))
+    return Improvement(
+        model=models[-1],
+        rounds=tuple(shown),
+        parameters=parameters,
+        locked=fall_of(locked, final),
+        tracks=(track_of(problem, problem.with_model(models[-1])), track_of(locked, final)),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def next_effect(found: Diagnosis) -> tuple[str | None, tuple[str, ...], float | None]:
+    """The effect to add after a diagnosis, its rivals, and the confidence in it; None: no more.
+
+    Of effects that cannot be told apart the first is taken: the error falls with any of them.
+    """
+    if not found.verdict.effects:
+        return None, (), None
+    name = found.verdict.effects[0]
+    rivals = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
+    sure = next((row.confidence for row in found.ranking if row.effect == name), None)
+    return name, tuple(rivals), sure

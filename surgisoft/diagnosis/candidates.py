@@ -163,17 +163,14 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
     """Every known effect in each of its shapes, as columns."""
     model, signal = problem.model, signals(problem)
     points = problem.rows(signal.body)
-    answer = []
-    for name in model.effects:
-        more = more_of(problem, signal, name) if names is None or name in names else None
-        if more is not None and more.columns.any():
-            answer.append(more)
-    known = known_effects()
+    answer, known = [], known_effects()
     for name in names or known:
+        # Of an effect that the model has there can only be more or less.
+        more = more_of(problem, signal, name) if name in model.effects else None
+        if more is not None:
+            answer.append(more)
+            continue
         for effect in known[name].candidates(model.facts, points):
             columns = columns_of(problem, signal, effect)
-            power = np.nanmean(columns**2, axis=(0, 1, 2))
-            kept = power > 1e-12 * max(power.max(), 1e-30)
-            if kept.any() and np.isfinite(columns).all():
-                answer.append(Candidate(name, copy.deepcopy(effect), columns))
-    return answer
+            answer.append(Candidate(name, copy.deepcopy(effect), columns))
+    return [c for c in answer if np.isfinite(c.columns).all() and np.abs(c.columns).max() > 1e-6]

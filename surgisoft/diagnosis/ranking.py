@@ -8,6 +8,7 @@ from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.cross_validation import CrossValidation, static_features
 from surgisoft.diagnosis.gates import family_p_values
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.surrogate.effects import Effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,8 @@ class Race:
     """(B,) sum of squared noise in each block, mm^2."""
     cache: dict = field(default_factory=dict)
     """Losses by columns."""
+    fitted: dict = field(default_factory=dict)
+    """Effects at their strengths by shape and base."""
 
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "Race":
@@ -114,12 +117,31 @@ class Race:
         gains = np.array([self.log_ratio(before, losses) for losses in after])
         chances = family_p_values(gains)
         best: dict[str, Standing] = {}
-        for way, losses, log_gain, chance in zip(ways, after, gains, chances, strict=True):
-            known = best.get(way.effect)
-            if known is None or log_gain.mean() > known.log_gain.mean():
+        for i in np.argsort(-gains.mean(axis=1), kind="stable"):
+            way, losses = ways[i], after[i]
+            if way.effect not in best and self.plausible(way, base):
                 gain = (before.sum() - losses.sum()) / self.excess(before)
-                best[way.effect] = Standing(way.effect, way, losses, log_gain, chance, gain)
+                best[way.effect] = Standing(way.effect, way, losses, gains[i], chances[i], gain)
         return sorted(best.values(), key=lambda standing: -standing.log_gain.mean())
+
+    def plausible(self, way: Option, base: tuple[int, ...] = ()) -> bool:
+        """Whether an effect's parameters lie in their ranges as the race leaves them.
+
+        All shapes side by side are as plausible as the best of them.
+        """
+        if way.shape is None:
+            singles = [w for w in self.options[way.effect] if w.shape is not None]
+            way = min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
+        effect = self.in_place(way, base)
+        return effect is None or effect.plausible()
+
+    def in_place(self, way: Option, base: tuple[int, ...] = ()) -> Effect | None:
+        """The effect of a single shape at the strengths that the race gives it beside a base."""
+        key = (way.shape, base)
+        if key not in self.fitted:
+            amplitudes = self.validation.amplitudes(base + way.picked)[len(base) :]
+            self.fitted[key] = self.candidates[way.shape].with_amplitudes(amplitudes)
+        return self.fitted[key]
 
     def unique_gains(self, standings: list[Standing]) -> dict[str, float]:
         """Share of the squared error above the floor that only this effect explains.
@@ -142,6 +164,5 @@ class Race:
             single,
             key=lambda w: float(self.log_ratio(self.losses(), self.losses(w.picked)).mean()),
         )
-        candidate = self.candidates[way.shape]
-        effect = candidate.with_amplitudes(self.validation.amplitudes(way.picked))
+        effect = self.in_place(way)
         return {} if effect is None else {q.name: q.value for q in effect.quantities()}

@@ -15,23 +15,34 @@ def studentised(gains: np.ndarray) -> np.ndarray:
     return gains.mean(axis=1) / np.maximum(spread, 1e-12 * np.abs(gains).max(initial=1e-30))
 
 
-def family_p_values(gains: np.ndarray, seed: int = 0) -> np.ndarray:
+def family_p_values(gains: np.ndarray, group: np.ndarray | None = None, seed: int = 0):
     """(C,) chance of so large a gain in any of the C candidates, if none had one.
 
     Without a gain each block's difference is as likely negative as positive, for all candidates at
-    once; the largest statistic over all of them corrects for their number (Westfall & Young 1993,
-    ch. 2; Nichols & Holmes 2002). gains: (C, B) by block.
+    once. Candidates of one group (the shapes of one effect) share their largest statistic, and
+    groups count alike however many they hold: the smallest of the groups' own chances corrects for
+    their number (Westfall & Young 1993, ch. 2, step minP). gains: (C, B) by block; group: (C,) ids.
     """
     rng = np.random.default_rng(seed)
     seen = studentised(gains)
+    group = np.arange(len(gains)) if group is None else np.asarray(group)
     signs = rng.choice([-1.0, 1.0], size=(FLIPS, gains.shape[1]))
     # The sum of squares does not change with the signs, so neither does what scales the mean.
     count = gains.shape[1]
     square = (gains**2).sum(axis=1)
     mean = signs @ gains.T / count
     variance = np.maximum(square / count - mean**2, 1e-12 * square.max(initial=1e-30))
-    largest = (mean / np.sqrt(variance / (count - 1))).max(axis=1)
-    return (1 + (largest[None] >= seen[:, None]).sum(axis=1)) / (1 + FLIPS)
+    drawn = mean / np.sqrt(variance / (count - 1))
+    own = np.empty(len(gains))
+    least = np.ones(FLIPS)
+    for name in np.unique(group):
+        of = group == name
+        largest = np.sort(drawn[:, of].max(axis=1))
+        own[of] = (1 + FLIPS - np.searchsorted(largest, seen[of], side="left")) / (1 + FLIPS)
+        rank = np.searchsorted(largest, drawn[:, of].max(axis=1), side="left")
+        least = np.minimum(least, (FLIPS - rank) / FLIPS)
+    least.sort()
+    return (1 + np.searchsorted(least, own, side="right")) / (1 + FLIPS)
 
 
 def first_shares(losses: np.ndarray, seed: int = 0) -> np.ndarray:

@@ -115,7 +115,7 @@ class Race:
         if not ways:
             return []
         gains = np.array([self.log_ratio(before, losses) for losses in after])
-        chances = family_p_values(gains)
+        chances = family_p_values(gains, [way.effect for way in ways])
         best: dict[str, Standing] = {}
         for i in np.argsort(-gains.mean(axis=1), kind="stable"):
             way, losses = ways[i], after[i]

@@ -71,7 +71,14 @@ def _column_bands(rest, square, block, name, axis: Axis, values, column) -> Iter
 def _cut(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(S,) band of each value (S,), -1 where it is NaN, and the edges of the bands."""
     seen = ~np.isnan(values)
-    edges = np.unique(np.quantile(values[seen], np.linspace(0, 1, BANDS + 1)))
+    least = values[seen].min()
+    above = values[seen & (values > least)]
+    if len(above) and len(above) < (1 - 1 / BANDS) * seen.sum():
+        # Many rows share the least value, as those without any dwell do: a band of their own.
+        edges = np.append(least, np.quantile(above, np.linspace(0, 1, BANDS)))
+    else:
+        edges = np.quantile(values[seen], np.linspace(0, 1, BANDS + 1))
+    edges = np.unique(edges)
     if len(edges) == 1:
         edges = np.repeat(edges, 2)
     band = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)

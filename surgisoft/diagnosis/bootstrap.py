@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-BLOCKS = 48
+BLOCKS = 30
 """Blocks that a set of recordings is cut into; more where it has more runs."""
 LEAST_ROWS = 8
 """Fewest rows of a block, where its run has that many."""

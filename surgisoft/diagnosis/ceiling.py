@@ -11,10 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.bootstrap import block_bootstrap, block_sums, folds
-from surgisoft.diagnosis.ridge import cross_validate
+from surgisoft.diagnosis.ridge import HeldOut, cross_validate
 
-RANDOM = 500
-"""Random nonlinear features."""
+RANDOM = 350
+"""Random nonlinear features of all inputs."""
+GATED = 150
+"""Random nonlinear features of the gates alone: static errors live in few dimensions."""
+STEEP = 2.0
+"""Steepness of those."""
 PRODUCTS = 400
 """Most products of an input and a gate; more gates are reduced to their principal components."""
 MOST_ROWS = 12_000
@@ -44,7 +48,7 @@ def ceiling(
     step = max(1, -(-len(residual) // MOST_ROWS))
     residual, inputs, gates, block = (values[::step] for values in (residual, inputs, gates, block))
     flat = residual.reshape(len(residual), -1)
-    found = cross_validate(design(inputs, gates, seed), flat, folds(block, seed=seed))
+    found = _learn(inputs, gates, flat, folds(block, seed=seed), seed)
     left = np.square(flat - found.predicted).reshape(residual.shape).sum(-1)
     before = np.square(residual).sum(-1)
     if np.nansum(left) > np.nansum(before):
@@ -71,12 +75,28 @@ def _principal(values: np.ndarray, most: int) -> np.ndarray:
     return values @ vectors[:, ::-1][:, :most]
 
 
-def design(inputs: np.ndarray, gates: np.ndarray, seed: int = 0) -> np.ndarray:
-    """(S, D) the inputs (S, F), their products with the gates (S, g), random features."""
+def _learn(inputs, gates, target, fold, seed) -> HeldOut:
+    """Held-out predictions by the richest set of features that the rows can support."""
+    parts = design(inputs, gates, seed)
+    widths = tuple(np.cumsum([part.shape[1] for part in parts[:-1]]).tolist())
+    return cross_validate(np.concatenate(parts, axis=1), target, fold, widths=widths)
+
+
+def design(inputs: np.ndarray, gates: np.ndarray, seed: int = 0) -> list[np.ndarray]:
+    """Ever richer sets of features of the inputs (S, F) and gates (S, g), each (S, D).
+
+    Smooth steps of the gates; the inputs; their products with the gates; smooth steps of them.
+    """
     scale = inputs.std(axis=0)
     z = (inputs - inputs.mean(axis=0)) / np.where(scale > 1e-9, scale, 1.0)
     x = _principal(gates - gates.mean(axis=0), max(1, PRODUCTS // z.shape[1]))
     products = (z[:, :, None] * x[:, None, :]).reshape(len(z), -1)
     rng = np.random.default_rng(seed)
-    mixed = z @ rng.normal(0, 1 / np.sqrt(z.shape[1]), (z.shape[1], RANDOM))
-    return np.concatenate([z, products, np.tanh(mixed + rng.uniform(-1, 1, RANDOM))], axis=1)
+    return [_kinks(gates, GATED, STEEP, rng), z, products, _kinks(z, RANDOM, 1.0, rng)]
+
+
+def _kinks(values: np.ndarray, number: int, steep: float, rng: np.random.Generator) -> np.ndarray:
+    """(S, number) smooth steps across random directions of the values (S, F)."""
+    width = values.shape[1]
+    mixed = values @ rng.normal(0, steep / np.sqrt(width), (width, number))
+    return np.tanh(mixed + rng.uniform(-steep, steep, number))

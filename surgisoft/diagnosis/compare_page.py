@@ -27,6 +27,8 @@ PICTURES = {
     "error": "The error over the rows",
 }
 """Caption of each picture by the stem of its file."""
+BROAD_PX = 620
+"""Width below which the pictures scroll, pixels."""
 
 
 def compare_page(
@@ -45,7 +47,7 @@ def compare_page(
             Section(
                 "Measured and predicted",
                 [
-                    Picture.from_file(path, PICTURES.get(path.stem, path.stem), PICTURES[path.stem])
+                    Picture.from_file(path, PICTURES[path.stem], PICTURES[path.stem], BROAD_PX)
                     for path in pictures
                     if path.stem in PICTURES
                 ],

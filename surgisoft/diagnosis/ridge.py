@@ -17,6 +17,8 @@ class HeldOut:
 
     predicted: np.ndarray
     """(S, k) predictions; every row by the fit that left its fold out."""
+    width: int
+    """Number of features, constant ones not counted, with the smallest held-out error."""
     penalty: float
     """The penalty with the smallest held-out error."""
 
@@ -26,29 +28,32 @@ def cross_validate(
     target: np.ndarray,
     fold: np.ndarray,
     penalties: tuple[float, ...] = PENALTIES,
+    widths: tuple[int, ...] = (),
 ) -> HeldOut:
     """Ridge predictions of target (S, k) from design (S, F), fold (S,) after fold left out.
 
     The intercept is not penalised. A row with NaN in its target is left out of the fit, but gets a
-    prediction. Of the penalties the best on the held-out rows is taken, the same
-    for all columns and folds.
+    prediction. widths: numbers of leading features that make simpler regressions. Of
+    all widths and penalties the best on the held-out rows is taken, the same for all columns and
+    folds.
     """
-    x = _standardised(design)
-    predicted = np.zeros((len(penalties), *target.shape))
+    x, kept = _standardised(design)
+    tries = [(int(kept[:w].sum()), p) for w in (*widths, len(kept)) for p in penalties]
+    predicted = np.zeros((len(tries), *target.shape))
     for columns in _alike(target):
         seen = ~np.isnan(target[:, columns]).any(axis=1)
         if seen.any():
-            predicted[:, :, columns] = _predict(x, target[:, columns], seen, fold, penalties)
+            predicted[:, :, columns] = _predict(x, target[:, columns], seen, fold, tries)
     error = [np.nansum(np.square(each - target)) for each in predicted]
     best = int(np.argmin(error))
-    return HeldOut(predicted[best], penalties[best])
+    return HeldOut(predicted[best], tries[best][0], tries[best][1])
 
 
-def _standardised(design: np.ndarray) -> np.ndarray:
-    """(S, F') columns of mean 0 and variance 1; constant ones are dropped."""
+def _standardised(design: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(S, F') columns of mean 0 and variance 1, and which (F,) were kept: constant ones are not."""
     spread = design.std(axis=0)
     kept = spread > 1e-9 * np.maximum(np.abs(design).max(axis=0, initial=0), 1e-300)
-    return (design[:, kept] - design[:, kept].mean(axis=0)) / spread[kept]
+    return (design[:, kept] - design[:, kept].mean(axis=0)) / spread[kept], kept
 
 
 def _alike(target: np.ndarray) -> list[np.ndarray]:
@@ -62,8 +67,8 @@ def _alike(target: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(which == group) for group in range(which.max() + 1)]
 
 
-def _predict(x, target, seen, fold, penalties) -> np.ndarray:
-    """(penalties, S, k) held-out predictions of columns that miss the same rows."""
+def _predict(x, target, seen, fold, tries) -> np.ndarray:
+    """(tries, S, k) held-out predictions of columns that miss the same rows."""
     x = np.concatenate([np.ones((len(x), 1)), x], axis=1)
     grams, moments = [], []
     for part in range(int(fold.max()) + 1):
@@ -71,13 +76,14 @@ def _predict(x, target, seen, fold, penalties) -> np.ndarray:
         grams.append(x[rows].T @ x[rows])
         moments.append(x[rows].T @ target[rows])
     whole, moment = sum(grams), sum(moments)
-    answer = np.empty((len(penalties), *target.shape))
+    answer = np.empty((len(tries), *target.shape))
     for part, (gram, own) in enumerate(zip(grams, moments, strict=True)):
         rows = fold == part
         left = max(int((seen & ~rows).sum()), 1)
-        for number, penalty in enumerate(penalties):
-            ridge = np.full(x.shape[1], penalty * left)
+        for number, (width, penalty) in enumerate(tries):
+            ridge = np.full(1 + width, penalty * left)
             ridge[0] = 1e-9 * left
-            solved = cho_solve(cho_factor(whole - gram + np.diag(ridge)), moment - own)
-            answer[number, rows] = x[rows] @ solved
+            own_gram = (whole - gram)[: 1 + width, : 1 + width] + np.diag(ridge)
+            solved = cho_solve(cho_factor(own_gram), (moment - own)[: 1 + width])
+            answer[number, rows] = x[rows, : 1 + width] @ solved
     return answer

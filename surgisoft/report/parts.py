@@ -11,6 +11,8 @@ from surgisoft.errors import InputError
 
 KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 """Picture files that can be embedded, by suffix."""
+LONG_CELL = 24
+"""Letters above which a cell of a table is broken into lines, but not into a column of words."""
 
 
 class Part(Protocol):
@@ -105,7 +107,8 @@ def _flush(right: bool) -> str:
 def _cell(cell: str | Share, right: bool) -> str:
     if isinstance(cell, Share):
         return f'<td class="share">{cell.to_html()}</td>'
-    return f"<td{_flush(right)}>{html.escape(cell)}</td>"
+    attribute = _flush(right) or (' class="long"' if len(cell) > LONG_CELL else "")
+    return f"<td{attribute}>{html.escape(cell)}</td>"
 
 
 def _is_numeric(cells: Sequence[str | Share]) -> bool:
@@ -128,22 +131,25 @@ class Picture:
     """A line below it."""
     kind: str = "image/png"
     """MIME type of `data`."""
+    least_px: int = 0
+    """Width below which it scrolls in its own frame instead of shrinking further, pixels."""
 
     @classmethod
-    def from_file(cls, path: Path, alt: str, caption: str = "") -> "Picture":
+    def from_file(cls, path: Path, alt: str, caption: str = "", least_px: int = 0) -> "Picture":
         """A picture file; its suffix says what it is."""
         kind = KINDS.get(path.suffix.lower())
         if kind is None:
             raise InputError(f"{path}: suffix '{path.suffix}', expected one of {', '.join(KINDS)}")
-        return cls(path.read_bytes(), alt, caption, kind)
+        return cls(path.read_bytes(), alt, caption, kind, least_px)
 
     def to_html(self) -> str:
         data = base64.b64encode(self.data).decode("ascii")
         caption = f"<figcaption>{html.escape(self.caption)}</figcaption>" if self.caption else ""
         framed = ' class="photo"' if self.kind != "image/svg+xml" else ""
         source = f"data:{self.kind};base64,{data}"
-        image = f'<img{framed} alt="{html.escape(self.alt)}" src="{source}">'
-        return f"<figure>{image}{caption}</figure>"
+        least = f' style="min-width:{self.least_px}px"' if self.least_px else ""
+        image = f'<img{framed}{least} alt="{html.escape(self.alt)}" src="{source}">'
+        return f'<figure><div class="wide">{image}</div>{caption}</figure>'
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ gap:12px;margin:16px 0}}
 .facts div{{background:var(--card);border-radius:4px;padding:10px 14px}}
 dd{{margin:0;font-size:1.25rem;font-variant-numeric:tabular-nums;overflow-wrap:anywhere}}
 .wide{{overflow-x:auto;margin:0 0 16px}}
+figure .wide{{margin:0 0 4px}}
+.long{{min-width:18em}}
 table{{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}}
 th,td{{text-align:left;padding:5px 18px 5px 0;border-bottom:1px solid var(--line);
 vertical-align:top}}

@@ -1,0 +1,128 @@
+"""Residuals of known cause depend most on the axis that physics says."""
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis.axes import AXES, gravity_angle, known, shares
+from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.residuals import residuals
+from tests.diagnosis.synthetic import (
+    POINTS,
+    backlash,
+    recording,
+    relaxation,
+    resting_together,
+    still_model,
+    walk,
+)
+
+ROWS = 2000
+SLOPE = 0.1 * np.arange(ROWS) / ROWS
+
+
+def shift(u):
+    """The tip is 0.3 s late: u(t) - u(t - 0.3 s), for u = chamber 1."""
+    return 0.8 * (np.concatenate([np.repeat(u[:1, 0], 3), u[:-3, 0]]) - u[:, 0])
+
+
+CAUSES = {
+    "gain": (walk, lambda u: 0.15 * (u[:, 0] - 5), {"pressure"}),
+    "lag": (walk, shift, {"rate", "lag"}),
+    "creep in motion": (
+        walk,
+        lambda u: 0.3 * (u[:, 0] - relaxation(u[:, 0], 20.0)),
+        {"past actuation"},
+    ),
+    "settling at rest": (
+        resting_together,
+        lambda u: 0.5 * -np.expm1(-0.1 * _rested(u) / 6.0),
+        {"dwell", "past actuation"},
+    ),
+    "backlash": (
+        walk,
+        lambda u: 0.3 * (u[:, 0] - backlash(u[:, 0], 0.8)),
+        {"direction", "since reversal"},
+    ),
+    "drift": (walk, lambda u: 8.0 * SLOPE * u[:, 1] / 5, {"elapsed time"}),
+}
+
+
+def _rested(u):
+    """(T,) rows since the actuation last changed."""
+    changed = (np.diff(u, axis=0, prepend=u[:1]) != 0).any(1)
+    rows = np.arange(len(u))
+    return rows - np.maximum.accumulate(np.where(changed, rows, 0))
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_the_axis_of_the_cause_comes_first(name):
+    schedule, cause, expected = CAUSES[name]
+    pressure = schedule(ROWS, seed=4)
+    effect = cause(pressure)
+    found = shares(residuals(still_model(), [recording(effect - effect.mean(), pressure)]))
+    first = found[0] if "pressure" in expected else next(a for a in found if not a.static)
+    assert first.axis in expected
+    assert first.ci95[0] > 0.05
+
+
+def test_softening_goes_with_the_largest_actuation_so_far():
+    """Fifteen runs, each up to another level: the largest so far starts afresh in each."""
+    run = np.repeat(np.arange(15), 150)
+    reach = np.random.default_rng(2).uniform(0.3, 1.0, 15)[run]
+    pressure = walk(len(run), seed=4) * reach[:, None]
+    largest = [np.maximum.accumulate(pressure[run == name, 0]) for name in range(15)]
+    made = recording(0.2 * (np.concatenate(largest) - 6), pressure, run=run)
+    result, _ = compare(still_model(), [made])
+    assert next(each for each in result.axes if not each.static).axis == "largest so far"
+    assert "on largest so far" in result.sentence
+
+
+def test_temperature_explains_what_goes_along_with_it():
+    pressure = walk(ROWS)
+    warm = 24 + 3 * np.sin(np.arange(ROWS) / 170)
+    made = recording(0.2 * (warm - 24), pressure, temp_C=warm)
+    first = shares(residuals(still_model(), [made]))[0]
+    assert first.axis == "temperature"
+    assert first.share > 0.6
+
+
+def test_noise_depends_on_nothing():
+    made = recording(np.zeros(ROWS), walk(ROWS))
+    result, _ = compare(still_model(), [made])
+    assert all(each.share < 0.02 for each in result.axes)
+    assert result.main_axes == []
+    assert "stands at the floor" in result.sentence
+
+
+def test_axes_without_values_are_left_out():
+    """A still model has no azimuth; settled points no time; nobody measured a temperature."""
+    settled = recording(np.zeros(200), walk(200), kind="settled")
+    names = set(known(residuals(still_model(), [settled])))
+    assert names == {"pressure", "direction", "since reversal", "elapsed time", "largest so far"}
+    timed = set(known(residuals(still_model(), [recording(np.zeros(200), walk(200))])))
+    assert timed == names | {"rate", "lag", "past actuation", "dwell"}
+    assert timed < set(AXES)
+
+
+def test_angle_to_the_weight():
+    """A body that bends to where the weight pulls is at 0 degrees, to its left at +90."""
+    pressure = walk(20)
+    for bend, angle in (((3.0, 0.0), 0.0), ((0.0, 3.0), 90.0), ((-3.0, 1e-9), 180.0)):
+        points = POINTS.copy()
+        rest = residuals(
+            still_model(), [recording(np.zeros(20), pressure, gravity=np.array([0.6, 0.0, 0.8]))]
+        )
+        points[-1, :2] += bend
+        rest.predicted_mm[:] = points
+        assert gravity_angle(rest) == pytest.approx(np.full(20, angle), abs=1e-6)
+
+
+@pytest.mark.parametrize(("chambers", "points"), [(1, POINTS[-1:]), (6, POINTS), (4, POINTS[1:])])
+def test_any_number_of_chambers_and_key_points(chambers, points):
+    pressure = walk(600, chambers)
+    made = recording(0.2 * pressure[:, -1], pressure, points)
+    made.key_points_mm[::7, -1] = np.nan
+    result, rest = compare(still_model(chambers, points), [made])
+    assert rest.body_mm.shape == (600, len(points), 3)
+    assert result.axes[0].axis == "pressure"
+    assert result.ceiling.rmse_mm < 0.6 * result.rmse_mm

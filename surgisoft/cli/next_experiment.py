@@ -1,0 +1,101 @@
+"""`surgisoft next-experiment`: the schedule that best tells rival effects apart."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.files import check_free, write_text
+from surgisoft.errors import InputError
+
+
+@app.command("next-experiment")
+def next_experiment(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="REC", help="What was recorded so far; may be left out."),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="SCHEDULE.csv", help="New schedule file.")
+    ] = Path("next_experiment.csv"),
+    between: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME...",
+            help="The rival effects; default: those that explain the recordings best, "
+            "without recordings all known ones.",
+        ),
+    ] = None,
+    minutes: Annotated[float, typer.Option(help="Longest time on the bench, minutes.")] = 15.0,
+    as_it_stands: Annotated[
+        bool, typer.Option("--as-it-stands", help="Ask for no change of the bench itself.")
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing schedule.")] = False,
+) -> None:
+    """Find the experiment that best tells rival effects apart, ready for the rig."""
+    from surgisoft.diagnosis.experiments import AS_IT_STANDS, SETTINGS, schedule_text
+    from surgisoft.diagnosis.next_experiment import likely_rivals, propose, recommend
+    from surgisoft.diagnosis.problem import pose
+    from surgisoft.measurement.recording import load_recordings
+    from surgisoft.surrogate.checkpoint import load_model
+
+    if output.suffix != ".csv":
+        raise InputError(
+            f"{output}: suffix '{output.suffix}', expected .csv, as `collect` reads it"
+        )
+    if output.exists() and not force:
+        raise InputError(f"{output}: exists already; choose another name or use --force")
+    check_free(json_file, "separates")
+    arm = load_model(model)
+    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
+    if recordings:
+        measured = load_recordings(recordings, on_warning=_warn)
+        for name in {r.label for r in measured if _turned(arm.spec.gravity, r.gravity)}:
+            _warn(f"{name}: the weight pulls along another direction than where MODEL was fitted")
+        problem = pose(arm, measured)
+        answer = recommend(problem, between or likely_rivals(problem), minutes, settings)
+    else:
+        answer = propose(arm, between, minutes, settings)
+    write_text(output, schedule_text(answer.protocol))
+    if json_file:
+        write_text(json_file, json.dumps(answer.to_json(), indent=2) + "\n")
+    _show(answer, model, recordings or [], output)
+
+
+def _warn(text: str) -> None:
+    typer.echo(f"surgisoft: warning: {text}", err=True)
+
+
+def _turned(fitted, came) -> bool:
+    """Whether two directions of weight (3,) differ by more than 5 degrees (cos 0.9962)."""
+    if fitted is None or came is None:
+        return False
+    return sum(a * b for a, b in zip(fitted, came, strict=True)) < 0.9962
+
+
+def _show(answer, model: Path, recordings: list[Path], output: Path) -> None:
+    from surgisoft.diagnosis.isolability import SURE
+
+    print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
+    print(f"why: {answer.why}")
+    for number, step in enumerate(answer.steps, 1):
+        print(f"  {number}. {step}")
+    options = f" {answer.options}" if answer.options else ""
+    old = "".join(f" {path}" for path in recordings)
+    print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
+    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
+    for pair in sorted(answer.pairs, key=lambda pair: pair.after):
+        a, b = pair.effects
+        print(
+            f"  {a} or {b}: expected chance of the right one {pair.before:.2f} -> {pair.after:.2f}"
+        )
+    open_ = [pair for pair in answer.pairs if pair.effects not in answer.separates]
+    if open_:
+        print(f"{len(open_)} of {len(answer.pairs)} pairs stay below {SURE:g} in this time")
+    print(f"wrote {output}: {len(answer.protocol.run_rows)} runs, {answer.protocol.unit}")

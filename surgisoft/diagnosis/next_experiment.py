@@ -1,0 +1,214 @@
+"""The experiment that best tells rival effects apart: model discrimination design.
+
+Every figure of the catalogue is predicted through the model with each rival at the strengths that
+the recordings so far suggest. Figures are added one by one, each time the one that raises most the
+expected log probability of naming the right rival, over all pairs, whichever is true (Hunter &
+Reiner 1965; Box & Hill 1967). The same is done for every change of the bench that touches a rival.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from surgisoft.diagnosis.experiments import (
+    AS_IT_STANDS,
+    FIGURES,
+    RUN_S,
+    SETTINGS,
+    bench_minutes,
+    limits_within,
+    schedule,
+)
+from surgisoft.diagnosis.isolability import SURE, Isolability
+from surgisoft.diagnosis.next_experiment_plans import (
+    LEAST_RUNS,
+    TARGET,
+    Plan,
+    make_plans,
+    pairs_of,
+)
+from surgisoft.diagnosis.next_experiment_question import Question, pose_question
+from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.verdict import Experiment
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.protocols import Protocol
+from surgisoft.surrogate.effects import known_effects, make_effect
+from surgisoft.surrogate.model import ArmModel
+
+MINUTES = 15.0
+"""Longest time on the bench where none is asked for, minutes."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two rivals and the expected chance to name the right one, whichever it is."""
+
+    effects: tuple[str, str]
+    """Their names."""
+    before: float
+    """With the recordings so far, 0.5 to 1."""
+    after: float
+    """With the experiment too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """What to do on the bench next, and what it is worth."""
+
+    name: str
+    """Its name: the figures and the change of the bench."""
+    protocol: Protocol
+    """The schedule, ready for the rig."""
+    setting: str
+    """Name of the change of the bench."""
+    minutes: float
+    """Time on the bench, rests and changes included, minutes."""
+    pairs: tuple[Pair, ...]
+    """Every pair of rivals."""
+    steps: tuple[str, ...]
+    """What to do, in words."""
+    options: str = ""
+    """Options of `surgisoft collect` for the change of the bench on the virtual rig."""
+    isolability: Isolability | None = field(default=None, repr=False)
+    """What the recordings and the experiment together say about the rivals."""
+
+    @property
+    def separates(self) -> tuple[tuple[str, str], ...]:
+        """The pairs that it is expected to tell apart."""
+        return tuple(pair.effects for pair in self.pairs if pair.after >= SURE)
+
+    @property
+    def experiment(self) -> Experiment:
+        """In short, as a diagnosis names it."""
+        return Experiment(self.name, self.minutes, self.separates)
+
+    @property
+    def why(self) -> str:
+        """One sentence."""
+        worst = min(self.pairs, key=lambda pair: pair.before)
+        a, b = worst.effects
+        many = f"; {len(self.separates)} of {len(self.pairs)} pairs are told apart by it"
+        return (
+            f"the chance to tell {a} from {b} goes from {worst.before:.2f} to {worst.after:.2f}"
+            + (many if len(self.pairs) > 1 else "")
+        )
+
+    def to_json(self) -> dict:
+        """Plain values, as `next-experiment --json` writes them."""
+        return {
+            "name": self.name,
+            "minutes": self.minutes,
+            "setting": self.setting,
+            "collect_options": self.options,
+            "steps": list(self.steps),
+            "why": self.why,
+            "separates": [list(pair) for pair in self.separates],
+            "pairs": [
+                {"effects": list(p.effects), "before": p.before, "after": p.after}
+                for p in self.pairs
+            ],
+        }
+
+
+def recommend(
+    problem: Problem,
+    rivals: list[str] | tuple[str, ...],
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETTINGS),
+) -> Recommendation:
+    """The experiment that best tells the rivals apart, given a problem's recordings.
+
+    settings: names of the changes of the bench that may be asked for.
+    """
+    return _recommend(problem.model, problem, list(rivals), minutes, settings)
+
+
+def propose(
+    model: ArmModel,
+    rivals: list[str] | tuple[str, ...] | None = None,
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETTINGS),
+) -> Recommendation:
+    """The experiment that best tells the rivals (default: all known effects) apart, before
+    anything was recorded."""
+    return _recommend(model, None, None if rivals is None else list(rivals), minutes, settings)
+
+
+def likely_rivals(problem: Problem, most: int = 4) -> list[str]:
+    """The effects that explain the residual of a problem best: those that one could confuse.
+
+    The best one, and up to `most` in all whose log evidence is at least half of its own; the two
+    best where that is one alone.
+    """
+    question = pose_question(problem.model, problem)
+    gains = question.gains
+    best: dict[str, float] = {}
+    for owner, gain in zip(question.owners, gains, strict=True):
+        best[owner] = max(best.get(owner, -np.inf), gain)
+    order = sorted(best, key=lambda name: -best[name])
+    near = [name for name in order if best[name] >= 0.5 * best[order[0]]]
+    return order[:2] if len(near) < 2 else near[:most]
+
+
+def _recommend(model, problem, rivals, minutes, settings) -> Recommendation:
+    rivals = None if rivals is None else list(dict.fromkeys(rivals))
+    _check(model, rivals, minutes)
+    question = pose_question(model, problem, rivals)
+    limits = limits_within(model.spec.low, model.spec.high)
+    for name in settings:
+        if name not in SETTINGS:
+            raise unknown_name("change of the bench", name, SETTINGS)
+    plans = make_plans(question, limits, minutes, settings)
+    good = [plan for plan in plans if plan.worst >= TARGET]
+    plan = min(good, key=lambda p: p.minutes) if good else max(plans, key=lambda p: p.worst)
+    return _worded(question, plan, limits)
+
+
+def _check(model: ArmModel, rivals: list[str] | None, minutes: float) -> None:
+    for name in rivals or []:
+        if name not in known_effects():
+            make_effect(name, model.facts)
+    if rivals is not None and len(rivals) < 2:
+        raise InputError(
+            f"rivals {', '.join(rivals) or 'none'}: expected at least two different effects; "
+            "name them with --between A B"
+        )
+    if not minutes >= bench_minutes(LEAST_RUNS):
+        raise InputError(
+            f"--minutes {minutes:g}: too short for {LEAST_RUNS} runs with their rests, expected at "
+            f"least {bench_minutes(LEAST_RUNS):g}"
+        )
+
+
+def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendation:
+    """A plan as something that a person can do."""
+    setting = SETTINGS[plan.setting]
+    seeds = [plan.figures[:k].count(figure) for k, figure in enumerate(plan.figures)]
+    figures = list(zip(plan.figures, seeds, strict=True))
+    names = "+".join(dict.fromkeys(plan.figures))
+    name = names if plan.setting == AS_IT_STANDS else f"{plan.setting}: {names}"
+    protocol = schedule("next_experiment", figures, limits, question.model.spec.unit)
+    before = None if question.known is None else question.judged(question.known)
+    pairs = tuple(
+        Pair((a, b), 0.5 if before is None else before.pair(a, b), plan.result.pair(a, b))
+        for a, b in pairs_of(plan.result.names)
+    )
+    options = setting.options
+    gravity = setting.gravity(question.model.facts.gravity)
+    if gravity is not None:
+        options = options.format(gravity=" ".join(f"{v:.4f}" for v in gravity))
+    what = "; ".join(
+        f"{plan.figures.count(f)} x {FIGURES[f].about}" for f in dict.fromkeys(plan.figures)
+    )
+    steps = [f"{setting.about} (about {setting.minutes:g} min)"] if setting.about else []
+    steps += [
+        f"if the error is gone then, the missing effect is {name}; if it stays, it is not"
+        for name in setting.removes
+    ]
+    steps.append(
+        f"play the schedule: {len(figures)} runs of {RUN_S / 60:g} min ({what}), each from a "
+        "vented arm that has rested half a minute"
+    )
+    return Recommendation(
+        name, protocol, plan.setting, plan.minutes, pairs, tuple(steps), options, plan.result
+    )

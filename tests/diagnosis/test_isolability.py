@@ -1,0 +1,199 @@
+"""Which effects a schedule can tell apart: against dense algebra, and against what must hold."""
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from surgisoft.diagnosis.discrepancy import body_covariance, kernel
+from surgisoft.diagnosis.isolability import (
+    Draws,
+    Isolability,
+    ambiguous_sets,
+    isolability,
+    judge,
+    uncertainty_of,
+)
+from surgisoft.diagnosis.isolability_designs import history_of_protocol
+from surgisoft.diagnosis.isolability_moments import (
+    FORM_S,
+    FORM_SHARE,
+    ROOM,
+    Moments,
+    Uncertainty,
+    inducing_points,
+    unimitated,
+)
+from surgisoft.measurement.protocols import Protocol, make_protocol
+from surgisoft.surrogate.default import default_arm
+
+LIMITS = np.array([[-15.0, 54.0]] * 3)
+NAMES = ["hysteresis", "line_lag", "creep", "rate_dependence"]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return default_arm()
+
+
+@pytest.fixture(scope="module")
+def mixed(arm):
+    return isolability(arm, make_protocol("mixed", LIMITS, 6000), NAMES)
+
+
+def sweeps(rate: float, count: int = 8, top: float = 50.0) -> Protocol:
+    """One chamber up and down at one speed, kPa/s."""
+    commands = np.zeros((2 * count + 1, 3))
+    commands[1::2, 0] = top
+    times = top / rate * np.arange(len(commands))
+    return Protocol("sweeps", "continuous", commands, np.zeros(len(commands)), times)
+
+
+def small_case(rows=40, points=3, count=4, seed=0, noise=0.1, signal=0.3):
+    rng = np.random.default_rng(seed)
+    x, d = rng.uniform(-1, 1, (rows, 2)), rng.choice([-1.0, 1.0], (rows, 2))
+    columns = rng.normal(size=(rows, points, 3, count))
+    uncertainty = Uncertainty(
+        np.full(points, noise), np.linspace(0.1, 0.3, points), np.full(points, signal), 0.05, (x, d)
+    )
+    return columns, x, d, uncertainty
+
+
+def test_moments_are_the_products_under_the_dense_covariance():
+    """Inducing points at every row make the process exact: compare with its full covariance."""
+    columns, x, d, uncertainty = small_case()
+    rows, points, _, count = columns.shape
+    seconds = 80.0
+    gram = Moments.of(columns, x, d, uncertainty, seconds).gram()
+    static = body_covariance(
+        np.sqrt((ROOM * uncertainty.surrogate_mm) ** 2 + FORM_SHARE * uncertainty.signal_mm**2)
+    )
+    density = (uncertainty.noise_mm**2 * 0.05 + FORM_SHARE * FORM_S * 0.3**2) / 3.0
+    noise = np.kron(np.eye(rows), np.diag(density)) * rows / seconds
+    whole = np.kron(kernel(x, d, x, d), static) + noise
+    expected = np.zeros((count, count))
+    for axis in range(3):
+        flat = columns[:, :, axis].reshape(rows * points, count)
+        expected += flat.T @ linalg.solve(whole, flat, assume_a="pos")
+    np.testing.assert_allclose(gram, expected, rtol=2e-3)
+
+
+def test_moments_of_two_experiments_share_the_surrogates_error():
+    """Rows one after another in one experiment or in two: the same, as the error is the same."""
+    columns, x, d, uncertainty = small_case(rows=60)
+    whole = Moments.of(columns, x, d, uncertainty, 60.0).gram()
+    first = Moments.of(columns[:25], x[:25], d[:25], uncertainty, 25.0)
+    second = Moments.of(columns[25:], x[25:], d[25:], uncertainty, 35.0)
+    np.testing.assert_allclose((first + second).gram(), whole, rtol=1e-4, atol=1e-4)
+
+
+def test_unimitated_is_the_residual_of_least_squares():
+    rng = np.random.default_rng(1)
+    field = rng.normal(size=(200, 7))
+    signals = np.zeros((7, 2))
+    signals[0, 0], signals[:3, 1] = 1.0, rng.normal(size=3)
+    shapes = [np.arange(3), np.arange(3, 5), np.array([6])]
+    left = unimitated(field.T @ field, signals, shapes)
+    for j, shape in enumerate(shapes):
+        for k in range(2):
+            y = field @ signals[:, k]
+            fit = field[:, shape] @ np.linalg.lstsq(field[:, shape], y, rcond=None)[0]
+            assert left[j, k] == pytest.approx(((y - fit) ** 2).sum(), rel=1e-3, abs=1e-6)
+
+
+def test_identical_columns_cannot_be_told_apart_and_single_ones_are_symmetric():
+    columns, x, d, uncertainty = small_case(count=3)
+    columns[..., 1] = 1.7 * columns[..., 0]
+    moments = Moments.of(columns, x, d, uncertainty, 40.0)
+    draws = Draws(np.eye(3), np.arange(3))
+    result = judge(moments, draws, ["a", "b", "c"], [np.array([k]) for k in range(3)])
+    assert result.separability[0, 1] == pytest.approx(0.0, abs=1e-4)
+    assert result.confidence[0, 1] == pytest.approx(0.5, abs=0.02)
+    assert result.separability[0, 2] > 0.5
+    np.testing.assert_allclose(result.separability, result.separability.T, atol=1e-4)
+    assert ((result.separability >= 0.0) & (result.separability <= 1.0)).all()
+
+
+def test_less_noise_and_more_columns_of_the_rival_work_in_opposite_ways():
+    draws = Draws(np.eye(4)[:, :1], np.array([0]))
+    evidence = []
+    for noise in (3.0, 1.0, 0.3):
+        columns, x, d, uncertainty = small_case(noise=noise, signal=0.01)
+        gram = Moments.of(columns, x, d, uncertainty, 2.0).gram()
+        left = unimitated(gram, draws.strengths, [np.array([1]), np.array([1, 2, 3])])[:, 0]
+        assert left[1] < left[0]
+        evidence.append(left[0])
+    assert evidence[0] < evidence[1] < evidence[2]
+
+
+def test_with_one_speed_play_imitates_lag_and_varied_motion_tells_them_apart(arm, mixed):
+    poor = isolability(arm, sweeps(6.0), NAMES)
+    a, b = poor.names.index("line_lag"), poor.names.index("hysteresis")
+    assert poor.separability[a, b] < 0.06
+    assert any({"line_lag", "hysteresis"} <= set(names) for names in ambiguous_sets(poor))
+    a, b = mixed.names.index("line_lag"), mixed.names.index("hysteresis")
+    assert mixed.separability[a, b] > 0.3
+    assert not any({"line_lag", "hysteresis"} <= set(names) for names in ambiguous_sets(mixed))
+
+
+def test_a_schedule_that_stays_at_rest_shows_nothing(arm):
+    still = Protocol("still", "continuous", np.zeros((2, 3)), np.zeros(2), np.array([0.0, 120.0]))
+    result = isolability(arm, still, ["line_lag", "creep"])
+    assert result.detectable.max() < 1e-3
+    assert not result.seen.any()
+    assert result.pair("line_lag", "creep") == pytest.approx(0.5, abs=0.01)
+
+
+def test_longer_and_larger_tells_more(arm, mixed):
+    shorter = isolability(arm, make_protocol("mixed", LIMITS, 1500), NAMES)
+    smaller = isolability(arm, make_protocol("mixed", LIMITS, 6000), NAMES, size_mm=0.1)
+    off = ~np.eye(len(NAMES), dtype=bool)
+    assert shorter.log_evidence[off].mean() < 0.6 * mixed.log_evidence[off].mean()
+    assert smaller.confidence[off].mean() < mixed.confidence[off].mean()
+    assert mixed.minutes == pytest.approx(5.0, abs=0.1)
+    np.testing.assert_allclose(
+        mixed.log_evidence_per_minute * mixed.minutes, mixed.log_evidence, rtol=1e-9
+    )
+
+
+def test_settled_protocols_hide_what_is_over_when_the_arm_has_settled(arm):
+    result = isolability(arm, make_protocol("traverse", LIMITS, 300), ["line_lag", "inertia"])
+    assert result.pair("line_lag", "inertia") < 0.9
+
+
+def test_a_protocol_becomes_the_history_that_is_commanded(arm):
+    protocol = sweeps(10.0, 2)
+    history = history_of_protocol(arm, protocol)
+    assert float(history.pressure.max()) == pytest.approx(50.0, abs=1e-4)
+    assert float(history.t_s.max()) == pytest.approx(20.0, abs=0.11)
+    settled = make_protocol("grid", LIMITS, 64)
+    rows = history_of_protocol(arm, settled)
+    assert int(rows.valid.sum()) == len(settled.commands)
+    kept = rows.rows(rows.pressure).numpy()
+    np.testing.assert_allclose(kept, settled.commands, atol=1e-4)
+
+
+def test_ambiguous_sets_are_the_largest_in_which_all_are_near():
+    chance = np.full((4, 4), 0.99)
+    for a, b, value in ((0, 1, 0.6), (1, 2, 0.7), (0, 2, 0.94), (2, 3, 0.8)):
+        chance[a, b] = value
+    empty = np.zeros((4, 4))
+    result = Isolability(
+        ("a", "b", "c", "d"), np.ones(4), empty, empty, empty, chance, np.ones(4), 1.0
+    )
+    assert ambiguous_sets(result) == [("a", "b", "c"), ("c", "d")]
+    assert ambiguous_sets(result, sure=0.5) == []
+
+
+def test_inducing_points_fill_the_range():
+    x, d = inducing_points(3)
+    assert x.min() >= -1
+    assert x.max() <= 1
+    assert set(np.unique(d)) == {-1.0, 1.0}
+    octants = {tuple(row) for row in (x > 0)}
+    assert len(octants) == 8
+
+
+def test_an_arm_without_a_stated_length_still_has_plausible_sizes(arm):
+    uncertainty = uncertainty_of(arm, None, np.full(5, 0.5), 0.05)
+    assert (uncertainty.density > 0).all()
+    assert uncertainty.surrogate_mm.shape == (5,)

@@ -1,0 +1,195 @@
+"""The recommended experiment: runs on the rig, stays in range, and tells rivals apart."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.experiments import (
+    AS_IT_STANDS,
+    FIGURES,
+    RUN_S,
+    SETTINGS,
+    bench_minutes,
+    draw_run,
+    limits_within,
+    schedule,
+    schedule_text,
+)
+from surgisoft.diagnosis.isolability import isolability
+from surgisoft.diagnosis.next_experiment import likely_rivals, propose, recommend
+from surgisoft.diagnosis.next_experiment_plans import make_plans
+from surgisoft.diagnosis.next_experiment_question import pose_question
+from surgisoft.diagnosis.problem import pose
+from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import load_schedule, make_protocol
+from surgisoft.measurement.recording import save_recording
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.default import default_arm
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return default_arm()
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    """Five minutes of an arm with a hidden line lag."""
+    rig = VirtualRig(0, take=3, hidden=[("line_lag", 1.0)])
+    return rig.record(make_protocol("mixed", rig.limits, 4500, seed=1))[0]
+
+
+@pytest.fixture(scope="module")
+def problem(arm, lagging):
+    return pose(arm, [lagging])
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize(
+    "limits", [[[-15.0, 54.0]] * 3, [[0.0, 1.0]], [[-90.0, 90.0]] * 6, [[2.0, 9.0], [0.0, 30.0]]]
+)
+def test_every_figure_stays_in_range_and_lasts_its_time(name, limits):
+    limits = np.array(limits)
+    times, rows = draw_run(name, limits, seed=4)
+    assert times[0] == 0.0
+    assert times[-1] == pytest.approx(RUN_S)
+    assert (np.diff(times) > 0).all()
+    assert (rows >= limits[:, 0] - 1e-12).all()
+    assert (rows <= limits[:, 1] + 1e-12).all()
+    assert np.ptp(rows, axis=0).max() > 0.15 * np.ptp(limits, axis=1).max()
+    again = draw_run(name, limits, seed=4)
+    np.testing.assert_array_equal(rows, again[1])
+
+
+def test_commands_keep_clear_of_the_ends_of_the_arms_range(arm):
+    limits = limits_within(arm.spec.low, arm.spec.high)
+    assert (limits[:, 0] > np.array(arm.spec.low)).all()
+    assert (limits[:, 1] < np.array(arm.spec.high)).all()
+    assert (limits_within([0.0], [10.0]) == [[0.0, 9.8]]).all()  # rest stays inside
+
+
+def test_a_schedule_is_read_back_as_it_was_written(tmp_path):
+    protocol = schedule("x", [("steps", 0), ("steps", 1)], np.array([[-15.0, 54.0]] * 3), "kPa")
+    path = tmp_path / "x.csv"
+    path.write_text(schedule_text(protocol))
+    back = load_schedule(path)
+    np.testing.assert_allclose(back.commands, protocol.commands, atol=1e-4)
+    np.testing.assert_allclose(back.t_s, protocol.t_s, atol=1e-3)
+    assert (back.run == protocol.run).all()
+    assert back.unit == "kPa"
+    assert not np.array_equal(back.commands[back.run == 0], back.commands[back.run == 1])
+
+
+def test_turned_benches_have_the_rigs_own_gravity():
+    weight = np.array([0.42, 0.1, 0.9])
+    weight /= np.linalg.norm(weight)
+    for name, setting in SETTINGS.items():
+        if setting.roll_deg:
+            truth = VirtualRig(0, gravity=weight, roll_deg=setting.roll_deg).gravity
+            np.testing.assert_allclose(setting.gravity(weight), truth, atol=1e-12)
+            assert setting.options == f"--roll-deg {setting.roll_deg:g}", name
+    np.testing.assert_allclose(SETTINGS["upside_down"].gravity(weight), -weight)
+
+
+def test_the_recommended_schedule_runs_on_the_rig(arm):
+    answer = propose(arm, ["creep", "line_lag"], minutes=5.0)
+    rig = VirtualRig(0)
+    recording, _ = rig.record(answer.protocol)
+    assert recording.t_s[-1] / 60 <= answer.minutes <= 5.0
+    assert len(recording.runs) == len(answer.protocol.run_rows)
+    assert answer.separates == (("creep", "line_lag"),)
+    assert answer.experiment.minutes == answer.minutes
+
+
+def test_the_plan_tells_more_than_any_one_of_other_schedules(arm):
+    """Against the isolability of schedules that were not chosen, as long as the plan."""
+    limits = limits_within(arm.spec.low, arm.spec.high)
+    names = ["hysteresis", "line_lag"]
+    plan = make_plans(pose_question(arm, None, names), limits, 5.0, (AS_IT_STANDS,))[0]
+    for figure in ("ramps", "wander", "reversals"):
+        if set(plan.figures) != {figure}:
+            twice = schedule("x", [(figure, 0), (figure, 1)], limits, "kPa")
+            assert plan.worst >= isolability(arm, twice, names, rows=300).pair(*names) - 0.02
+
+
+def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(problem):
+    rivals = likely_rivals(problem)
+    assert rivals[0] in ("line_lag", "rate_dependence")
+    assert len(rivals) >= 2
+    answer = recommend(problem, ["line_lag", "rate_dependence"])
+    pair = answer.pairs[0]
+    assert pair.before < 0.95 < pair.after
+    assert answer.setting == "short_tube"
+    assert answer.minutes <= 15.0
+    assert any("tube" in step for step in answer.steps)
+    left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))
+    assert left.setting == AS_IT_STANDS
+    assert left.pairs[0].after < pair.after
+
+
+def test_more_time_never_tells_less(arm):
+    rivals = ["line_lag", "rate_dependence"]
+    chances = [
+        propose(arm, rivals, minutes, (AS_IT_STANDS,)).pairs[0].after for minutes in (5.0, 10.0)
+    ]
+    assert chances[0] <= chances[1] + 0.02
+
+
+def test_where_gravity_is_not_known_no_bench_is_turned(arm):
+    from surgisoft.surrogate.model import ArmModel
+
+    spec = replace(arm.spec, gravity=None)
+    free = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    limits = limits_within(spec.low, spec.high)
+    question = pose_question(free, None, ["payload", "gain_mismatch"])
+    plans = make_plans(question, limits, 8.0, tuple(SETTINGS))
+    assert {plan.setting for plan in plans} == {AS_IT_STANDS, "bare_tip"}
+
+
+@pytest.mark.parametrize(
+    ("rivals", "minutes", "said"),
+    [
+        (["creep"], 15.0, "at least two different effects"),
+        (["creep", "creep"], 15.0, "at least two different effects"),
+        (["creep", "drft"], 15.0, "unknown effect 'drft'"),
+        (["creep", "drift"], 4.0, f"at least {bench_minutes(2):g}"),
+        (["creep", "drift"], float("nan"), "too short"),
+    ],
+)
+def test_bad_questions_are_told_in_one_line(arm, rivals, minutes, said):
+    with pytest.raises(InputError, match=said) as caught:
+        propose(arm, rivals, minutes)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):
+    model = str(files("surgisoft") / "assets" / "default_arm")
+    data, out, numbers = (tmp_path / name for name in ("r.parquet", "s.csv", "s.json"))
+    save_recording(lagging, data)
+    between = ["--between", "line_lag", "hysteresis"]
+    bad = [
+        ([model, "-o", str(tmp_path / "s.txt")], "expected .csv"),
+        ([str(tmp_path / "none"), "-o", str(out)], "no arm model there"),
+        ([model, "-o", str(out), "--between", "creep"], "at least two"),
+        ([model, str(tmp_path / "x.csv"), "-o", str(out)], "x.csv"),
+    ]
+    for arguments, said in bad:
+        assert run(["next-experiment", *arguments]) == 2
+        message = capsys.readouterr().err
+        assert said in message
+        assert message.count("\n") == 1
+        assert not out.exists()
+    arguments = ["next-experiment", model, str(data), "-o", str(out), "--json", str(numbers)]
+    assert run([*arguments, *between]) == 0
+    printed = capsys.readouterr().out
+    assert f"surgisoft collect {out}" in printed
+    content = json.loads(numbers.read_text())
+    assert content["minutes"] <= 15
+    assert content["pairs"][0]["effects"] == ["line_lag", "hysteresis"]
+    assert load_schedule(out).chambers == 3
+    assert run([*arguments, *between]) == 2
+    assert "exists already" in capsys.readouterr().err

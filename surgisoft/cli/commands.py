@@ -10,6 +10,7 @@ from surgisoft.cli import (
     evaluate,
     fit,
     import_,
+    next_experiment,
     replay,
     scene,
     train,

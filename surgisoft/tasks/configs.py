@@ -8,6 +8,7 @@ from typing import Any
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
+from surgisoft.tasks.keyhole import KeyholeConfig
 from surgisoft.tasks.laser_plane import LaserPlaneConfig
 from surgisoft.tasks.track import SQUARE, TrackConfig
 from surgisoft.tasks.track_body import TrackBodyConfig
@@ -18,6 +19,7 @@ CONFIGS: dict[str, Any] = {
     "track_square": SQUARE,
     "track_body": TrackBodyConfig(),
     "laser_plane": LaserPlaneConfig(),
+    "keyhole": KeyholeConfig(),
     "circle_ablation": CircleAblationConfig(),
 }
 """Name -> the configuration that the task has without one."""

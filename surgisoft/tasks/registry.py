@@ -7,6 +7,7 @@ import torch
 from surgisoft.errors import unknown_name
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.keyhole import Keyhole
 from surgisoft.tasks.laser_plane import laser_plane
 from surgisoft.tasks.track import track_circle, track_square
 from surgisoft.tasks.track_body import TrackBody
@@ -16,6 +17,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "track_square": track_square,
     "track_body": TrackBody,
     "laser_plane": laser_plane,
+    "keyhole": Keyhole,
     "circle_ablation": CircleAblation,
 }
 """Name -> builder(config=None, device="cpu"); without a config the task's own."""

@@ -18,7 +18,7 @@ from surgisoft.tasks.base import Task
 from surgisoft.tasks.port import Port, unseeded
 from surgisoft.tasks.registry import make_task
 
-ONE_ARM = ("track_circle", "track_square", "track_body", "laser_plane")
+ONE_ARM = ("track_circle", "track_square", "track_body", "laser_plane", "keyhole")
 """Tasks of one agent."""
 
 

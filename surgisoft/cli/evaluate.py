@@ -96,8 +96,8 @@ def evaluate(
         from surgisoft.replay.episode_view import write_replay
 
         with progress("replay") as report:
-            write_replay(log, replay, report=report)
-        print(f"wrote {replay}")
+            written = write_replay(log, replay, report=report)
+        print(f"wrote {written}")
 
 
 def _check_files(json_file: Path | None, replay: Path | None) -> None:

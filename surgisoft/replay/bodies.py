@@ -7,7 +7,7 @@ import rerun as rr
 
 from surgisoft.replay.colours import ARM_COLOURS, BAND_COLOURS, CHARRED, SHAFT_COLOUR
 from surgisoft.replay.recording import Columns
-from surgisoft.replay.shapes import tube
+from surgisoft.replay.shapes import BORE_RINGS, tube
 from surgisoft.scene import frames
 from surgisoft.tasks.episode_parts import ArmLog
 
@@ -112,9 +112,8 @@ def _sleeve(radius_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _log_tip(columns: Columns, entity: str, rows, tip_mm, aim, radius_mm: float, colour) -> None:
     """The bevelled end with its channel, at tips (R, 3) mm along (R, 3)."""
     line = np.array([[0.0, 0.0, -1.5 * TIP_MM], [0.0, 0.0, -0.5 * TIP_MM], [0.0, 0.0, 0.0]])
-    vertices, faces, normals = tube(line, radius_mm, BORE_MM)
-    hole = np.linalg.norm(vertices[:, :2], axis=1) <= 1.01 * BORE_MM
-    hole &= vertices[:, 2] > -1.2 * BORE_MM
+    vertices, faces, normals = tube(line, radius_mm, BORE_MM, SIDES)
+    hole = np.arange(len(vertices)) >= len(vertices) - BORE_RINGS * SIDES
     colours = np.where(hole[:, None], CHARRED, colour).astype(np.uint8)
     still = rr.Mesh3D(
         vertex_positions=vertices,

@@ -27,12 +27,15 @@ from surgisoft.replay.episode_blueprint import TRAIL, episode_blueprint
 from surgisoft.replay.plots import plots_of
 from surgisoft.replay.recording import Columns, new_recording
 from surgisoft.replay.shapes import creased
+from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
 from surgisoft.tasks.episode import EpisodeLog
 from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
 
 MOTION_HZ = 10.0
 """Bodies are drawn so many times a second; plots have every step."""
+RING_CORNERS, RING_WIDER = 24, 1.15
+"""Corners of the rings around a target body, and their radius in radii of the arm."""
 DOSE_HZ = 2.5
 """The organ's colours change so many times a second."""
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
@@ -157,10 +160,27 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
         style = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
         columns.recording.log(TRAIL, style, static=True)
         columns.send(TRAIL, ends, rr.LineStrips3D.columns(strips=list(pieces)))
+    count = log.targets_mm.shape[1]
     style = rr.Points3D.from_fields(colors=PLAN_COLOUR, radii=0.55)
     columns.recording.log("/path/target", style, static=True)
     moving = rr.Points3D.columns(positions=log.targets_mm[rows].reshape(-1, 3))
-    columns.send("/path/target", rows, moving.partition([log.targets_mm.shape[1]] * len(rows)))
+    columns.send("/path/target", rows, moving.partition([count] * len(rows)))
+    if count > 1:
+        _log_target_body(columns, log.targets_mm[rows], rows, log.arms[log.agents[0]].radius_mm)
+
+
+def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: float) -> None:
+    """Rings around where a whole body's points (R, k, 3) should be, a little wider than it."""
+    count = targets.shape[1]
+    turn = 2.0 * np.pi * np.arange(RING_CORNERS + 1) / RING_CORNERS
+    flat = np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), axis=1)
+    axes = frames.normalise(np.gradient(targets.astype(float), axis=1)).reshape(-1, 3)
+    rings = RING_WIDER * radius_mm * flat @ frames.rotation_from_z(axes).swapaxes(1, 2)
+    rings = rings + targets.reshape(-1, 1, 3)
+    style = rr.LineStrips3D.from_fields(colors=PLAN_COLOUR, radii=0.25)
+    columns.recording.log("/path/target_body", style, static=True)
+    strips = rr.LineStrips3D.columns(strips=list(rings.astype(np.float32)))
+    columns.send("/path/target_body", rows, strips.partition([count] * len(rows)))
 
 
 def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:

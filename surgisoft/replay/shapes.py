@@ -32,6 +32,10 @@ def finer(line_mm: np.ndarray, step_mm: float) -> np.ndarray:
     return CubicSpline(along, line_mm)(np.linspace(0.0, along[-1], count))
 
 
+BORE_RINGS = 3
+"""Rings of vertices, the last ones of a tube, that are its bore's wall and floor."""
+
+
 def tube(
     line_mm: np.ndarray, radius_mm: float, bore_mm: float = 0.0, sides: int = 40
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

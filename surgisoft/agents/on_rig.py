@@ -2,10 +2,11 @@
 
 Each arm of each episode is a `VirtualRig` of its own: commands go to its pumps, pressures and key
 points come from its sensors and cameras. The task, its goals and its surroundings stay as they
-are. Bodies, beams and errors are judged by where the plant is, without the cameras' noise; what
-drivers see is measured. The arm's model runs beside it, fed with the measured pressures, and is
-held to the cameras by two filters: the difference of the key points (an output disturbance, as in
-offset-free predictive control: Pannocchia & Rawlings 2003) and that of the pumps.
+are. Bodies, beams and errors are judged by where the plant is, without the cameras' noise. What
+drivers see is measured: the arm's model runs beside the bench, fed with the measured pressures,
+and is held to the cameras and the pumps by a filter each, which takes over a share of every new
+difference (an output disturbance, as in offset-free predictive control: Pannocchia & Rawlings
+2003). Key points are seen through that filter; with trust = 1 as the cameras give them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class RigConfig:
     """Whether the key points are measured; else drivers get the model's, as it foresees them."""
     trust: float = 0.3
     """Share of a new difference between cameras and model that is taken over in a step, 0..1."""
-    drift: float = 0.02
+    drift: float = 0.01
     """Share of it that is taken for a steady drift, added in every later step, 0..1."""
     pump_trust: float = 0.3
     """Share of a new difference between the pumps and the world's that is taken over, 0..1."""
@@ -171,27 +172,31 @@ class RigArm:
 
     def _shown(self, benches: Sequence[Bench], part: ArmPart, reading: Reading) -> ArmPart:
         """The part as measured and as it truly is; its points as yet are the model's."""
-        seen = modelled = part.points_mm
-        offset = part.offset_mm
+        seen, offset = part.points_mm, part.offset_mm
         if self.config.cameras:
             measured = frames.apply(part.mount, reading.points_mm)
-            seen = torch.where(measured.isfinite(), measured, modelled + offset)
-            offset = offset + self._correction(benches, seen - modelled - offset)
+            surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
+            now, offset = self._offsets(benches, offset, surprise)
+            seen = seen + now
         part = self.arm.posed(part, frames.apply(part.mount, reading.true_mm))
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset)
 
-    def _correction(self, benches: Sequence[Bench], surprise: Tensor) -> Tensor:
-        """(B, n, 3) mm by which the offset will change in a step, after a surprise (B, n, 3) mm.
+    def _offsets(
+        self, benches: Sequence[Bench], offset: Tensor, surprise: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """How far the body is off the model now, and in a step from now, (B, n, 3) mm each.
 
-        An alpha-beta filter (Kalata 1984): it follows a steady drift without lag. The first
-        surprise of an episode is taken over whole.
+        An alpha-beta filter (Kalata 1984) on the offset that was expected for now and what the
+        cameras showed beyond it: it follows a steady drift without lag. The first surprise of an
+        episode is taken over whole.
         """
-        config, changes = self.config, []
-        for bench, new in zip(benches, surprise, strict=True):
-            known = bench.drift_mm is not None
-            bench.drift_mm = bench.drift_mm + config.drift * new if known else 0.0 * new
-            changes.append(bench.drift_mm + config.trust * new if known else new)
-        return torch.stack(changes)
+        share, now = self.config.trust, []
+        for bench, expected, new in zip(benches, offset, surprise, strict=True):
+            first = bench.drift_mm is None
+            bench.drift_mm = 0.0 * new if first else bench.drift_mm + self.config.drift * new
+            now.append(expected + (new if first else share * new))
+        drift = torch.stack([bench.drift_mm for bench in benches])
+        return torch.stack(now), torch.stack(now) + drift
 
 
 def on_rig(task: Task, config: RigConfig | None = None) -> Task:

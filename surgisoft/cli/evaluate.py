@@ -1,6 +1,7 @@
 """`surgisoft evaluate`: how well drivers do a task, in simulation or on the virtual rig."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -46,6 +47,15 @@ def evaluate(
     cameras: Annotated[
         bool, typer.Option(help="On the rig: key points are measured; else foreseen by the model.")
     ] = True,
+    trust: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="On the rig: share of what the cameras show beyond the model that is believed at "
+            "once; 1: they are believed as they are. Default 0.3.",
+        ),
+    ] = None,
     arm: Annotated[
         str | None, typer.Option(metavar="MODEL", help="Arm model of all arms; default: the own.")
     ] = None,
@@ -66,7 +76,7 @@ def evaluate(
 ) -> None:
     """Play episodes with each driver and say how well they went, with 95 % intervals."""
     _check_files(json_file, replay)
-    rig = _rig_config(on, specimen, hidden, cameras)
+    rig = _rig_config(on, specimen, hidden, cameras, trust)
     own, table = _task(drivers, task, config, arm, scene)
     place = own
     if rig is not None:
@@ -108,18 +118,25 @@ def _check_files(json_file: Path | None, replay: Path | None) -> None:
         raise InputError(f"{replay}: suffix '{replay.suffix}', expected .rrd")
 
 
-def _rig_config(on: str, specimen: int | None, hidden: list[str] | None, cameras: bool):
+def _rig_config(
+    on: str,
+    specimen: int | None,
+    hidden: list[str] | None,
+    cameras: bool,
+    trust: float | None,
+):
     """The bench that is asked for, None in simulation."""
     if on not in PLACES:
         raise unknown_name("place", on, PLACES)
     if on != "rig":
-        if specimen is not None or hidden or not cameras:
-            raise InputError("--specimen, --hidden and --no-cameras are for --on rig")
+        if specimen is not None or trust is not None or hidden or not cameras:
+            raise InputError("--specimen, --hidden, --no-cameras, --trust are for --on rig")
         return None
     from surgisoft.agents.on_rig import RigConfig
 
     pairs = tuple(_hidden(text) for text in hidden or ())
-    return RigConfig(seed=specimen or 0, hidden=pairs, cameras=cameras)
+    own = RigConfig(seed=specimen or 0, hidden=pairs, cameras=cameras)
+    return own if trust is None else replace(own, trust=trust)
 
 
 def _hidden(text: str) -> tuple[str, float]:
@@ -182,12 +199,14 @@ def _show(results) -> None:
     from surgisoft.agents.evaluate import RATES
 
     names = list(dict.fromkeys(name for result in results for name in result.overall))
-    width = max(26, *(len(Path(result.driver).name) + 2 for result in results))
-    titles = "".join(f"{Path(result.driver).name:>{width}s}" for result in results)
-    print(f"{'':20s}{titles}")
+    rows = [["", *(Path(result.driver).name for result in results)]]
     for name in names:
-        cells = [_cell(result.overall.get(name), name in RATES) for result in results]
-        print(f"{name:20s}" + "".join(f"{cell:>{width}s}" for cell in cells))
+        cells = (_cell(result.overall.get(name), name in RATES) for result in results)
+        rows.append([name, *cells])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for first, *cells in rows:
+        held = "".join(f"   {cell:>{w}s}" for cell, w in zip(cells, widths[1:], strict=True))
+        print(f"{first:{widths[0]}s}{held}")
     for result in results:
         if result.verdicts is not None:
             facts = result.to_json()["referee"]

@@ -27,8 +27,8 @@ PICTURES = {
     "error": "The error over the rows",
 }
 """Caption of each picture by the stem of its file."""
-BROAD_PX = 620
-"""Width below which the pictures scroll, pixels."""
+BROAD_PX = {"loops": 620, "error": 620}
+"""Width below which a picture scrolls, pixels."""
 
 
 def compare_page(
@@ -47,7 +47,9 @@ def compare_page(
             Section(
                 "Measured and predicted",
                 [
-                    Picture.from_file(path, PICTURES[path.stem], PICTURES[path.stem], BROAD_PX)
+                    Picture.from_file(
+                        path, PICTURES[path.stem], PICTURES[path.stem], BROAD_PX.get(path.stem, 0)
+                    )
                     for path in pictures
                     if path.stem in PICTURES
                 ],

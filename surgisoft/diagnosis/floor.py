@@ -24,6 +24,8 @@ APART_S = 10.0
 """Least time between two rows that repeat each other, s: noise may be slow."""
 LEAST_PAIRS = 50
 """Fewest repeats that give an estimate."""
+MOST_ROWS = 12_000
+"""Rows among which repeats are looked for; more are thinned evenly."""
 LEAST_PLACES = 5
 """Fewest blocks of time that repeats must lie in."""
 
@@ -76,6 +78,7 @@ def repeat_floor(rest: "Residuals") -> Floor:
     block = blocks(rest.run)
     fold = folds(block)
     seen = ~np.isnan(rest.error_mm).all(axis=1)
+    seen[np.arange(len(seen)) % -(-len(seen) // MOST_ROWS) != 0] = False
     halves, places = [], set()
     for part in range(int(fold.max()) + 1):
         here, there = np.flatnonzero((fold == part) & seen), np.flatnonzero((fold != part) & seen)

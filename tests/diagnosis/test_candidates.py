@@ -1,0 +1,80 @@
+"""Columns against differences of the whole model's predictions."""
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.candidates import candidates, with_effect
+from surgisoft.diagnosis.problem import locked_rows, pose
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.effects import EFFECTS
+
+
+@pytest.fixture(scope="module")
+def recording():
+    rig = VirtualRig(0)
+    return rig.record(make_protocol("mixed", rig.limits, 1000, seed=1))[0]
+
+
+@pytest.fixture(scope="module")
+def problem(recording):
+    return pose(default_arm(), [recording], rows=400)
+
+
+@pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"hysteresis"}))
+def test_columns_are_slopes_of_the_whole_prediction(problem, name):
+    """Material, body and sensor effects exactly; line effects up to the plays behind them."""
+    some = candidates(problem, [name])
+    candidate = some[len(some) // 2]
+    count = candidate.columns.shape[3]
+    step = 1e-2 / max(float(np.abs(candidate.columns).max()), 1e-9)
+    for k in range(min(count, 2)):
+        amplitudes = np.zeros(count)
+        amplitudes[k] = 20 * step
+        effect = candidate.with_amplitudes(amplitudes)
+        with torch.no_grad():
+            model = with_effect(problem.model, name, effect)
+            change = problem.rows(model.predict(problem.history)).numpy() - problem.predicted
+        column = candidate.columns[..., k]
+        off = np.abs(change / (20 * step) - column)
+        tolerance = 0.35 if effect.stage == "line" else 0.06
+        scale = np.sqrt(np.square(column).mean())
+        assert np.sqrt(np.square(off).mean()) < tolerance * scale
+
+
+def test_more_of_an_effect_is_its_own_share(problem):
+    """A column of more hysteresis: what a tenth more of its push changes, to first order."""
+    candidate = candidates(problem, ["hysteresis"])[0]
+    assert candidate.more
+    model = problem.model
+    with torch.no_grad():
+        trace = model.trace(problem.history)
+        push = model.effective(trace.pressure, trace.memory) - trace.pressure
+        more = model.network(trace.pressure + 1.1 * push, trace.direction)
+        same = model.network(trace.pressure + push, trace.direction)
+        change = problem.rows(more - same).numpy()
+    off = change / 0.1 - candidate.columns[..., 0]
+    assert np.sqrt(np.square(off).mean()) < 0.05 * np.sqrt(np.square(change / 0.1).mean())
+
+
+def test_open_and_locked_parts_share_no_row(recording, problem):
+    """The last runs are locked away, and both parts together are everything."""
+    locked = locked_rows([recording])
+    last = recording.runs[-1]
+    assert locked[last].all()
+    assert not locked[: last.start].any()
+    model = problem.model
+    parts = [pose(model, [recording], rows=10**6, part=part) for part in ("open", "locked")]
+    indices = [set(part.index.tolist()) for part in parts]
+    assert not indices[0] & indices[1]
+    everything = pose(model, [recording], rows=10**6)
+    assert indices[0] | indices[1] == set(everything.index.tolist())
+
+
+def test_blocks_are_contiguous_stretches_of_one_run(problem):
+    run = problem.history.run_of_row.numpy()[problem.index.numpy()]
+    assert (np.diff(problem.block) >= 0).all()
+    for block in np.unique(problem.block):
+        assert len(np.unique(run[problem.block == block])) == 1

@@ -1,0 +1,98 @@
+"""The answer on robots whose truth is known and has other forms than the model's effects."""
+
+import json
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recording import save_recording
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.default import default_arm
+
+
+def recorded(hidden=(), take=3, points=6000):
+    rig = VirtualRig(0, take=take, hidden=hidden)
+    return rig.record(make_protocol("mixed", rig.limits, points, seed=take))[0]
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Diagnoses of a few robots by what is hidden in them."""
+    model, names = default_arm(), ("", "creep", "misalignment", "hysteresis")
+    return {name: diagnose(model, [recorded([(name, 1.0)] if name else [])]) for name in names}
+
+
+def test_nothing_is_named_on_a_clean_robot(found):
+    verdict = found[""].verdict
+    assert verdict.kind == "nothing_missing"
+    assert verdict.effects == ()
+
+
+@pytest.mark.parametrize("name", ["creep", "misalignment", "hysteresis"])
+def test_the_hidden_effect_is_named(found, name):
+    answer = found[name]
+    assert answer.verdict.kind == "identified"
+    assert answer.verdict.effects == (name,)
+    first = answer.ranking[0]
+    assert first.effect == name
+    assert first.confidence > 0.9
+    assert first.gain_alone > 0.7
+    assert first.heldout_rmse_mm < 0.5 * answer.error_mm.before
+    assert answer.error_mm.floor < answer.error_mm.before
+    assert answer.error_mm.ceiling <= first.heldout_rmse_mm + 1e-9
+
+
+def test_the_same_data_gives_the_same_answer(found):
+    again = diagnose(default_arm(), [recorded([("creep", 1.0)])])
+    assert again.verdict == found["creep"].verdict
+    assert [row.effect for row in again.ranking] == [r.effect for r in found["creep"].ranking]
+
+
+def test_command_writes_the_promised_json(tmp_path, capsys):
+    from surgisoft.surrogate.checkpoint import save_model
+
+    save_model(default_arm(), tmp_path / "arm")
+    before = {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()}
+    save_recording(recorded([("misalignment", 1.0)], points=3000), tmp_path / "x.parquet")
+    out = tmp_path / "d.json"
+    assert (
+        run(["diagnose", str(tmp_path / "arm"), str(tmp_path / "x.parquet"), "--json", str(out)])
+        == 0
+    )
+    said = json.loads(out.read_text())
+    assert said["verdict"]["kind"] == "identified"
+    assert said["verdict"]["effects"] == ["misalignment"]
+    assert set(said["error_mm"]) == {"before", "floor", "ceiling"}
+    assert {"effect", "confidence", "gain_alone", "gain_unique", "heldout_rmse_mm", "ci95"} <= set(
+        said["ranking"][0]
+    )
+    assert {"ambiguous_with", "next_experiment", "checks", "seconds"} <= set(said)
+    assert "misalignment is missing" in capsys.readouterr().out
+    after = {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()}
+    assert after == before
+
+
+def test_too_little_data_is_told(tmp_path, capsys):
+    from dataclasses import replace
+
+    from surgisoft.surrogate.checkpoint import save_model
+
+    save_model(default_arm(), tmp_path / "arm")
+    short = recorded(points=1000)
+    keep = slice(0, 60)
+    short = replace(
+        short,
+        t_s=short.t_s[keep],
+        measured=short.measured[keep],
+        commanded=short.commanded[keep],
+        key_points_mm=short.key_points_mm[keep],
+        run=np.zeros(60, np.int64),
+    )
+    save_recording(short, tmp_path / "x.parquet")
+    assert run(["diagnose", str(tmp_path / "arm"), str(tmp_path / "x.parquet")]) == 2
+    error = capsys.readouterr().err
+    assert "blocks of time" in error
+    assert len(error.strip().splitlines()) == 1

@@ -34,6 +34,8 @@ from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
 
 MOTION_HZ = 10.0
 """Bodies are drawn so many times a second; plots have every step."""
+JUMP_MM = 3.0
+"""A target that goes farther in a step than this has jumped (mm)."""
 RING_CORNERS, RING_WIDER = 24, 1.15
 """Corners of the rings around a target body, and their radius in radii of the arm."""
 DOSE_HZ = 2.5
@@ -147,10 +149,11 @@ def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) ->
 
 def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     """What is asked for once; the way that was gone, piece by piece; both points as they move."""
-    planned = log.path_mm if len(log.path_mm) else log.target_mm
-    closed = np.vstack((planned, planned[:1])) if len(log.path_mm) else planned
-    plan = rr.LineStrips3D([closed], colors=[PLAN_COLOUR], radii=[0.18])
-    columns.recording.log("/path/planned", plan, static=True)
+    closed = np.vstack((log.path_mm, log.path_mm[:1]))
+    planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
+    if planned:
+        plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[0.18])
+        columns.recording.log("/path/planned", plan, static=True)
     shown = np.isfinite(log.actual_mm).all(1)
     if log.beam is not None:
         shown &= log.beam.on
@@ -167,6 +170,13 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     columns.send("/path/target", rows, moving.partition([count] * len(rows)))
     if count > 1:
         _log_target_body(columns, log.targets_mm[rows], rows, log.arms[log.agents[0]].radius_mm)
+
+
+def _unbroken(points_mm: np.ndarray) -> list[np.ndarray]:
+    """The pieces of (T, 3) mm that are walked without a jump, where anything moves."""
+    steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
+    pieces = np.split(points_mm, np.flatnonzero(~(steps <= JUMP_MM)) + 1)
+    return [piece for piece in pieces if len(piece) > 1 and np.ptp(piece, axis=0).max() > 0.0]
 
 
 def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: float) -> None:

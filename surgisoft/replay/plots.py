@@ -11,7 +11,7 @@ from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
 from surgisoft.tasks.episode import EpisodeLog
 from surgisoft.tasks.episode_parts import ArmLog
 
-SHARES = ("completion", "view_fraction")
+SHARES = ("completion", "visited", "view_fraction")
 """Measures that run from 0 to 1 together."""
 SHOWN_ELSEWHERE = ("success", "collided", "clearance_mm")
 """Measures that events or another plot show."""
@@ -59,10 +59,11 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     for name, arm in log.arms.items():
         made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm)))
     if shares:
-        title = "Ring cut, ring in sight (share)"
+        title = "Done, in sight (share)"
         made.append(Plot(title, _lines("share", shares), "rightbottom"))
     if log.clearance_mm is not None:
-        made.append(Plot("Clearance (mm), red: limit", _clearance(log)))
+        title = "Clearance (mm), red: limit" if log.limits else "Clearance (mm)"
+        made.append(Plot(title, _clearance(log)))
     for agent, terms in log.rewards.items():
         title = f"Reward of {agent}"
         made.append(Plot(title, _lines(f"reward/{agent}", terms), "rightbottom", "rewards"))
@@ -95,8 +96,9 @@ def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
 
 
 def _clearance(log: EpisodeLog) -> tuple[Line, ...]:
+    where = "/plots/clearance"
+    held = Line(f"{where}/clearance_mm", "clearance_mm", log.clearance_mm, series_colour(0))
+    if not log.limits:
+        return (held,)
     limit = np.full(log.rows, log.limits["clearance_mm"])
-    return (
-        Line("/plots/clearance/clearance_mm", "clearance_mm", log.clearance_mm, series_colour(0)),
-        Line("/plots/clearance/limit", "limit", limit, LIMIT_COLOUR, 1.0),
-    )
+    return held, Line(f"{where}/limit", "limit", limit, LIMIT_COLOUR, 1.0)

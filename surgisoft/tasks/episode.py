@@ -159,7 +159,8 @@ class EpisodeRecorder:
         """The episode so far."""
         task, config = self.task, self.task.world.config
         scene = getattr(getattr(task, "config", None), "scene", None)
-        near = task.world.surroundings
+        around = task.world.surroundings
+        near = around if isinstance(around, Surroundings) else None
         rows = {name: self._column(name) for name in self._rows[-1]}
         log = EpisodeLog(
             task=task.name,
@@ -178,6 +179,10 @@ class EpisodeRecorder:
         )
         if near is not None:
             log = replace(log, **self._surroundings(near, rows))
+        elif around is not None:
+            bodies = tuple(_body(body) for body in around.geometry.bodies)
+            limits = {"clearance_mm": around.clearance_mm}
+            log = replace(log, bodies=bodies, limits=limits, clearance_mm=rows["clearance"])
         return replace(log, events=find_events(log, self._ending))
 
     def _of(self, tensor: Tensor) -> np.ndarray:

@@ -26,11 +26,13 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
         seen = log.view_fraction >= log.limits["view_fraction"]
         found += _changes(log, seen, ("info", "lesion in sight"), ("warning", "lesion lost"))
     if log.clearance_mm is not None:
-        least = log.limits["clearance_mm"]
-        near, touch = log.clearance_mm < least, log.clearance_mm < 0.0
-        close = ("warning", f"closer than {least:g} mm"), ("info", f"{least:g} mm clear again")
-        found += _changes(log, near, *close)
-        found += _changes(log, touch, ("error", "contact"), ("info", "contact ended"))
+        if "clearance_mm" in log.limits:
+            least = log.limits["clearance_mm"]
+            close = ("warning", f"closer than {least:g} mm"), ("info", f"{least:g} mm clear again")
+            found += _changes(log, log.clearance_mm < least, *close)
+        found += _changes(
+            log, log.clearance_mm < 0.0, ("error", "contact"), ("info", "contact ended")
+        )
     collided = log.measures.get("collided")
     if collided is not None and log.clearance_mm is not None:
         folded = (collided > 0.0) & ~(log.clearance_mm < 0.0)

@@ -177,7 +177,7 @@ def test_a_replay_is_small(replay):
 
 
 def test_an_arm_alone_has_no_scene_in_its_replay(tmp_path):
-    log = recorded("track_square", 20)
+    log = recorded("track_square", 36)
     replay = write_replay(log, tmp_path / "square.rrd")
     found = entities(replay.path)
     assert {"/arms/arm/body", "/path/planned", "/path/real", "/plots/reward/arm/track"} <= found

@@ -267,3 +267,24 @@ def test_what_is_no_episode_is_one_line(tmp_path):
             less.writestr(name, file.read(name))
     with pytest.raises(InputError, match="no whole episode"):
         load_episode(tmp_path / "less.npz")
+
+
+def test_a_body_without_a_scene_is_in_the_log():
+    """The slotted plate of the keyhole task: no organ, no beam, but clearance and a mesh."""
+    task = make_task("keyhole")
+    with torch.inference_mode():
+        play = Episodes(task)
+        state = play.seeded(0, 1)
+        recorder = EpisodeRecorder(task, state, driver="still", seed=0)
+        for _ in range(2):
+            actions = {"arm": torch.zeros(1, 3)}
+            state, outcome = play.step(state, actions)
+            recorder.step(state, outcome, actions)
+    log = recorder.log()
+    assert [body.role for body in log.bodies] == ["keep-out"]
+    assert log.beam is None
+    np.testing.assert_array_equal(log.clearance_mm, log.measures["clearance_mm"])
+    surface = log.bodies[0].vertices_mm
+    line = log.arms["arm"].line_mm[-1]
+    apart = np.linalg.norm(surface[:, None] - line, axis=2).min() - log.arms["arm"].radius_mm
+    assert 0.0 < log.clearance_mm[-1] < apart + 0.5

@@ -90,13 +90,10 @@ class Gathered:
 @torch.inference_mode()
 def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
     """Play `steps` steps into the agents' storages; the last observations, and `Gathered`."""
-    sums: dict[str, Tensor] = {}
-    counts: dict[str, Tensor] = {}
+    notes: dict[str, list[Tensor]] = {}
 
     def note(name: str, value: Tensor) -> None:
-        known = value.isfinite()
-        sums[name] = sums.get(name, 0.0) + value.nan_to_num(0.0, 0.0, 0.0).sum()
-        counts[name] = counts.get(name, 0) + known.sum()
+        notes.setdefault(name, []).append(value)
 
     for _ in range(steps):
         actions = {agent: ppo.act(seen.select(agent, STATE)) for agent, ppo in agents.items()}
@@ -110,13 +107,20 @@ def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
                 note(f"term/{agent}/{term}", value)
         for name, value in extras["measures"].items():
             note(f"measure/{name}", value)
-        note("done", dones.float())
+        note("done", dones)
     for agent, ppo in agents.items():
         ppo.compute_returns(seen.select(agent, STATE))
-    means = {name: (value / counts[name]).item() for name, value in sums.items()}
+    means = {name: _mean(values) for name, values in notes.items()}
 
     def part(prefix: str) -> dict[str, float]:
         return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
 
-    ended = int(sums["done"].item())
+    ended = int(torch.stack(notes["done"]).sum())
     return seen, Gathered(part("reward/"), part("term/"), part("measure/"), ended)
+
+
+def _mean(values: list[Tensor]) -> float:
+    """Mean of what is finite in (T, B) values; nan where nothing is."""
+    every = torch.stack(values).float()
+    known = every.isfinite()
+    return (every.where(known, 0.0).sum() / known.sum()).item()

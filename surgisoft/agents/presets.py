@@ -42,7 +42,7 @@ class Preset:
     """Change of pressure for an output of 1, kPa; the pumps' own limit holds besides."""
     noise: float = 0.5
     """First standard deviation of the actions, in outputs."""
-    last_noise: float | None = 0.03
+    last_noise: float | None = 0.005
     """The deviation falls to this, evenly in its logarithm, until the end; None: it is learned."""
     evaluate_every: int = 100
     """Updates between two evaluations."""
@@ -82,10 +82,10 @@ Schulman et al. (2017)."""
 
 
 STEPS: dict[str, int] = {
-    "track_circle": 20_000_000,
-    "track_square": 20_000_000,
-    "laser_plane": 20_000_000,
-    "circle_ablation": 2_000_000,
+    "track_circle": 4_000_000,
+    "track_square": 4_000_000,
+    "laser_plane": 4_000_000,
+    "circle_ablation": 1_000_000,
 }
 """Task -> steps that the `fast` preset trains it unless told otherwise."""
 PAPER_STEPS = 20_000_000

@@ -26,6 +26,9 @@ from surgisoft.surrogate.model import ArmModel
 
 CHANCE = 0.02
 """Largest chance, over all effects together, at which an effect is named."""
+LARGE = (0.1, 0.5, 0.2)
+"""Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
+in some of them only), the share that makes it large, and its least log gain."""
 LEAST_GAIN = 0.25
 """Least share of the squared error above the floor that the first effect explains."""
 NEXT_GAIN = 0.15
@@ -34,6 +37,8 @@ LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""
 MOST_EFFECTS = 3
 """Most effects that one diagnosis names."""
+MOST_RIVALS = 3
+"""Most rivals that an experiment is sought for."""
 RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
@@ -117,6 +122,9 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
 def _passes(race: Race, base: tuple[int, ...], s: Standing, start: float, later: bool) -> bool:
     """Whether one effect on top of a base is beyond chance and large enough."""
     share = (race.losses(base).sum() - s.losses.sum()) / start
+    chance, large, log_gain = LARGE
+    if not later and s.p_value <= chance and share >= large and s.log_gain.mean() >= log_gain:
+        return True
     return bool(
         s.p_value <= CHANCE
         and s.log_gain.mean() >= LEAST_LOG_GAIN
@@ -155,11 +163,18 @@ def answer(found: Findings) -> Diagnosis:
         for place, standing in enumerate(_order(found))
     )
     sentence = _sentence(kind, effects, levels, reached, sure, found)
+    plan = None
+    if kind == "ambiguous":
+        # Imported here: it predicts every experiment of the catalogue, which takes seconds.
+        from surgisoft.diagnosis.next_experiment import recommend
+
+        plan = recommend(problem, effects[:MOST_RIVALS]).experiment
     return Diagnosis(
         verdict=Verdict(kind, effects, sentence),
         error_mm=levels,
         ranking=ranking,
         ambiguous_with=tuple(found.rivals) if kind == "ambiguous" else (),
+        next_experiment=plan,
         checks=tuple(_checks(found)),
         statistics=numbers | {"blocks": len(counts)},
     )
@@ -181,12 +196,13 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
         return ("several" if len(names) > 1 else "identified"), names
-    if numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE:
-        return "unknown_effect", ()
-    if numbers["static_size"] >= OFF_SIZE and numbers["before_over_floor"] >= TRAINED:
-        return "unknown_effect", ()
-    if numbers["static_share"] >= 0.5 and numbers["before_over_floor"] >= TRAINED:
-        return "surrogate_undertrained", ()
+    if numbers["before_over_floor"] >= TRAINED:
+        if numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE:
+            return "unknown_effect", ()
+        if numbers["static_size"] >= OFF_SIZE:
+            return "unknown_effect", ()
+        if numbers["static_share"] >= 0.5:
+            return "surrogate_undertrained", ()
     return "nothing_missing", ()
 
 

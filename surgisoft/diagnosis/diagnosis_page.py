@@ -1,0 +1,123 @@
+"""The page of a diagnosis."""
+
+from pathlib import Path
+
+from surgisoft.diagnosis.verdict import Diagnosis
+from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
+
+HOW = (
+    "Every effect is added to the model in each of its shapes, to first order, beside a flexible "
+    "correction for the surrogate's own error whose size is what the model was validated to. What "
+    "counts is the error on blocks of time that took no part in the fit.\n\n"
+    "Alone: the share of the held-out squared error above the noise floor that goes with this "
+    "effect only. Unique: the share that comes back when it is left out of all effects together; "
+    "effects that can stand in for each other have much of the first and little of the second.\n\n"
+    "Chance: how often random signs of the blocks' gains would give so large a gain in any of the "
+    "effects. Confidence: how often such a statement was right on virtual robots whose truth was "
+    "known; see the benchmark.\n\n"
+    "The last quarter of each recording was not looked at: it is kept for the final check of "
+    "`surgisoft amend`."
+)
+TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
+"""Tone of a verdict; the others are warnings."""
+
+
+def diagnosis_page(found: Diagnosis, title: str) -> Page:
+    """The page of a diagnosis."""
+    error, verdict = found.error_mm, found.verdict
+    facts = [
+        ("error", f"{error.before:.3f} mm"),
+        ("noise floor", f"{error.floor:.3f} mm"),
+        ("best on held-out blocks", f"{error.ceiling:.3f} mm"),
+        ("time", f"{found.seconds:.1f} s"),
+    ]
+    parts = [Facts(facts)]
+    if found.checks:
+        parts.append(Section("Checks of the data", [Text("\n\n".join(found.checks))]))
+    parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+    if found.next_experiment:
+        plan = found.next_experiment
+        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
+        parts.append(
+            Section(
+                "Next experiment",
+                [
+                    Text(
+                        f"{plan.name}: {plan.minutes:g} minutes on the bench; tells apart: {pairs}."
+                    )
+                ],
+            )
+        )
+    if verdict.effects:
+        parts.append(_parameters(found))
+    parts.append(Section("How to read this", [Text(HOW)]))
+    return Page(
+        title=f"Diagnosis of {title}",
+        verdict=verdict.sentence[:1].upper() + verdict.sentence[1:] + ".",
+        about=verdict.kind.replace("_", " "),
+        tone=TONES.get(verdict.kind, "warn"),
+        parts=parts,
+    )
+
+
+def _ranking(found: Diagnosis) -> Table:
+    rows = [
+        (
+            row.effect,
+            f"{row.confidence:.2f}",
+            Share(row.gain_alone),
+            Share(row.gain_unique),
+            f"{row.heldout_rmse_mm:.3f}",
+            f"{row.ci95[0]:.3f} .. {row.ci95[1]:.3f}",
+            f"{row.p_value:.4f}",
+        )
+        for row in found.ranking
+    ]
+    header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "chance"]
+    return Table(header, rows)
+
+
+def _parameters(found: Diagnosis) -> Section:
+    rows = [
+        (row.effect, name, _number(value))
+        for row in found.ranking
+        if row.effect in found.verdict.effects
+        for name, value in row.parameters.items()
+    ]
+    note = Text("First estimates; `surgisoft amend` fits them through the whole model.")
+    return Section("Parameters", [Table(["effect", "parameter", "value"], rows), note])
+
+
+def _number(value) -> str:
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_number(item) for item in value) + "]"
+    return f"{value:.4g}"
+
+
+def _chart(found: Diagnosis):
+    """Held-out error with each effect, between the error before and the noise floor."""
+    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+
+    rows = found.ranking[::-1]
+    with drawing():
+        figure, axis = plt.subplots(figsize=(4.8, 0.6 + 0.24 * max(len(rows), 3)))
+        for place, row in enumerate(rows):
+            named = row.effect in found.verdict.effects
+            low, high = row.ci95
+            axis.plot([low, high], [place, place], c=RED if named else BLUE, lw=1.2, alpha=0.6)
+            axis.plot(row.heldout_rmse_mm, place, "o", c=RED if named else BLUE, ms=5)
+        axis.axvline(found.error_mm.floor, c=GREEN, lw=1, label="noise floor")
+        axis.axvline(found.error_mm.before, c=AMBER, lw=1, ls="--", label="error as it is")
+        axis.set_yticks(range(len(rows)), [row.effect for row in rows])
+        axis.set_xlabel("held-out error with this effect added [mm]")
+        axis.set_xlim(left=0)
+        axis.legend(fontsize=7, loc="lower right")
+        return chart(figure, "Held-out error with each effect")
+
+
+def write_report(found: Diagnosis, folder: Path, title: str) -> Path:
+    """Write `diagnosis.html` into a folder; returns its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "diagnosis.html"
+    write_page(diagnosis_page(found, title), path)
+    return path

@@ -1,12 +1,13 @@
 """Effects on schedules of actuations: what each would change, nothing measured."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.diagnosis.candidates import columns_of, more_of, signals
+from surgisoft.diagnosis.candidates import Signals, columns_of, more_of, signals
 from surgisoft.diagnosis.experiments import REFERENCE, draw_run, limits_within
 from surgisoft.diagnosis.isolability_moments import sample_time
 from surgisoft.measurement.protocols import Protocol
@@ -42,6 +43,11 @@ class Design:
         """The looked-at rows of a (R, T, ...) tensor."""
         return self.history.rows(tensor)[self.index]
 
+    @cached_property
+    def signals(self) -> Signals:
+        """What the stages of the model see along the history."""
+        return signals(self)
+
 
 @dataclass(frozen=True, eq=False)
 class Shape:
@@ -60,7 +66,7 @@ def shapes_of(model: ArmModel, reference: Design, names: list[str] | None = None
     known = known_effects()
     names = list(known) if names is None else list(names)
     facts = model.facts
-    points = reference.rows(signals(reference).body)
+    points = reference.rows(reference.signals.body)
     answer = []
     for name in names:
         kind = known[name] if name in known else type(make_effect(name, facts))
@@ -78,7 +84,7 @@ def columns_on(
 
     facts: those of the arm as it stands in the experiment, where they are not the model's own.
     """
-    signal = signals(design)
+    signal = design.signals
     points = design.model.spec.key_points
     answer = []
     for shape in shapes:

@@ -25,7 +25,7 @@ from surgisoft.diagnosis.next_experiment_plans import make_plans
 from surgisoft.diagnosis.next_experiment_question import pose_question
 from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError
-from surgisoft.measurement.protocols import load_schedule, make_protocol
+from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recording import save_recording
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.surrogate.default import default_arm
@@ -129,6 +129,31 @@ def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(proble
     left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))
     assert left.setting == AS_IT_STANDS
     assert left.pairs[0].after < pair.after
+
+
+def lead(problem, true: str, rival: str) -> float:
+    """Log evidence of one effect over another in recordings, each in its best shape, nats."""
+    question = pose_question(problem.model, problem, [true, rival])
+    gain = dict.fromkeys((true, rival), -np.inf)
+    for owner, value in zip(question.owners, question.gains, strict=True):
+        gain[owner] = max(gain[owner], value)
+    return gain[true] - gain[rival]
+
+
+def test_the_recommended_schedule_settles_on_the_rig_what_one_speed_leaves_open(arm):
+    """The rig's friction and lag are written with other formulas than the models' effects."""
+    commands = np.zeros((9, 3))
+    commands[1::2, 0] = 50.0
+    poor = Protocol("sweeps", "continuous", commands, np.zeros(9), 8.0 * np.arange(9.0))
+    for true, rival in (("hysteresis", "line_lag"), ("line_lag", "hysteresis")):
+        first, _ = VirtualRig(0, take=1, hidden=[(true, 1.0)]).record(poor)
+        problem = pose(arm, [first])
+        answer = recommend(problem, [true, rival], 5.0, (AS_IT_STANDS,))
+        assert answer.pairs[0].before < 0.95
+        second, _ = VirtualRig(0, take=2, hidden=[(true, 1.0)]).record(answer.protocol)
+        assert lead(pose(arm, [first, second]), true, rival) > 30.0 + abs(
+            lead(problem, true, rival)
+        )
 
 
 def test_more_time_never_tells_less(arm):

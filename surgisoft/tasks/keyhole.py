@@ -63,7 +63,7 @@ class Keyhole:
 
     def __init__(self, config: KeyholeConfig | None = None, device: str | torch.device = "cpu"):
         c = self.config = config or KeyholeConfig()
-        self.world = plate_world(c.plate, c.height_mm, c.arm, c.world, device)
+        self.world = plate_world(c.plate, c.height_mm, c.limit_mm, c.arm, c.world, device)
         self.arm, self.dt_s = self.world.arms["arm"], c.world.dt_s
         self.steps = round(c.time_s / self.dt_s)
         self.ways = clear_ways(self.world, c.plate, c.deep_mm, c.clear_mm)

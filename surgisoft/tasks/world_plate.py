@@ -32,8 +32,9 @@ NO_DIAMETER_MM = 15.0
 class Walls:
     """Bodies that an arm keeps clear of, and nothing else; holds no state."""
 
-    def __init__(self, bodies, radii_mm, geometry: str, device, engine: str | None = None):
-        self.geometry = BatchedScene(bodies, radii_mm, device, engine=engine)
+    def __init__(self, bodies, radii_mm, geometry: str, device, clearance_mm: float = 0.0):
+        """clearance_mm: nearer than this is too close; geometry as in `SceneryConfig`."""
+        self.clearance_mm, self.geometry = clearance_mm, BatchedScene(bodies, radii_mm, device)
         self.judge = judge_of(geometry, self.geometry)
 
     def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, Scenery]:
@@ -47,11 +48,16 @@ class Walls:
 
 
 def plate_world(
-    plate: SlottedPlate, height_mm: float, arm: str | Path, config: WorldConfig, device
+    plate: SlottedPlate,
+    height_mm: float,
+    clearance_mm: float,
+    arm: str | Path,
+    config: WorldConfig,
+    device: str | torch.device,
 ) -> World:
     """The named arm model, upright, and a plate whose middle it passes at rest.
 
-    height_mm: from the arm's base to the plate's lower side.
+    height_mm: from the arm's base to the plate's lower side; clearance_mm: nearer is too close.
     """
     model = named_arm(arm, device)
     alone = lone_arm(config, model, device=device).arms["arm"]
@@ -66,7 +72,7 @@ def plate_world(
     pose[2, 3] = height_mm
     radii = {"arm": 0.5 * (model.spec.diameter_mm or NO_DIAMETER_MM)}
     bodies = (Body("plate", "keep-out", plate.mesh(), pose),)
-    walls = Walls(bodies, radii, config.scenery.geometry, device)
+    walls = Walls(bodies, radii, config.scenery.geometry, device, clearance_mm)
     return World({"arm": Mounted(model, torch.eye(4))}, config, walls, device)
 
 

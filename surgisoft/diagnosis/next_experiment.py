@@ -91,6 +91,7 @@ class Recommendation:
         return (
             f"the chance to tell {a} from {b} goes from {worst.before:.2f} to {worst.after:.2f}"
             + (many if len(self.pairs) > 1 else "")
+            + ("; what is recorded should tell them apart already" if worst.before >= SURE else "")
         )
 
     def to_json(self) -> dict:

@@ -1,6 +1,6 @@
 """`improve`: diagnose, amend, and again, until the gates are silent.
 
-Every round adds the surest effect of a diagnosis and fits it together with those that were added
+Every round adds an effect that a diagnosis names and fits it together with those that were added
 before. The network's last layer is re-tuned at the end, where held-out motion rewards it. All of
 this sees the open part of the recordings only; the locked part is looked at once, at the end, for
 the errors of all rounds, and decides nothing but whether the whole fall is claimed.
@@ -118,31 +118,28 @@ def improve(
         rounds.append(done)
         tell(done)
 
-    while len(added) < most_effects:
+    going = True
+    while going and len(added) < most_effects:
         found = diagnose(models[-1], recordings)
-        name, rivals, confidence = next_effect(found)
-        before = problem.with_model(models[-1])
-        done = Round(
-            found.verdict.kind,
-            found.verdict.sentence,
-            None,
-            rivals,
-            confidence,
-            fall_of(before, before).after,
-        )
-        if name is None or name in added:
-            note(done)
-            break
-        fitted = fit_effects(before, [*added, name])
-        fall = fall_of(before, problem.with_model(fitted.model))
-        if not fall.claimed:
-            why = f"{done.sentence}; but {name}, fitted through the whole model, does not help"
-            note(replace(done, sentence=why))
-            break
-        added.append(name)
-        models.append(fitted.model)
-        parameters = fitted.parameters
-        note(replace(done, step=name, error_open_mm=fall.after))
+        error = fall_of(problem, problem.with_model(models[-1])).after
+        said = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
+        names = [name for name in next_effects(found) if name not in added]
+        going = False
+        for name in names[: most_effects - len(added)]:
+            before = problem.with_model(models[-1])
+            fitted = fit_effects(before, [*added, name])
+            fall = fall_of(before, problem.with_model(fitted.model))
+            if not fall.claimed:
+                why = f"{said.sentence}; but {name}, fitted through the whole model, does not help"
+                said = replace(said, sentence=why, error_open_mm=fall.before)
+                continue
+            going = True
+            added.append(name)
+            models.append(fitted.model)
+            parameters = fitted.parameters
+            note(_step(said, name, found, fall.after))
+        if not going:
+            note(said)
     tuned = retune(models[-1], problem)
     if added and tuned.kept:
         after = fall_of(problem, problem.with_model(tuned.model)).after
@@ -165,14 +162,17 @@ def improve(
     )
 
 
-def next_effect(found: Diagnosis) -> tuple[str | None, tuple[str, ...], float | None]:
-    """The effect to add after a diagnosis, its rivals, and the confidence in it; None: no more.
+def next_effects(found: Diagnosis) -> tuple[str, ...]:
+    """The effects to add after a diagnosis, in order; none where the loop ends.
 
     Of effects that cannot be told apart the first is taken: the error falls with any of them.
     """
-    if not found.verdict.effects:
-        return None, (), None
-    name = found.verdict.effects[0]
+    effects = found.verdict.effects
+    return effects[:1] if found.verdict.kind == "ambiguous" else effects
+
+
+def _step(said: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
+    """The round in which the named effect was added."""
     rivals = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
     sure = next((row.confidence for row in found.ranking if row.effect == name), None)
-    return name, tuple(rivals), sure
+    return replace(said, step=name, rivals=tuple(rivals), confidence=sure, error_open_mm=error_mm)

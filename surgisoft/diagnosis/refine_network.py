@@ -3,10 +3,10 @@
 A network that was fitted without an effect has taken some of it for its own shape. The last layer
 is linear, so its best change D is a ridge regression in the activations h of the layer before,
 
-    min_D  sum_rows |r - h D|^2 + ridge rows mean_range |h D|^2,
+    min_D  sum_rows |r - h D|^2 + ridge rows var_range (h D),
 
-whose second term holds the network where it was over its whole range of actuation, also where the
-recordings do not go. Residuals behind body and sensor effects are taken for those of the network:
+whose second term holds the network's shape over its whole range of actuation, also where the
+recordings do not go; a shift of everything is free. Residuals behind body and sensor effects are taken for those of the network:
 what these effects turn or bend is small.
 """
 
@@ -60,7 +60,7 @@ def retune(model: ArmModel, problem: Problem) -> Retuned:
     )
     count = len(hidden)
     anywhere = _hidden(network, *_over_range(model))
-    held = anywhere.T @ anywhere / len(anywhere)
+    held = np.cov(anywhere.T, bias=True)
     held += 1e-6 * np.trace(held) / len(held) * np.eye(len(held))
     residual = problem.residual.reshape(count, -1)
     part = judging_parts(problem)

@@ -15,7 +15,7 @@ def waterfall(before_mm: float, steps: list[tuple[str, float]], floor_mm: float)
 
     figure, axis = plt.subplots(figsize=(1.6 + 1.1 * (len(steps) + 2), 3.2))
     axis.bar(0, before_mm, color=RED, width=0.7)
-    level, names = before_mm, ["before"]
+    level, place, names = before_mm, 0, ["before"]
     axis.text(0, before_mm, f"{before_mm:.3f}", ha="center", va="bottom")
     for place, (name, after) in enumerate(steps, 1):
         rises = after > level
@@ -26,12 +26,14 @@ def waterfall(before_mm: float, steps: list[tuple[str, float]], floor_mm: float)
         names.append(name.replace("_", "\n"))
     axis.bar(len(steps) + 1, level, color=BLUE, width=0.7)
     axis.text(len(steps) + 1, level, f"{level:.3f}", ha="center", va="bottom")
+    axis.plot([place + 0.65, len(steps) + 1.35], [level, level], c=MUTED, lw=0.8)
     axis.axhline(floor_mm, c=MUTED, ls="--", lw=1)
+    axis.text(len(steps) + 1.45, floor_mm, "floor", c=MUTED, ha="right", va="bottom")
+    axis.set_axisbelow(True)
     axis.set_xticks(range(len(names) + 1), [*names, "after"])
     axis.grid(visible=False, axis="x")
     axis.set_ylabel("error [mm]")
-    axis.margins(y=0.12)
-    axis.set_ylim(bottom=0)
+    axis.set_ylim(0, 1.1 * max(before_mm, *(after for _, after in steps)))
     return figure
 
 

@@ -1,0 +1,214 @@
+"""`amend`: falls by hand, claims that hold, and every wrong turn in one line."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.amend import Fall, amend, fall_of
+from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.problem import locked_rows, pose
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recording import Recording, load_recording, save_recording
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.default import default_arm
+from tests.diagnosis.test_refine import TRUTHS, bare_arm, measured_on
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A bare arm's folder, a recording of it with hidden creep, and one without."""
+    folder = tmp_path_factory.mktemp("lab")
+    save_model(bare_arm(), folder / "arm")
+    save_recording(measured_on(TRUTHS["creep"]), folder / "creep.parquet")
+    save_recording(measured_on(bare_arm()), folder / "clean.parquet")
+    return folder
+
+
+def hashes(folder) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_fall_by_hand():
+    """Twelve blocks whose error is 1 mm before and 0.6 after, but for one that was 0 and is 0.6."""
+    arm = bare_arm()
+    problem = pose(arm, [measured_on(arm, runs=1, rows=240)])
+    count = int(problem.block.max()) + 1
+    shift = np.zeros_like(problem.predicted)
+    shift[..., 0] = np.where(problem.block == 0, 0.0, 1.0)[:, None]
+    before = replace(problem, predicted=problem.measured + shift)
+    after = replace(problem, predicted=problem.measured + np.array([0.6, 0.0, 0.0]))
+    fall = fall_of(before, after)
+    sizes = np.bincount(problem.block)
+    assert fall.before == pytest.approx(np.sqrt(1 - sizes[0] / sizes.sum()))
+    assert fall.after == pytest.approx(0.6)
+    assert fall.fall == pytest.approx(fall.before - 0.6)
+    assert fall.blocks == count
+    # Drawn with replacement, the block without error comes 0 to 3 times in 95 % of the draws.
+    assert fall.ci95[1] == pytest.approx(0.4, abs=1e-9)
+    worst = np.sqrt(1 - 3 * sizes[0] / sizes.sum()) - 0.6
+    assert fall.ci95[0] == pytest.approx(worst, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "ci95", "claimed"),
+    [
+        (1.0, 0.5, (0.4, 0.6), True),
+        (1.0, 0.9, (-0.01, 0.2), False),
+        (1.0, 0.99, (0.005, 0.015), False),
+        (0.5, 0.6, (-0.2, -0.1), False),
+    ],
+)
+def test_what_is_claimed(before, after, ci95, claimed):
+    fall = Fall(before, after, 0.1, before - after, ci95, 100, 20)
+    assert fall.claimed is claimed
+    assert fall.sentence.startswith("error") is claimed
+
+
+def test_the_locked_rows_take_no_part():
+    """Wild key points in the locked part change its error, and no parameter."""
+    recording = measured_on(TRUTHS["gain_mismatch"], rows=200)
+    points = recording.key_points_mm.copy()
+    points[locked_rows([recording])] += 5.0
+    wild = replace(recording, key_points_mm=points)
+    one, other = (amend(bare_arm(), [each], ["gain_mismatch"]) for each in (recording, wild))
+    assert one.parameters == other.parameters
+    assert other.locked.after > one.locked.after + 5
+
+
+def test_an_amended_model_is_a_model(lab, capsys):
+    before = hashes(lab)
+    new = lab / "new"
+    command = ["amend", str(lab / "arm"), "--effect", "creep", "--data", str(lab / "creep.parquet")]
+    file, report = lab / "new.json", lab / "pictures"
+    assert run([*command, "-o", str(new), "--json", str(file), "--report", str(report)]) == 0
+    out = capsys.readouterr().out
+    assert "amount_share" in out
+    assert "creep: error" in out
+    values = json.loads(file.read_text())
+    assert values["claimed"] is True
+    error = values["error_mm"]
+    assert error["after"] < 1.1 * error["floor"] < 0.6 * error["before"]
+    assert error["ci95"][0] < error["fall"] < error["ci95"][1]
+    amount = values["parameters"][0]
+    assert amount["ci95"][0] < 0.15 < amount["ci95"][1]
+    assert json.loads((new / "report.json").read_text())["amended_from"] == "arm"
+    page = (report / "report.html").read_text()
+    assert "amount_share" in page
+    assert page.count("<figure") >= 2
+    after = hashes(lab)
+    assert {name: after[name] for name in before} == before
+
+    model, recording = load_model(new), load_recording(lab / "creep.parquet")
+    assert list(model.effects) == ["creep"]
+    history = history_of([recording]).select(torch.tensor([0]))
+    predicted = model.predict(history)[0]
+    state = model.initial_state(1)
+    state = replace(state, pressure=history.pressure[:, 0])
+    for row in range(60):
+        change = history.pressure[:, row] - state.pressure
+        state, points = model.step(state, change, history.dt_s[:, row])
+        assert torch.allclose(points[0], predicted[row], atol=1e-3)
+    assert compare(model, [recording])[0].rmse_mm < 1.1 * error["floor"]
+    assert run([*command, "-o", str(new)]) == 2
+    assert "already there" in capsys.readouterr().err
+
+
+def test_a_clean_recording_is_refused(lab, capsys):
+    before = hashes(lab)
+    command = ["amend", str(lab / "arm"), "--effect", "creep", "--data", str(lab / "clean.parquet")]
+    assert run([*command, "-o", str(lab / "refused")]) == 1
+    assert "no fall of the error is claimed" in capsys.readouterr().out
+    assert hashes(lab) == before
+    assert run([*command, "-o", str(lab / "anyway"), "--anyway"]) == 1
+    assert load_model(lab / "anyway").effects["creep"].amount.abs() < 0.02
+
+
+def test_an_effect_of_ones_own(lab, tmp_path, capsys):
+    """A file that names no effect of the package: a shift of all key points."""
+    own = tmp_path / "mean_shift.py"
+    own.write_text(
+        "from surgisoft.surrogate.effects.base import Memoryless, Quantity, amplitude, value_of\n"
+        "class MeanShift(Memoryless):\n"
+        "    stage = 'sensor'\n"
+        "    def __init__(self, facts):\n"
+        "        super().__init__(facts)\n"
+        "        self.shift = amplitude(1)\n"
+        "    def strengths(self):\n"
+        "        return {'shift': self.shift}\n"
+        "    def apply(self, signal, memory):\n"
+        "        return signal + self.shift\n"
+        "    def config(self):\n"
+        "        return {}\n"
+        "    def quantities(self):\n"
+        "        return [Quantity('shift_mm', value_of(self.shift), 'mm', -9, 9, 'a test')]\n"
+    )
+    recording = load_recording(lab / "clean.parquet")
+    moved = tmp_path / "moved.parquet"
+    save_recording(replace(recording, key_points_mm=recording.key_points_mm + 0.7), moved)
+    command = ["amend", str(lab / "arm"), "--effect", str(own), "--data", str(moved)]
+    assert run([*command, "-o", str(tmp_path / "new")]) == 0
+    assert load_model(tmp_path / "new").effects["mean_shift"].shift.item() == pytest.approx(
+        0.7, abs=0.01
+    )
+    assert "mean_shift: shift_mm = 0.6" in capsys.readouterr().out
+
+
+WRONG = {
+    "unknown effect 'magic': known are": {"effect": "magic"},
+    "no arm model there": {"model": "nowhere"},
+    "is the model that is read": {"output": "arm"},
+    "key points: 3, but the model has 5": {"data": "other.parquet"},
+    "every key point is missing in every row": {"data": "blind.parquet"},
+    "0 blocks of time": {"data": "half_blind.parquet"},
+}
+
+
+@pytest.mark.parametrize("says", WRONG)
+def test_a_bad_input_gets_one_line(lab, says, capsys):
+    clean = load_recording(lab / "clean.parquet")
+    unseen = clean.key_points_mm.copy()
+    unseen[~locked_rows([clean])] = np.nan
+    for name, points in (
+        ("other", clean.key_points_mm[:, :3]),
+        ("blind", np.full_like(unseen, np.nan)),
+        ("half_blind", unseen),
+    ):
+        save_recording(replace(clean, key_points_mm=points), lab / f"{name}.parquet", force=True)
+    given = {"model": "arm", "effect": "creep", "data": "clean.parquet", "output": "out"}
+    given |= WRONG[says]
+    before = hashes(lab)
+    code = run(
+        [
+            "amend", str(lab / given["model"]), "--effect", given["effect"],
+            "--data", str(lab / given["data"]), "-o", str(lab / given["output"]),
+        ]
+    )  # fmt: skip
+    captured = capsys.readouterr()
+    errors = [line for line in captured.err.splitlines() if "error" in line]
+    assert code == 2
+    assert len(errors) == 1
+    assert says in errors[0]
+    assert captured.out == ""
+    assert hashes(lab) == before
+
+
+def test_the_error_falls_on_a_rig_whose_creep_has_another_form():
+    """The rig's creep is a nonlinear ladder (Findley 1976); the tool's is a log-normal spectrum."""
+    rig = VirtualRig(0, hidden=[("creep", 1.0)])
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 2400, seed=3))
+    assert isinstance(recording, Recording)
+    result = amend(default_arm(), [recording], ["creep"])
+    assert result.locked.claimed
+    assert result.locked.after < 0.6 * result.locked.before
+    assert list(result.model.effects) == ["hysteresis", "creep"]

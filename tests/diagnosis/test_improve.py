@@ -1,0 +1,103 @@
+"""`improve`: effect after effect until the gates are silent, and the waterfall of it."""
+
+import json
+
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.diagnosis import improve as loop
+from surgisoft.diagnosis.improve import improve, next_effects
+from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Verdict
+from surgisoft.errors import InputError
+from surgisoft.measurement.recording import save_recording
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from tests.diagnosis.test_refine import TRUTHS, bare_arm, measured_on, with_truth
+
+
+def said(kind: str, *effects: str) -> Diagnosis:
+    """A diagnosis that says so."""
+    return Diagnosis(Verdict(kind, effects, f"{kind} it is"), ErrorLevels(1.0, 0.1, 0.1), ())
+
+
+@pytest.fixture
+def recited(monkeypatch):
+    """Diagnoses by rote: what each round hears."""
+
+    def recite(*answers: Diagnosis) -> None:
+        left = iter(answers)
+        monkeypatch.setattr(loop, "diagnose", lambda model, recordings: next(left))
+
+    return recite
+
+
+def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
+    """Nothing by rote here: the diagnosis has to name creep and gains by itself."""
+    truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
+    save_model(bare_arm(), tmp_path / "arm")
+    save_recording(measured_on(truth), tmp_path / "both.parquet")
+    command = ["improve", str(tmp_path / "arm"), str(tmp_path / "both.parquet")]
+    options = ["--json", str(tmp_path / "rounds.json"), "--report", str(tmp_path / "report")]
+    assert run([*command, "-o", str(tmp_path / "new"), *options]) == 0
+    out = capsys.readouterr().out
+    assert "round 1:" in out
+    assert "floor" in out
+    values = json.loads((tmp_path / "rounds.json").read_text())
+    assert set(values["effects"]) == {"creep", "gain_mismatch"}
+    errors = [r["error_mm"] for r in values["rounds"] if r["step"]]
+    assert errors == sorted(errors, reverse=True)
+    assert values["error_mm"]["after"] == pytest.approx(errors[-1])
+    assert values["error_mm"]["after"] < 1.1 * values["error_mm"]["floor"]
+    assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
+    assert (tmp_path / "report" / "waterfall.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert "Rounds" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_a_model_that_misses_nothing_is_left_alone(tmp_path, capsys):
+    save_model(bare_arm(), tmp_path / "arm")
+    save_recording(measured_on(bare_arm()), tmp_path / "clean.parquet")
+    command = ["improve", str(tmp_path / "arm"), str(tmp_path / "clean.parquet")]
+    assert run([*command, "-o", str(tmp_path / "new")]) == 1
+    assert "nothing was added" in capsys.readouterr().out
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_wrong_diagnosis_is_not_followed(recited):
+    """An effect that the whole model cannot use ends the loop and is not added."""
+    recited(said("identified", "line_lag"))
+    result = improve(bare_arm(), [measured_on(TRUTHS["gain_mismatch"], rows=200)])
+    assert result.steps == []
+    assert not result.claimed
+    assert "does not help" in result.rounds[-1].sentence
+    assert list(result.model.effects) == []
+
+
+def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recited):
+    recording = measured_on(TRUTHS["creep"], rows=300)
+    recited(said("identified", "creep"), said("identified", "creep"))
+    again = improve(bare_arm(), [recording])
+    assert [name for name, _ in again.steps] == ["creep"]
+    recited(said("ambiguous", "creep", "drift"))
+    once = improve(bare_arm(), [recording], most_effects=1)
+    assert [name for name, _ in once.steps] == ["creep"]
+    assert once.rounds[0].rivals == ("drift",)
+    with pytest.raises(InputError, match="expected 1 or more"):
+        improve(bare_arm(), [recording], most_effects=0)
+
+
+def test_what_a_diagnosis_leads_to():
+    assert next_effects(said("nothing_missing")) == ()
+    assert next_effects(said("unknown_effect")) == ()
+    assert next_effects(said("identified", "creep")) == ("creep",)
+    assert next_effects(said("several", "creep", "payload")) == ("creep", "payload")
+    assert next_effects(said("ambiguous", "creep", "drift")) == ("creep",)
+
+
+def test_rounds_are_reported_as_they_end(recited):
+    recited(said("identified", "gain_mismatch"), said("nothing_missing"))
+    heard = []
+    result = improve(
+        bare_arm(), [measured_on(TRUTHS["gain_mismatch"], rows=200)], progress=heard.append
+    )
+    assert [r.step for r in heard] == [r.step for r in result.rounds] == ["gain_mismatch", None]
+    assert all(r.error_mm is None for r in heard)
+    assert result.rounds[-1].error_mm == result.locked.after

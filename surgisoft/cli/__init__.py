@@ -16,7 +16,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-MANY = {"--valid", "--effects", "--hidden", "--between"}
+MANY = {"--valid", "--effects", "--hidden", "--between", "--effect", "--data"}
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 

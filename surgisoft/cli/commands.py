@@ -3,6 +3,7 @@
 # ruff: noqa: F401
 
 from surgisoft.cli import (
+    amend,
     benchmark,
     collect,
     compare,
@@ -10,6 +11,7 @@ from surgisoft.cli import (
     evaluate,
     fit,
     import_,
+    improve,
     next_experiment,
     replay,
     scene,

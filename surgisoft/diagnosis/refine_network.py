@@ -6,8 +6,8 @@ is linear, so its best change D is a ridge regression in the activations h of th
     min_D  sum_rows |r - h D|^2 + ridge rows var_range (h D),
 
 whose second term holds the network's shape over its whole range of actuation, also where the
-recordings do not go; a shift of everything is free. Residuals behind body and sensor effects are taken for those of the network:
-what these effects turn or bend is small.
+recordings do not go; a shift of everything is free. Residuals behind body and sensor effects are
+taken for those of the network: what these effects turn or bend is small.
 """
 
 import copy

@@ -33,7 +33,8 @@ def test_supersuit_makes_a_vector_environment_of_one_arm():
     seen, rewards, terminated, truncated, _ = many.step(np.zeros((1, 3), np.float32))
     assert np.isfinite(seen).all()
     assert rewards[0] > 0.0
-    assert not (terminated[0] or truncated[0])
+    assert not terminated[0]
+    assert not truncated[0]
 
 
 def test_torchrl_rolls_both_arms_out():

@@ -86,10 +86,14 @@ def _show(answer, model: Path, recordings: list[Path], output: Path) -> None:
     print(f"why: {answer.why}")
     for number, step in enumerate(answer.steps, 1):
         print(f"  {number}. {step}")
-    options = f" {answer.options}" if answer.options else ""
-    old = "".join(f" {path}" for path in recordings)
-    print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
-    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
+    if answer.by_hand:
+        print(f"  then: surgisoft compare {model} NEW.parquet")
+        print("  the virtual rig has no option for that change: --as-it-stands asks for none")
+    else:
+        options = f" {answer.options}" if answer.options else ""
+        old = "".join(f" {path}" for path in recordings)
+        print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
+        print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
     for pair in sorted(answer.pairs, key=lambda pair: pair.after):
         a, b = pair.effects
         print(

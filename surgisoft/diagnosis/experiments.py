@@ -188,6 +188,10 @@ SETTINGS: dict[str, Setting] = {
 """Every change of the bench by name."""
 
 
+ON_THE_RIG = tuple(name for name, setting in SETTINGS.items() if not setting.removes)
+"""Changes of the bench that the virtual rig has an option for."""
+
+
 def draw_run(
     name: str, limits: np.ndarray, seed: int, seconds: float = RUN_S
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -78,6 +78,11 @@ class Recommendation:
         return tuple(pair.effects for pair in self.pairs if pair.after >= SURE)
 
     @property
+    def by_hand(self) -> bool:
+        """Whether it takes a change of the bench that the virtual rig has no option for."""
+        return bool(SETTINGS[self.setting].removes)
+
+    @property
     def experiment(self) -> Experiment:
         """In short, as a diagnosis names it."""
         return Experiment(self.name, self.minutes, self.separates)
@@ -101,6 +106,7 @@ class Recommendation:
             "minutes": self.minutes,
             "setting": self.setting,
             "collect_options": self.options,
+            "by_hand": self.by_hand,
             "steps": list(self.steps),
             "why": self.why,
             "separates": [list(pair) for pair in self.separates],

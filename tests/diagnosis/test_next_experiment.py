@@ -11,6 +11,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis.experiments import (
     AS_IT_STANDS,
     FIGURES,
+    ON_THE_RIG,
     RUN_S,
     SETTINGS,
     bench_minutes,
@@ -124,6 +125,8 @@ def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(proble
     pair = answer.pairs[0]
     assert pair.before < 0.95 < pair.after
     assert answer.setting == "short_tube"
+    assert answer.by_hand
+    assert not recommend(problem, ["line_lag", "rate_dependence"], 5.0, ON_THE_RIG).by_hand
     assert answer.minutes <= 15.0
     assert any("tube" in step for step in answer.steps)
     left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))

@@ -102,8 +102,9 @@ def rollout(
     batch: int = BATCH,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Instant], None] | None = None,
+    first: int = 0,
 ) -> Rollout:
-    """Play episodes 0 to `episodes - 1` of a seed; the batch's size does not change what happens.
+    """Play episodes from number `first` of a seed on; the batch's size changes nothing.
 
     progress: called with the steps done and the most that may be to do. watch: sees every instant.
     """
@@ -111,11 +112,17 @@ def rollout(
         raise InputError(f"rollout: {episodes} episodes in batches of {batch}, expected 1 or more")
     report = progress or (lambda done, total: None)
     parts, total = [], task.steps * -(-episodes // batch)
-    for number, first in enumerate(range(0, episodes, batch)):
-        count, before = min(batch, episodes - first), number * task.steps
+    for number, done in enumerate(range(0, episodes, batch)):
+        count, before = min(batch, episodes - done), number * task.steps
         parts.append(
             _played(
-                task, driver, seed, first, count, lambda k, n=before: report(n + k, total), watch
+                task,
+                driver,
+                seed,
+                first + done,
+                count,
+                lambda k, n=before: report(n + k, total),
+                watch,
             )
         )
     return joined(parts)

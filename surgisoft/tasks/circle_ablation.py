@@ -5,7 +5,6 @@ The ring is cut while the endoscope sees enough of it; success is judged on the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -61,7 +60,6 @@ class CircleAblation:
         self.steps = round(self.spec.limits.time_s / dt_s)
         self.round = round(self.config.cut_s / dt_s)
         self.aims = {name: Aim(arm, dt_s) for name, arm in self.world.arms.items()}
-
         self.goal = fresh_cut
 
     def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
@@ -78,15 +76,16 @@ class CircleAblation:
         laser = state.world.arms["laser"]
         return self.aims["laser"].miss(laser.points_mm, self.target_mm(state)).norm(dim=1)
 
-    def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
-        """The beam fires, and its target goes on, while three things hold.
-
-        The endoscope sees the ring, the axis passes the target, only the organ is in the beam.
-        """
+    def fires(self, state: TaskState) -> Tensor:
+        """(B,) bool: the endoscope sees the ring, the axis passes the target, tissue is hit."""
         scenery = state.world.scenery
         seen = scenery.view.fraction >= self.spec.limits.view_fraction
         near = self.beam_error_mm(state) <= self.config.fire_mm
-        fired = seen & near & scenery.hit.on_organ
+        return seen & near & scenery.hit.on_organ
+
+    def advance(self, state: TaskState, actions, in_place: bool, fired=None) -> TaskState:
+        """The beam is on, and its target goes on, where `fired` (B,) bool says; None: `fires`."""
+        fired = self.fires(state) if fired is None else fired
         world = self.world.step(state.world, actions, fired * self.spec.laser.power_w, in_place)
         return TaskState(world, further(state.goal, fired))
 

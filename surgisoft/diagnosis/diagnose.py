@@ -26,7 +26,7 @@ from surgisoft.surrogate.model import ArmModel
 
 CHANCE = 0.02
 """Largest chance, over all effects together, at which an effect is named."""
-LARGE = (0.1, 0.5, 0.2)
+LARGE = (0.2, 0.5, 0.12)
 """Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
 in some of them only), the share that makes it large, and its least log gain."""
 LEAST_GAIN = 0.25
@@ -43,8 +43,9 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
-EXPLAINED = 0.62
-"""Share of what is explainable that named effects must explain, or something else is missing."""
+EXPLAINED, LEFT_SIZE = 0.6, 4.0
+"""Share of the error above the floor that named effects must explain where what they leave is still
+so many times the surrogate's validated error; else something that is not known is missing."""
 UNKNOWN_SHARE = 0.35
 """Share of the error above the floor that a black box must explain where no effect does."""
 OFF_SIZE = 2.2
@@ -65,6 +66,8 @@ class Findings:
     """All effects on top of nothing."""
     named: list[Standing]
     """The effects that passed, in order, each on top of those before it."""
+    next: list[Standing]
+    """The effects that did not pass on top of those, the best first."""
     rivals: list[str]
     """Effects that explain the data about as well as the first."""
     unique: dict[str, float]
@@ -112,6 +115,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
         race=race,
         first=first,
         named=named,
+        next=standings,
         rivals=_rivals(race, first, named),
         unique=race.unique_gains(first),
         box=black_box(problem),
@@ -191,7 +195,8 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     """The kind of the answer and the effects that it names."""
     names = tuple(standing.effect for standing in found.named)
     if names:
-        if numbers["explained"] < EXPLAINED:
+        left = numbers["static_size_after"]
+        if numbers["explained_above_floor"] < EXPLAINED and left >= LEFT_SIZE:
             return "unknown_effect", ()
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
@@ -241,6 +246,10 @@ def statistics(found: Findings) -> dict:
         "box_p": found.box.p_value,
         "named": len(found.named),
         "rivals": len(found.rivals),
+        "steps": [
+            [s.effect, float(s.gain), float(s.log_gain.mean()), float(s.p_value)]
+            for s in (*found.named, *found.next[:2])
+        ],
     }
 
 

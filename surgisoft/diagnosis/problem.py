@@ -17,8 +17,10 @@ from surgisoft.surrogate.model import ArmModel
 
 ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
-BLOCK_S = 10.0
-"""Length of a block of time that is held out as a whole, s."""
+BLOCK_S = 5.0
+"""Length of a block of time, the unit of every test, s."""
+TOGETHER = 2
+"""Neighbouring blocks that are held out together."""
 BLOCK_ROWS = 8
 """Fewest of the fitted rows in a block."""
 LEAST_BLOCKS = 10
@@ -114,7 +116,7 @@ def pose(
     step = max(1, round(seen.sum() / rows))
     index = np.flatnonzero(seen)[::step]
     names, kept = np.unique(block[index], return_inverse=True)
-    fold = np.arange(len(names)) % FOLDS
+    fold = np.arange(len(names)) // TOGETHER % FOLDS
     spec = model.spec
     low, high = np.array(spec.low), np.array(spec.high)
     half = np.where(high > low, (high - low) / 2, 1.0)

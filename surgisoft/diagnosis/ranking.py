@@ -101,7 +101,7 @@ class Race:
 
     def excess(self, losses: np.ndarray) -> float:
         """Squared error above the noise floor, mm^2."""
-        return float(max(losses.sum() - self.floor.sum(), 1e-9 * max(losses.sum(), 1e-30)))
+        return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
     def log_ratio(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(B,) log of errors before over after; the floor keeps quiet blocks from shouting."""

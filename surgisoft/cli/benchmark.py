@@ -46,3 +46,44 @@ def modelling(
     if output:
         write_text(output, text)
     print(text)
+
+
+@benchmark.command()
+def diagnosis(
+    robots: Annotated[
+        str,
+        typer.Option(help="Robots, by the seed of their casting; the calibration used 101-103."),
+    ] = "104,105,106,107",
+    count: Annotated[int, typer.Option(min=8, help="Robots with their recordings, in all.")] = 400,
+    seed: Annotated[int, typer.Option(min=0, help="Draws the cases; 1 was the calibration's.")] = 2,
+    processes: Annotated[int, typer.Option(min=1, help="Robots side by side.")] = 2,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Keeps base models and what was said of each robot.")
+    ] = Path("runs/benchmark-diagnosis"),
+    images: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw the reliability diagram here.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
+    ] = None,
+) -> None:
+    """The benchmark of `diagnose`: virtual robots with hidden effects, clean ones, unknown ones."""
+    from surgisoft.errors import InputError
+    from surgisoft.studies.diagnosis import cases, run
+    from surgisoft.studies.diagnosis_table import draw, markdown
+
+    try:
+        numbers = [int(word) for word in robots.split(",")]
+    except ValueError:
+        raise InputError(f"--robots '{robots}': expected whole numbers such as 4,5,6") from None
+    some = cases(numbers, count, seed)
+    with progress("diagnosis") as report:
+        outcomes = run(some, work, processes, report)
+    command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
+    today = datetime.date.today().isoformat()
+    text = f"# Diagnosis results\n\nPrinted by `{command}` on {today}.\n\n{markdown(outcomes)}"
+    if images:
+        print(f"wrote {draw(outcomes, images)}")
+    if output:
+        write_text(output, text)
+    print(text)

@@ -7,8 +7,10 @@ on purpose, by a smooth change of their weights, to a wanted validated error.
 """
 
 import copy
+import hashlib
 import json
 import math
+import multiprocessing
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -248,28 +250,63 @@ def run(
     folder: Path,
     processes: int,
     report: Callable[[float, float, str], None],
-    log: Path | None = None,
 ) -> list[Outcome]:
     """All outcomes; base models first, then the cases, over processes.
 
-    log: a JSON-lines file that outcomes are added to as they come.
+    What was said of a case is kept in the folder, so that a run that was cut off goes on.
     """
     robots = sorted({(case.robot, case.undertrained) for case in some})
     if not robots:
         raise InputError("no cases: ask for at least one robot")
-    total, done, answer = len(robots) + len(some), 0, []
-    with ProcessPoolExecutor(processes) as pool:
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / f"outcomes-{_fingerprint()}.jsonl"
+    known = _read(log)
+    total, done = len(robots) + len(some), 0
+    answer = {case: known[case] for case in some if case in known}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as pool:
         for future in as_completed([pool.submit(base_model, r, folder, u) for r, u in robots]):
             future.result()
             done += 1
             report(done, total, "base models")
-        jobs = {pool.submit(run_case, case, folder): i for i, case in enumerate(some)}
+        done += len(answer)
+        jobs = [pool.submit(run_case, case, folder) for case in some if case not in answer]
         for future in as_completed(jobs):
             outcome = future.result()
-            answer.append((jobs[future], outcome))
+            answer[outcome.case] = outcome
             done += 1
             report(done, total, f"{len(answer)} of {len(some)} robots")
-            if log is not None:
-                with log.open("a") as file:
-                    file.write(json.dumps(asdict(outcome)) + "\n")
-    return [outcome for _, outcome in sorted(answer, key=lambda pair: pair[0])]
+            with log.open("a") as file:
+                file.write(json.dumps(asdict(outcome)) + "\n")
+    return [answer[case] for case in some]
+
+
+def _fingerprint() -> str:
+    """What the outcomes depend on: the code of the diagnosis, the effects and the rig."""
+    package = Path(__file__).parents[1]
+    parts = ("diagnosis", "surrogate", "measurement/rig", "measurement/protocols", "studies")
+    digest = hashlib.sha256()
+    for part in parts:
+        for path in sorted((package / part).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _read(log: Path) -> dict[Case, Outcome]:
+    """Outcomes that were kept; a line that was cut off is left out."""
+    answer = {}
+    for line in log.read_text().splitlines() if log.is_file() else []:
+        try:
+            values = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        case = values.pop("case")
+        hidden = tuple((name, strength) for name, strength in case.pop("hidden"))
+        outcome = Outcome(
+            case=Case(hidden=hidden, **case),
+            effects=tuple(values.pop("effects")),
+            ranking=tuple(values.pop("ranking")),
+            **values,
+        )
+        answer[outcome.case] = outcome
+    return answer

@@ -1,7 +1,9 @@
 """Figures of the diagnosis benchmark: each goal with what was measured, confusion, reliability."""
 
+import itertools
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
@@ -148,3 +150,36 @@ def _confusion(outcomes: list[Outcome]) -> str:
         "## Confusion\n\nA question mark: called ambiguous, with this one first.\n\n"
         + "\n".join(lines)
     )
+
+
+def draw(outcomes: list[Outcome], folder: Path) -> Path:
+    """The reliability diagram as a picture; returns its path."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    named = [o for o in outcomes if o.kind in NAMING]
+    sure = np.array([o.confidence for o in named])
+    right = np.array([statement_right(o) for o in named])
+    figure, axis = plt.subplots(figsize=(4.6, 3.6), layout="constrained")
+    axis.plot([0, 1], [0, 1], c="#888888", lw=1, label="calibrated")
+    for low, high in itertools.pairwise(BINS):
+        rows = (sure >= low) & ((sure < high) | (high == 1))
+        if rows.any():
+            share = right[rows].mean()
+            ends = stats.binomtest(int(right[rows].sum()), int(rows.sum())).proportion_ci(
+                method="wilson"
+            )
+            axis.plot([sure[rows].mean()] * 2, ends, c="#3b82c4", lw=1.2)
+            axis.plot(sure[rows].mean(), share, "o", c="#3b82c4")
+            axis.annotate(f" {rows.sum()}", (sure[rows].mean(), share), fontsize=8)
+    axis.set_xlabel("confidence of the first effect named")
+    axis.set_ylabel("share that is right (95 % interval)")
+    axis.set_ylim(0, 1.02)
+    axis.legend(frameon=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "diagnosis_reliability.png"
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+    return path

@@ -109,18 +109,19 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
 
 def show_parameters(parameters) -> None:
     """The fitted parameters, one a line, and which of them are implausible."""
-    from surgisoft.diagnosis.amend_page import values_text
+    from surgisoft.diagnosis.refine_intervals import values_text
 
     for each in parameters:
         unit = f" {each.unit}" if each.unit else ""
-        low, high = values_text(each.low), values_text(each.high)
-        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit} ({low} to {high})")
+        interval = f" ({each.interval_text})" if each.interval_text else ""
+        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit}{interval}")
     for each in parameters:
         if not each.plausible:
             low, high = each.plausible_range
+            unit = f" {each.unit}" if each.unit else ""
             print(
                 f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
-                f"{low:g} to {high:g} {each.unit} ({each.source})"
+                f"{low:g} to {high:g}{unit} ({each.source})"
             )
 
 

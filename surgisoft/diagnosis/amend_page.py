@@ -3,7 +3,7 @@
 import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Track
-from surgisoft.diagnosis.refine_intervals import Parameter
+from surgisoft.diagnosis.refine_intervals import Parameter, values_text
 from surgisoft.report import Facts, Page, Picture, Section, Table, Text
 from surgisoft.report.charts import BLUE, RED, chart, drawing
 
@@ -15,8 +15,6 @@ HOW = (
 )
 POINTS = 600
 """Points of a line in a chart."""
-MOST_VALUES = 12
-"""Most values of one quantity that are written out."""
 
 
 def amend_page(result: Amendment, title: str, about: str) -> Page:
@@ -59,7 +57,7 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
             each.effect,
             each.name,
             values_text(each.value),
-            f"{values_text(each.low)} .. {values_text(each.high)}",
+            each.interval_text or "-",
             each.unit or "-",
             "{:g} .. {:g}".format(*each.plausible_range) + ("" if each.plausible else ": outside"),
             each.source,
@@ -68,15 +66,6 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
     ]
     header = ["effect", "parameter", "value", "95 % interval", "unit", "plausible", "source"]
     return Table(header, rows)
-
-
-def values_text(value: float | list) -> str:
-    """A value or nested values in short."""
-    flat = np.asarray(value, float).ravel()
-    if flat.size > MOST_VALUES:
-        return f"{flat.size} values, {flat.min():.3g} to {flat.max():.3g}"
-    text = ", ".join(f"{number:.4g}" for number in flat)
-    return text if flat.size == 1 else f"[{text}]"
 
 
 def track_chart(track: Track, caption: str) -> Picture:

@@ -14,7 +14,7 @@ from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.refine_effects import fit_effects
-from surgisoft.diagnosis.refine_intervals import Parameter
+from surgisoft.diagnosis.refine_intervals import Parameter, values_text
 from surgisoft.diagnosis.refine_network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
@@ -129,9 +129,9 @@ def improve(
             before = problem.with_model(models[-1])
             fitted = fit_effects(before, [*added, name])
             fall = fall_of(before, problem.with_model(fitted.model))
-            if not fall.claimed:
-                why = f"{said.sentence}; but {name}, fitted through the whole model, does not help"
-                said = replace(said, sentence=why, error_open_mm=fall.before)
+            doubt = _doubt(name, fall, fitted.parameters)
+            if doubt:
+                said = replace(said, sentence=f"{said.sentence}; but {doubt}")
                 continue
             going = True
             added.append(name)
@@ -169,6 +169,20 @@ def next_effects(found: Diagnosis) -> tuple[str, ...]:
     """
     effects = found.verdict.effects
     return effects[:1] if found.verdict.kind == "ambiguous" else effects
+
+
+def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
+    """Why an effect is not added, whatever the diagnosis says; empty where it may be."""
+    if not fall.claimed:
+        return f"{name}, fitted through the whole model, does not lower the error"
+    wrong = [p for p in parameters if p.effect == name and not p.plausible]
+    if not wrong:
+        return ""
+    low, high = wrong[0].plausible_range
+    return (
+        f"{name} would lower the error to {fall.after:.3f} mm only with an implausible "
+        f"{wrong[0].name} = {values_text(wrong[0].value)}, expected {low:g} to {high:g}"
+    )
 
 
 def _step(said: Round, name: str, found: Diagnosis, error_mm: float) -> Round:

@@ -18,6 +18,8 @@ from surgisoft.surrogate.effects import Effect
 
 DRAWS = 400
 """Draws of the values."""
+MOST_VALUES = 9
+"""Most values of one quantity that are written out."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,27 @@ class Parameter:
     source: str
     """Where the range comes from."""
 
+    @property
+    def interval_text(self) -> str:
+        """The interval in short; empty where the value was given or there are too many."""
+        if np.size(self.value) > MOST_VALUES or self.low == self.high:
+            return ""
+        return f"{values_text(self.low)} to {values_text(self.high)}"
+
     def to_json(self) -> dict:
         """Plain values, the interval as `ci95`."""
         values = asdict(self)
         low, high = values.pop("low"), values.pop("high")
         return values | {"ci95": [low, high], "plausible_range": list(self.plausible_range)}
+
+
+def values_text(value: float | list) -> str:
+    """A value or nested values in short."""
+    flat = np.asarray(value, float).ravel()
+    if flat.size > MOST_VALUES:
+        return f"{flat.size} values from {flat.min():.3g} to {flat.max():.3g}"
+    text = ", ".join(f"{number:.4g}" for number in flat)
+    return text if flat.size == 1 else f"[{text}]"
 
 
 def draws_of(fit: Fit, block: np.ndarray, number: int = DRAWS, seed: int = 0) -> np.ndarray:

@@ -27,7 +27,7 @@ RIDGES = 10.0 ** np.arange(-4.0, 2.1, 0.5)
 """Ridges that are tried."""
 RANGE_ROWS = 4000
 """Random actuations over the range where the network is held."""
-LEAST_GAIN = 0.02
+LEAST_GAIN = 0.05
 """Least fall of the held-out squared error that is worth a change, as a share of it."""
 CHANCE = 0.025
 """Chance of so large a gain if there were none, one-sided."""

@@ -6,7 +6,7 @@ import pytest
 
 from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
-from surgisoft.diagnosis.improve import improve, next_effects
+from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Verdict
 from surgisoft.errors import InputError
 from surgisoft.measurement.recording import save_recording
@@ -67,8 +67,17 @@ def test_a_wrong_diagnosis_is_not_followed(recited):
     result = improve(bare_arm(), [measured_on(TRUTHS["gain_mismatch"], rows=200)])
     assert result.steps == []
     assert not result.claimed
-    assert "does not help" in result.rounds[-1].sentence
+    assert "does not lower the error" in result.rounds[-1].sentence
     assert list(result.model.effects) == []
+
+
+def test_an_effect_that_helps_only_beyond_all_plausibility_is_not_added(recited):
+    """Gains that differ by so much are no manufacturing spread: amend may add them, improve not."""
+    truth = with_truth("gain_mismatch", {"gain": [0.7, -0.1, -0.4]})
+    recited(said("identified", "gain_mismatch"))
+    result = improve(bare_arm(), [measured_on(truth, rows=200)])
+    assert [name for name, _ in result.steps if name != NETWORK] == []
+    assert "only with an implausible gain_share" in result.rounds[0].sentence
 
 
 def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recited):

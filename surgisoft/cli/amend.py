@@ -121,7 +121,7 @@ def show_parameters(parameters) -> None:
             unit = f" {each.unit}" if each.unit else ""
             print(
                 f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
-                f"{low:g} to {high:g}{unit} ({each.source})"
+                f"{low:.3g} to {high:.3g}{unit} ({each.source})"
             )
 
 

@@ -91,7 +91,7 @@ def improve(
 def _show(result) -> None:
     """Each round, then the parameters and the errors on the locked part."""
     for number, done in enumerate(result.rounds, 1):
-        what = f"+ {done.step}" if done.step else "end"
+        what = f"+ {done.step}" if done.step else "no effect more"
         rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")
         print(f"  {what}{rivals}: error on the open part {done.error_open_mm:.4f} mm")

@@ -59,7 +59,8 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
             values_text(each.value),
             each.interval_text or "-",
             each.unit or "-",
-            "{:g} .. {:g}".format(*each.plausible_range) + ("" if each.plausible else ": outside"),
+            "{:.3g} .. {:.3g}".format(*each.plausible_range)
+            + ("" if each.plausible else ": outside"),
             each.source,
         )
         for each in parameters

@@ -13,6 +13,8 @@ HOW = (
     "quarter of each recording, which was looked at once.\n\n"
     "Intervals are 95 %, from blocks of time: rows that follow each other err alike."
 )
+OUTSIDE = ": outside"
+"""Mark of a value outside its plausible range."""
 POINTS = 600
 """Points of a line in a chart."""
 

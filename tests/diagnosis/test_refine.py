@@ -33,7 +33,7 @@ def bare_arm() -> ArmModel:
     return ArmModel(arm.spec, network, {}, arm.rest_mm, arm.validation).eval()
 
 
-def measured_on(truth: ArmModel, runs: int = 4, rows: int = 500, seed: int = 0) -> Recording:
+def measured_on(truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0) -> Recording:
     """What cameras with white noise would record of a model that is the truth, at 10 Hz."""
     rng = np.random.default_rng(seed)
     low, high = np.array(truth.spec.low), np.array(truth.spec.high)

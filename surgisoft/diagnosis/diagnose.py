@@ -26,13 +26,16 @@ from surgisoft.surrogate.model import ArmModel
 
 CHANCE = 0.02
 """Largest chance, over all effects together, at which an effect is named."""
-LARGE = (0.2, 0.5, 0.12)
+LARGE = (0.2, 0.5, 0.07)
 """Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
 in some of them only), the share that makes it large, and its least log gain."""
 LEAST_GAIN = 0.25
 """Least share of the squared error above the floor that the first effect explains."""
 NEXT_GAIN = 0.15
 """Least share of the first such error that a further effect explains."""
+BESIDE = (0.3, 0.3, 0.6)
+"""Or: least share of what the effects before it left, least log gain, and the most that it explains
+alone beside what the first one does alone, for it must not be that one's shadow."""
 LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""
 MOST_EFFECTS = 3
@@ -103,7 +106,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     base: tuple[int, ...] = ()
     start = race.excess(race.losses())
     while standings and len(named) < MOST_EFFECTS:
-        passed = [s for s in standings if _passes(race, base, s, start, bool(named))]
+        passed = [s for s in standings if _passes(race, base, s, start, first, named)]
         if not passed:
             break
         named.append(passed[0])
@@ -123,17 +126,27 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     )
 
 
-def _passes(race: Race, base: tuple[int, ...], s: Standing, start: float, later: bool) -> bool:
+def _passes(
+    race: Race,
+    base: tuple[int, ...],
+    s: Standing,
+    start: float,
+    first: list[Standing],
+    named: list[Standing],
+) -> bool:
     """Whether one effect on top of a base is beyond chance and large enough."""
     share = (race.losses(base).sum() - s.losses.sum()) / start
-    chance, large, log_gain = LARGE
-    if not later and s.p_value <= chance and share >= large and s.log_gain.mean() >= log_gain:
-        return True
-    return bool(
-        s.p_value <= CHANCE
-        and s.log_gain.mean() >= LEAST_LOG_GAIN
-        and share >= (NEXT_GAIN if later else LEAST_GAIN)
-    )
+    log_gain = s.log_gain.mean()
+    if not named:
+        chance, large, least = LARGE
+        sure = s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN
+        return bool(sure or (s.p_value <= chance and share >= large and log_gain >= least))
+    if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
+        return False
+    least_gain, least_log, most = BESIDE
+    alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
+    beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
+    return bool(share >= NEXT_GAIN or beside)
 
 
 def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[str]:

@@ -5,10 +5,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from surgisoft.diagnosis.candidates import Candidate
-from surgisoft.diagnosis.cross_validation import CrossValidation, static_features
+from surgisoft.diagnosis.cross_validation import FITTED, CrossValidation, static_features
 from surgisoft.diagnosis.gates import family_p_values
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.effects import Effect, Quantity
+
+KNOWN_WEIGHT = float(__import__("os").environ.get("KW", 3.0))
+"""Weight of a reference's rows: an error that changed since is not shared out over both."""
+
+PRICE = 0.003
+"""Share of a gain that each amplitude costs: of two effects that explain alike, the simpler one."""
+
+WIDER = 2.0
+"""Factor by which a first, linear estimate may leave the plausible range of a parameter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +49,23 @@ class Standing:
     gain: float
     """Share of the base's squared error above the floor that goes."""
 
+    @property
+    def score(self) -> float:
+        """What effects are ranked by."""
+        return _score(self.log_gain, self.option)
+
+
+def _near(quantity: Quantity) -> bool:
+    """Whether a first estimate may turn out plausible: right in sign, at most WIDER too large."""
+    low = quantity.low * (WIDER if quantity.low < 0 else 1 / WIDER) - 0.01 * abs(quantity.high)
+    high = quantity.high * (WIDER if quantity.high > 0 else 1 / WIDER)
+    return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
+
+
+def _score(log_gain: np.ndarray, option: Option) -> float:
+    """Mean log gain, the less of it counted the more amplitudes it took."""
+    return float(log_gain.mean()) * (1.0 - PRICE * min(len(option.picked), 100))
+
 
 @dataclass(frozen=True, eq=False)
 class Race:
@@ -65,16 +91,7 @@ class Race:
         columns = [c.columns for c in candidates]
         residual = problem.residual
         columns = np.concatenate([np.zeros((*residual.shape, 0)), *columns], axis=3)
-        features = static_features(problem.pressure, problem.direction)
-        validation = CrossValidation.of(
-            features,
-            residual,
-            columns,
-            problem.block,
-            problem.fold,
-            problem.surrogate_mm,
-            problem.noise_mm,
-        )
+        validation = _validation(problem, columns)
         options: dict[str, list[Option]] = {}
         first = 0
         for number, candidate in enumerate(candidates):
@@ -117,12 +134,13 @@ class Race:
         gains = np.array([self.log_ratio(before, losses) for losses in after])
         chances = family_p_values(gains, [way.effect for way in ways])
         best: dict[str, Standing] = {}
-        for i in np.argsort(-gains.mean(axis=1), kind="stable"):
+        scores = [_score(gain, way) for gain, way in zip(gains, ways, strict=True)]
+        for i in np.argsort(-np.array(scores), kind="stable"):
             way, losses = ways[i], after[i]
             if way.effect not in best and self.plausible(way, base):
                 gain = (before.sum() - losses.sum()) / self.excess(before)
                 best[way.effect] = Standing(way.effect, way, losses, gains[i], chances[i], gain)
-        return sorted(best.values(), key=lambda standing: -standing.log_gain.mean())
+        return sorted(best.values(), key=lambda standing: -standing.score)
 
     def plausible(self, way: Option, base: tuple[int, ...] = ()) -> bool:
         """Whether an effect's parameters lie in their ranges as the race leaves them.
@@ -133,7 +151,7 @@ class Race:
             singles = [w for w in self.options[way.effect] if w.shape is not None]
             way = min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
         effect = self.in_place(way, base)
-        return effect is None or effect.plausible()
+        return effect is None or all(_near(quantity) for quantity in effect.quantities())
 
     def in_place(self, way: Option, base: tuple[int, ...] = ()) -> Effect | None:
         """The effect of a single shape at the strengths that the race gives it beside a base."""
@@ -166,3 +184,26 @@ class Race:
         )
         effect = self.in_place(way)
         return {} if effect is None else {q.name: q.value for q in effect.quantities()}
+
+
+def _validation(problem: Problem, columns: np.ndarray) -> CrossValidation:
+    """Held-out errors with columns (S, n, 3, K); rows of a reference are fitted, never judged."""
+    pressure, direction, residual = problem.pressure, problem.direction, problem.residual
+    block, fold = problem.block, problem.fold
+    known = problem.reference
+    if known is not None:
+        pressure = np.concatenate([pressure, known.pressure])
+        direction = np.concatenate([direction, known.direction])
+        residual = np.concatenate([residual, known.residual])
+        nothing = np.zeros((*known.residual.shape, columns.shape[3]), columns.dtype)
+        columns = np.concatenate([columns, nothing])
+        block = np.concatenate([block, known.block + len(fold)])
+        fold = np.concatenate([fold, np.full(known.block.max() + 1, FITTED)])
+    features = static_features(pressure, direction)
+    if known is not None:
+        first = len(problem.block)
+        features[first:] *= KNOWN_WEIGHT
+        residual[first:] *= KNOWN_WEIGHT
+    return CrossValidation.of(
+        features, residual, columns, block, fold, problem.surrogate_mm, problem.noise_mm
+    )

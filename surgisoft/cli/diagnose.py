@@ -23,6 +23,14 @@ def diagnose(
     report: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write an HTML report with pictures here.")
     ] = None,
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="REC",
+            help="Recordings from before something changed, such as those of the fit: tells what "
+            "has changed since from what the network never learned.",
+        ),
+    ] = None,
     effect_files: Annotated[
         list[Path] | None,
         typer.Option("--effect-file", metavar="FILE.py", help="Also try an effect of your own."),
@@ -45,15 +53,18 @@ def diagnose(
     for path in effect_files or []:
         register_effect_file(path)
     arm = load_model(model)
-    measured = load_recordings(
-        recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
-    )
+
+    def warn(text: str) -> None:
+        typer.echo(f"surgisoft: warning: {text}", err=True)
+
+    measured = load_recordings(recordings, on_warning=warn)
+    before = load_recordings(reference, on_warning=warn) if reference else None
     torch.set_num_threads(1)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
-        found = diagnose_model(arm, measured, lambda text: tell(next(stages), 5, text))
+        found = diagnose_model(arm, measured, lambda text: tell(next(stages), 5, text), before)
     for note in outside_range(arm.spec, measured):
-        typer.echo(f"surgisoft: warning: {note}", err=True)
+        warn(note)
     if json_file:
         write_text(json_file, json.dumps(found.to_json(), indent=2) + "\n")
     _show(found)

@@ -24,6 +24,9 @@ hold the flexible function back. Of several the one is taken that does best on h
 RIDGES = (1e-4, 1e-2, 1e-1)
 """Ridges on amplitudes, shares of a column's own power; the best on held-out blocks is taken."""
 
+FITTED = -1
+"""Fold of blocks that are fitted in every fold and never judged; they come last."""
+
 
 def static_features(x, d, number: int = INDUCING, seed: int = 0) -> np.ndarray:
     """(S, F) features whose unit-normal mixture has the discrepancy's covariance."""
@@ -70,8 +73,8 @@ class CrossValidation:
     ) -> "CrossValidation":
         """features (S, F), residual (S, n, 3) and columns (S, n, 3, K) in mm, NaN where missing.
 
-        block: (S,) block of each row; fold: (B,) fold of each block; surrogate_mm and noise_mm:
-        (n,) RMS errors of each key point's distance.
+        block: (S,) block of each row; fold: (B,) fold of each block, blocks of the fold FITTED
+        last; surrogate_mm and noise_mm: (n,) RMS errors of each key point's distance.
         """
         seen = np.isfinite(residual).all(2)
         field = np.concatenate([residual[..., None], columns], axis=3).astype(np.float32)
@@ -81,12 +84,13 @@ class CrossValidation:
         prior = np.maximum(surrogate_mm, 0.1 * noise_mm) ** 2 * ROOM**2
         ridges = [(noise_mm**2 + rows * mean) / prior for rows in PERSISTENCE]
         levels: list[list[Fold]] = [[] for _ in ridges]
-        for number in np.unique(fold):
+        judged = int((fold != FITTED).sum())
+        for number in np.unique(fold[:judged]):
             where = np.flatnonzero(fold == number)
             parts = _split(features.astype(np.float32), field, seen, fold[block] == number, block)
             for level, ridge in zip(levels, ridges, strict=True):
                 level.append(_fold(parts, ridge, where, field.shape[3]))
-        counts = np.bincount(block, weights=seen.sum(1), minlength=len(fold))
+        counts = np.bincount(block, weights=seen.sum(1), minlength=len(fold))[:judged]
         return cls(levels, counts, field.shape[3] - 1)
 
     def losses(self, picked: list[int] | np.ndarray = ()) -> np.ndarray:

@@ -17,7 +17,7 @@ from surgisoft.diagnosis.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.confidence import confidence
 from surgisoft.diagnosis.gates import first_shares, studentised
-from surgisoft.diagnosis.problem import Problem, pose
+from surgisoft.diagnosis.problem import Problem, pose, with_reference
 from surgisoft.diagnosis.ranking import Race, Standing
 from surgisoft.diagnosis.static_error import StaticError, static_error
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
@@ -85,13 +85,22 @@ class Findings:
 
 
 def diagnose(
-    model: ArmModel, recordings: list[Recording], progress: Progress | None = None
+    model: ArmModel,
+    recordings: list[Recording],
+    progress: Progress | None = None,
+    reference: list[Recording] | None = None,
 ) -> Diagnosis:
-    """Name the effects that a model is missing on recordings of its own arm."""
+    """Name the effects that a model is missing on recordings of its own arm.
+
+    reference: recordings from before something changed, such as those that the model was fitted
+    to; where given, the question is what has changed since.
+    """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
     report("predicting")
     problem = pose(model, recordings, part="open")
+    if reference:
+        problem = with_reference(problem, reference)
     report("columns of the effects")
     found = find(problem, candidates(problem), report)
     return replace(answer(found), seconds=time.perf_counter() - begin)

@@ -36,6 +36,20 @@ Part = Literal["open", "locked", "all"]
 
 
 @dataclass(frozen=True, eq=False)
+class Reference:
+    """A model's residual on recordings on which nothing is missing but what its network lacks."""
+
+    pressure: np.ndarray
+    """(S, m) actuation scaled to [-1, 1] over the model's range."""
+    direction: np.ndarray
+    """(S, m) directions of change."""
+    residual: np.ndarray
+    """(S, n, 3) measured less predicted, mm; NaN where missing."""
+    block: np.ndarray
+    """(S,) block of time of each row, from 0."""
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """A model on recordings, thinned to S rows."""
 
@@ -65,6 +79,8 @@ class Problem:
     """(n,) RMS noise of each key point's distance, mm."""
     floor_source: str
     """Where the noise is known from."""
+    reference: "Reference | None" = None
+    """What the model's own error is known from; None: from its validated size alone."""
 
     @property
     def residual(self) -> np.ndarray:
@@ -140,6 +156,19 @@ def pose(
         surrogate_mm=np.sqrt(np.maximum(validated**2 - noise**2, (0.3 * validated) ** 2)),
         noise_mm=noise,
         floor_source=source,
+    )
+
+
+def with_reference(problem: Problem, recordings: list[Recording], rows: int = ROWS) -> Problem:
+    """The problem, told where its model was wrong on recordings made before anything changed.
+
+    The model's own error has to explain these rows too, by the same function of actuation and
+    direction, so it cannot pass for what has changed since.
+    """
+    known = pose(problem.model, recordings, rows)
+    return replace(
+        problem,
+        reference=Reference(known.pressure, known.direction, known.residual, known.block),
     )
 
 

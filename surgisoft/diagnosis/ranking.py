@@ -10,7 +10,7 @@ from surgisoft.diagnosis.gates import family_p_values
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.surrogate.effects import Effect, Quantity
 
-KNOWN_WEIGHT = float(__import__("os").environ.get("KW", 3.0))
+KNOWN_WEIGHT = 3.0
 """Weight of a reference's rows: an error that changed since is not shared out over both."""
 
 PRICE = 0.003
@@ -187,7 +187,10 @@ class Race:
 
 
 def _validation(problem: Problem, columns: np.ndarray) -> CrossValidation:
-    """Held-out errors with columns (S, n, 3, K); rows of a reference are fitted, never judged."""
+    """Held-out errors with columns (S, n, 3, K).
+
+    Rows of a reference are fitted and never judged; no effect acts on them.
+    """
     pressure, direction, residual = problem.pressure, problem.direction, problem.residual
     block, fold = problem.block, problem.fold
     known = problem.reference

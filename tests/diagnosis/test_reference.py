@@ -1,0 +1,82 @@
+"""What has changed since a reference, beside an error of the network that was there before."""
+
+import numpy as np
+import pytest
+from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.cross_validation import FITTED, CrossValidation
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.measurement.recording import save_recording
+from surgisoft.surrogate.checkpoint import save_model
+
+ROWS = 3000
+
+
+def unlearned(pressure):
+    """(T,) mm: what the network never learned of the arm, a smooth function of the actuation."""
+    a, b = pressure.T / 10
+    return 2.0 * np.sin(2.5 * a) + 1.5 * np.cos(3.0 * b) * a
+
+
+def measured(seed, shifted_mm=0.0):
+    """The arm's recording; the whole of it moved sideways since, as a turned camera sees it."""
+    pressure = walk(ROWS, seed=seed)
+    points = POINTS + np.array([0.0, shifted_mm, 0.0])
+    return recording(unlearned(pressure), pressure, points, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def model():
+    model = still_model()
+    model.validation = {"rmse_mm": 1.5, "per_key_point_mm": [0.5, 1.0, 2.0], "rows": ROWS}
+    return model
+
+
+def test_what_was_there_before_is_not_named(model):
+    found = diagnose(model, [measured(1)], reference=[measured(2)])
+    assert found.verdict.effects == ()
+
+
+def test_what_has_changed_is_named(model):
+    """A shift of the size of the network's error: its own for all one knows without a reference."""
+    now = measured(1, shifted_mm=1.0)
+    alone = diagnose(model, [now])
+    since = diagnose(model, [now], reference=[measured(2)])
+    assert "misalignment" not in alone.verdict.effects
+    assert since.verdict.effects[0] == "misalignment"
+    gain = {row.effect: row.gain_alone for row in since.ranking}["misalignment"]
+    assert gain > 0.8
+
+
+def test_rows_of_a_reference_are_fitted_and_not_judged():
+    """Against the same rows put into every fold by hand."""
+    rng = np.random.default_rng(0)
+    features, columns = rng.normal(size=(90, 4)), rng.normal(size=(90, 1, 3, 2))
+    residual = 0.5 * columns[..., 0] + rng.normal(size=(90, 1, 3))
+    columns[60:] = 0.0
+    block, size, noise = np.arange(90) // 6, np.ones(1), np.full(1, 0.1)
+    fold = np.concatenate([np.arange(10) % 5, np.full(5, FITTED)])
+    found = CrossValidation.of(features, residual, columns, block, fold, size, noise)
+    assert found.losses((0,)).shape == (10,)
+    np.testing.assert_array_equal(found.counts, np.full(10, 6))
+    for number in range(5):
+        # One split into two: the judged fold, and the rest with the reference.
+        two = np.where(fold == number, 0, 1)
+        one = CrossValidation.of(features, residual, columns, block, two, size, noise)
+        judged = fold[:10] == number
+        for level, other in zip(found.levels, one.levels, strict=True):
+            np.testing.assert_allclose(level[number].gram, other[0].gram, rtol=1e-5)
+            np.testing.assert_allclose(level[number].judged, other[0].judged, rtol=1e-4, atol=1e-4)
+            assert judged[level[number].blocks].all()
+
+
+def test_command_takes_a_reference(model, tmp_path, capsys):
+    save_model(model, tmp_path / "arm")
+    save_recording(measured(1, shifted_mm=1.0), tmp_path / "now.parquet")
+    save_recording(measured(2), tmp_path / "before.parquet")
+    now, before = str(tmp_path / "now.parquet"), str(tmp_path / "before.parquet")
+    assert run(["diagnose", str(tmp_path / "arm"), now, "--reference", before]) == 0
+    assert "misalignment is missing" in capsys.readouterr().out
+    assert run(["diagnose", str(tmp_path / "arm"), now, "--reference", str(tmp_path / "no")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -14,12 +14,16 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
 	touch $@
 
-demo: $(STAMP)  ## collect on the virtual rig, fit the arm model, compare
-	$(BIN)/surgisoft collect grid --points 1728 --seed 1 -o demo/train.parquet --force
-	$(BIN)/surgisoft collect validation --seed 1 -o demo/valid.parquet --force
-	$(BIN)/surgisoft collect test --seed 1 -o demo/test.parquet --force
-	$(BIN)/surgisoft fit demo/train.parquet --valid demo/valid.parquet --effects hysteresis -o demo/model --force
-	$(BIN)/surgisoft compare demo/model demo/test.parquet --report demo/compare
+demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that a model is missing
+	rm -rf demo/ring
+	$(BIN)/surgisoft train --task circle_ablation --minutes 4 -o demo/ring
+	$(BIN)/surgisoft evaluate demo/ring scripted random --task circle_ablation --episodes 4 --replay demo/ring.rrd
+	$(BIN)/surgisoft collect mixed --seed 0 --hidden creep -o demo/bench.parquet --force
+	$(BIN)/surgisoft compare default demo/bench.parquet --report demo/compare
+	$(BIN)/surgisoft diagnose default demo/bench.parquet --report demo/diagnosis
+	$(BIN)/surgisoft amend default --effect creep --data demo/bench.parquet -o demo/amended --force
+	@echo "Look at demo/compare/report.html and demo/diagnosis/diagnosis.html;"
+	@echo "see the cut with: $(BIN)/surgisoft replay demo/ring.rrd --web"
 
 test: $(STAMP)  ## the whole suite
 	$(BIN)/python -m pytest -n 2 -q

@@ -23,6 +23,9 @@ from surgisoft.surrogate.recurrent import RecurrentArm
 FORMAT = 1
 """Version of the folder's layout."""
 
+DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "default_arm"
+"""Name and folder of the arm that comes with the package."""
+
 OWN_FILES = ("config.json", "weights.safetensors", "report.json")
 """What a model's folder is made of; a replaced model leaves other files where they are."""
 
@@ -92,8 +95,13 @@ def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, 
 
 
 def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmModel:
-    """The model in a folder, ready to evaluate; bit-equal to what was saved."""
+    """The model in a folder, ready to evaluate; bit-equal to what was saved.
+
+    `default`, where there is no such folder, is the arm that comes with the package.
+    """
     folder = Path(folder)
+    if str(folder) == DEFAULT and not folder.exists():
+        folder = DEFAULT_FOLDER
     if not (folder / "config.json").is_file():
         raise InputError(
             f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"

@@ -4,11 +4,14 @@ import json
 from importlib.resources import files
 
 import numpy as np
+import pytest
 import torch
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.default import default_arm
 
 
@@ -33,3 +36,12 @@ def test_its_folder_says_how_well_it_was_validated():
     kept = [stage["valid_rmse_mm"] for stage in report["stages"] if stage["kept"]]
     assert default_arm().validation["rmse_mm"] == kept[-1] < 0.2
     assert "surgisoft fit" in (folder / "SOURCE.md").read_text()
+
+
+def test_the_word_default_opens_it(tmp_path, monkeypatch):
+    """Unless a folder has that name."""
+    monkeypatch.chdir(tmp_path)
+    assert load_model("default").summary() == default_arm().summary()
+    (tmp_path / "default").mkdir()
+    with pytest.raises(InputError, match="no arm model there"):
+        load_model("default")

@@ -18,10 +18,12 @@ MAY_IMPORT = {
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
     "agents": {"scene", "surrogate", "measurement", "tasks", "report"},
+    "experiments": {"agents", "scene", "measurement", "tasks", "replay", "report"},
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
         "agents",
+        "experiments",
         "tasks",
         "scene",
         "surrogate",

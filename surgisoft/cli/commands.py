@@ -9,6 +9,7 @@ from surgisoft.cli import (
     compare,
     diagnose,
     evaluate,
+    experiment,
     fit,
     import_,
     improve,

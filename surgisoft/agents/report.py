@@ -1,0 +1,141 @@
+"""The page of an evaluation: the verdict, the table, charts of each driver's first episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from surgisoft.agents.evaluate import RATES, Evaluation, Summary
+from surgisoft.agents.report_charts import episode_charts, spread_chart
+from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
+from surgisoft.tasks.episode import EpisodeLog
+
+WORDS = {
+    "success": "success",
+    "completion": "share of the ring cut",
+    "beam_error_mean_mm": "mean beam error [mm]",
+    "clearance_mm": "least clearance [mm]",
+}
+"""Numbers that are drawn for every episode, in words."""
+HOW = (
+    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
+    "for all else. The beam's error is how far its axis passes from its target while it is on. "
+    "Clearance, contact and success are judged by exact collision queries where there is a scene."
+)
+
+
+def evaluation_page(
+    task: str, on: str, results: Sequence[Evaluation], logs: Mapping[str, EpisodeLog], about: str
+) -> Page:
+    """`logs`: driver -> its first episode."""
+    names = list(dict.fromkeys(name for result in results for name in result.overall))
+    rows = [
+        (name, *(cell(result.overall.get(name), name in RATES) for result in results))
+        for name in names
+    ]
+    header = ["mean [95 % interval]", *(Path(result.driver).name for result in results)]
+    best = next(iter(results))
+    return Page(
+        title=f"Evaluation of {task}, {on}",
+        verdict=verdict(task, results),
+        about=about,
+        tone=_tone(results),
+        parts=[
+            Facts(_facts(best)),
+            Section("All numbers", [Table(header, rows)]),
+            Section("Every episode", [Gallery(_spreads(results))]),
+            *(
+                Section(f"First episode of {Path(name).name}", episode_parts(log))
+                for name, log in logs.items()
+            ),
+            Section("How to read this", [Text(HOW)]),
+        ],
+    )
+
+
+def episode_parts(log: EpisodeLog) -> list:
+    """Charts and events of an episode."""
+    charts = episode_charts(log)
+    wide = [picture for picture in charts if picture.alt.startswith("dose")]
+    events = [(f"{e.time_s:.1f} s", e.level, e.text) for e in log.events]
+    return [
+        Gallery([picture for picture in charts if picture not in wide]),
+        *(_scrolling(picture) for picture in wide),
+        Table(["time", "level", "event"], shortened(events), "Events"),
+    ]
+
+
+def shortened(events: list, most: int = 24) -> list:
+    """The events, those in the middle left out where there are many."""
+    if len(events) <= most:
+        return events
+    left = len(events) - most
+    return [*events[: most // 2], ("...", "", f"{left} more"), *events[-(most // 2) :]]
+
+
+def _scrolling(picture: Picture) -> Picture:
+    return Picture(picture.data, picture.alt, picture.caption, picture.kind, 620)
+
+
+def verdict(task: str, results: Sequence[Evaluation]) -> str:
+    """One sentence on what came out for each driver."""
+    parts = []
+    for result in results:
+        success, error = result.overall.get("success"), _error(result)
+        words = [] if success is None else [f"{success.mean:.0%} success"]
+        words += [] if error is None else [f"mean error {error.mean:.3g} mm"]
+        parts.append(f"{Path(result.driver).name}: {', '.join(words) or 'see the table'}")
+    episodes = len(next(iter(results[0].per_episode.values())))
+    plural = "s" if episodes > 1 else ""
+    return f"{task}, {episodes} episode{plural} each. {'; '.join(parts)}."
+
+
+def cell(value: Summary | None, rate: bool) -> str:
+    """A mean with its interval."""
+    if value is None or not value.episodes:
+        return "-"
+    if rate:
+        return f"{value.mean:.1%} [{value.low:.1%}, {value.high:.1%}]"
+    if value.least == value.most:
+        return f"{value.mean:.4g}"
+    return f"{value.mean:.4g} [{value.low:.4g}, {value.high:.4g}]"
+
+
+def _error(result: Evaluation) -> Summary | None:
+    names = [name for name in result.overall if name.endswith("error_mean_mm")]
+    return result.overall[names[0]] if names else None
+
+
+def _tone(results: Sequence[Evaluation]) -> str:
+    shares = [r.overall["success"].mean for r in results if "success" in r.overall]
+    if not shares:
+        return "plain"
+    return "good" if min(shares) >= 0.95 else "warn" if max(shares) >= 0.5 else "bad"
+
+
+def _facts(result: Evaluation) -> list[tuple[str, str]]:
+    items = [("driver", Path(result.driver).name)]
+    for name in ("success", "completion", "collided", "clearance_mm", "time_s"):
+        value = result.overall.get(name)
+        if value is not None and value.episodes:
+            text = f"{value.mean:.0%}" if name in (*RATES, "completion") else f"{value.mean:.3g}"
+            items.append((name, text))
+    error = _error(result)
+    if error is not None and error.episodes:
+        items.append(("mean error", f"{error.mean:.3g} mm"))
+    return items
+
+
+def _spreads(results: Sequence[Evaluation]) -> list[Picture]:
+    names = [n for n in results[0].per_episode if n in WORDS or n.endswith("error_mean_mm")]
+    drawn = []
+    for name in names:
+        groups = [
+            (Path(result.driver).name, result.per_episode[name].tolist())
+            for result in results
+            if name in result.per_episode
+        ]
+        words = WORDS.get(name, name)
+        picture = spread_chart(words, groups, words)
+        drawn += [] if picture is None else [picture]
+    return drawn

@@ -1,0 +1,216 @@
+"""Charts of an episode's log: path over target, error, progress, clearance, the dose unrolled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib import pyplot as plt
+
+from surgisoft.report import Picture
+from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
+from surgisoft.report.style import INK, MUTED
+from surgisoft.tasks.episode import EpisodeLog
+
+JUMP_MM = 3.0
+"""A target that goes farther in a step has jumped: no line is drawn (mm)."""
+OFFSET_MM = 2.0
+"""The unrolled dose is shown so far on either side of the ring (mm)."""
+CELL_MM = 0.25
+"""Size of a cell of the unrolled dose along the ring, and half of it across (mm)."""
+NEAR_CLEARANCE_MM = 15.0
+"""Clearances beyond this and the limit are not spread out (mm)."""
+
+
+def episode_charts(log: EpisodeLog) -> list[Picture]:
+    """Every chart that the episode has something for."""
+    return [
+        picture
+        for picture in (
+            path_chart(log),
+            dose_chart(log),
+            error_chart(log),
+            progress_chart(log),
+            clearance_chart(log),
+        )
+        if picture is not None
+    ]
+
+
+def path_chart(log: EpisodeLog) -> Picture:
+    """Where the beam burnt (or the point went) over where it should, in the path's plane."""
+    wanted = log.path_mm if len(log.path_mm) else log.target_mm
+    on = log.beam.on if log.beam is not None else np.ones(log.rows, bool)
+    done = log.beam.end_mm if log.beam is not None else log.actual_mm
+    middle, plane = _plane(wanted)
+    flat = (wanted - middle) @ plane
+    if len(log.path_mm):
+        flat = np.vstack((flat, flat[:1]))
+    went = (done - middle) @ plane
+    went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
+    with drawing():
+        figure, axis = plt.subplots(figsize=(CHART[0], 4.2))
+        axis.plot(*_broken(flat).T, c=AMBER, lw=5, alpha=0.55, label="asked for")
+        word = "burnt" if log.beam is not None else "done"
+        axis.plot(*_broken(went).T, c=BLUE, lw=1.3, label=word)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+        axis.set_ylabel("mm")
+        axis.set_title("path over target")
+        axis.legend(loc="center")
+        return chart(figure, "path over target", "Seen at right angles to the path's plane")
+
+
+def error_chart(log: EpisodeLog) -> Picture | None:
+    """The distance from what was asked for, over time; with a beam, only while it burns."""
+    named = log.measures.get("beam_error_mm")
+    error = log.error_mm if named is None else named
+    if not np.isfinite(error).any():
+        return None
+    largest = float(np.nanmax(error))
+    with drawing():
+        figure, axis = plt.subplots()
+        axis.plot(log.time_s, error, c=RED, lw=1.0)
+        axis.set_ylim(0.0, 1.08 * largest if largest > 0.0 else 1.0)
+        axis.set_xlim(0.0, log.time_s[-1])
+        axis.set_xlabel("time [s]")
+        axis.set_ylabel("error [mm]")
+        axis.set_title(
+            "error over time" + (" while the beam is on" if log.beam is not None else "")
+        )
+        return chart(figure, "error over time", f"Largest {largest:.3g} mm")
+
+
+def progress_chart(log: EpisodeLog) -> Picture | None:
+    """Share of the ring that is cut and seen, over time, with the beam's times shaded."""
+    if log.beam is None or "completion" not in log.measures:
+        return None
+    with drawing():
+        figure, axis = plt.subplots()
+        axis.fill_between(
+            log.time_s, 0, 1.05, where=log.beam.on, color=GREEN, alpha=0.15, lw=0, label="beam on"
+        )
+        axis.plot(log.time_s, log.measures["completion"], c=BLUE, label="cut")
+        axis.plot(log.time_s, log.view_fraction, c=AMBER, lw=1.0, label="in sight")
+        axis.axhline(log.limits["view_fraction"], c=MUTED, lw=0.8, ls="--")
+        axis.set_xlim(0.0, log.time_s[-1])
+        axis.set_ylim(0.0, 1.05)
+        axis.set_xlabel("time [s]")
+        axis.set_ylabel("share of the ring")
+        axis.set_title("cut and in sight")
+        axis.legend(loc="lower right")
+        return chart(figure, "share cut and in sight", "Dashed: what has to be in sight")
+
+
+def clearance_chart(log: EpisodeLog) -> Picture | None:
+    """The least clearance over time, with its limit."""
+    if log.clearance_mm is None:
+        return None
+    least = float(np.nanmin(log.clearance_mm))
+    with drawing():
+        figure, axis = plt.subplots()
+        axis.plot(log.time_s, log.clearance_mm, c=BLUE, lw=1.2)
+        limit = log.limits.get("clearance_mm")
+        if limit is not None:
+            axis.axhline(limit, c=RED, lw=1.0, ls="--")
+        axis.set_ylim(min(0.0, 1.1 * least), None)
+        axis.set_xlim(0.0, log.time_s[-1])
+        axis.set_xlabel("time [s]")
+        axis.set_ylabel("clearance [mm]")
+        axis.set_title("least clearance")
+        return chart(figure, "clearance over time", f"Least {least:.1f} mm; dashed: the limit")
+
+
+def dose_chart(log: EpisodeLog) -> Picture | None:
+    """The dose at the end, unrolled along the ring: 1 is the threshold of ablation."""
+    if log.dose is None:
+        return None
+    from matplotlib.colors import TwoSlopeNorm
+
+    dose = log.dose
+    near = np.abs(dose.offset_mm) <= OFFSET_MM
+    along = (dose.station[near] + 0.5) * dose.ring_length_mm / dose.stations
+    width = max(CELL_MM, dose.ring_length_mm / dose.stations)
+    edges = (
+        np.linspace(0.0, dose.ring_length_mm, math.ceil(dose.ring_length_mm / width) + 1),
+        np.arange(-OFFSET_MM, OFFSET_MM + 0.5 * CELL_MM, 0.5 * CELL_MM),
+    )
+    share = dose.at(-1)[near] / dose.threshold_j_per_mm2
+    areas = dose.areas_mm2[near]
+    place = (along, dose.offset_mm[near])
+    total = np.histogram2d(*place, edges, weights=areas * share)[0]
+    area = np.histogram2d(*place, edges, weights=areas)[0]
+    mean = np.divide(total, area, out=np.full_like(total, np.nan), where=area > 0.0)
+    with drawing():
+        figure, axis = plt.subplots(figsize=(2.0 * CHART[0], 2.4))
+        norm = TwoSlopeNorm(1.0, 0.0, max(2.0, float(np.nanmax(mean))))
+        shown = axis.pcolormesh(
+            *edges, mean.T, norm=norm, cmap="RdGy", rasterized=True, shading="flat"
+        )
+        axis.grid(visible=False)
+        axis.axhline(0.0, c=INK, lw=0.8, ls="--")
+        axis.set_xlabel("along the ring [mm]")
+        axis.set_ylabel("off the ring [mm]")
+        axis.set_title("dose, unrolled; above 1 the tissue is ablated")
+        figure.colorbar(shown, ax=axis, label="dose / threshold", pad=0.01)
+        return chart(figure, "dose unrolled along the ring", "Negative: inside the ring")
+
+
+def spread_chart(
+    title: str, groups: Sequence[tuple[str, Sequence[float]]], label: str
+) -> Picture | None:
+    """One number of every episode, side by side for each group, with its mean."""
+    known = [(name, np.array([v for v in values if v is not None])) for name, values in groups]
+    known = [(name, values[np.isfinite(values)]) for name, values in known]
+    if not any(len(values) for _, values in known):
+        return None
+    rng = np.random.default_rng(0)
+    with drawing():
+        figure, axis = plt.subplots(figsize=(CHART[0], max(1.6, 0.42 * len(known) + 1.0)))
+        for place, (_, values) in enumerate(known):
+            off = place + rng.uniform(-0.16, 0.16, len(values))
+            axis.scatter(values, off, s=14, c=BLUE, alpha=0.6, lw=0)
+            if len(values):
+                axis.plot([values.mean()] * 2, [place - 0.3, place + 0.3], c=RED, lw=2)
+        axis.set_yticks(range(len(known)), [name for name, _ in known])
+        axis.set_ylim(len(known) - 0.5, -0.5)
+        axis.set_xlabel(label)
+        axis.set_title(title)
+        return chart(figure, title, "A dot an episode; red: the mean")
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle (3,) and two directions (3, 2) of the plane that fits points (N, 3) mm best."""
+    known = points[np.isfinite(points).all(1)].astype(float)
+    middle = known.mean(axis=0)
+    _, _, axes = np.linalg.svd(known - middle, full_matrices=False)
+    plane = axes[:2].T
+    # The picture's right and up are as near to the world's x and y as the plane allows.
+    turn = np.linalg.svd(plane[:2])
+    return middle, plane @ (turn[0] @ turn[2]).T
+
+
+def _broken(points: np.ndarray) -> np.ndarray:
+    """(N, 2) mm with a gap wherever the next point is far."""
+    jump = np.linalg.norm(np.diff(points, axis=0), axis=1) > JUMP_MM
+    return np.insert(points, np.flatnonzero(jump) + 1, np.nan, axis=0)
+
+
+def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) -> Picture:
+    """A number over what varies, with 95 % intervals; lines: name -> (value, mean, low, high)."""
+    colours = (BLUE, RED, GREEN, AMBER)
+    name = field.split(".")[-1]
+    with drawing():
+        figure, axis = plt.subplots()
+        for (title, points), colour in zip(lines.items(), colours * len(lines), strict=False):
+            x, mean, low, high = np.array(points, dtype=float).T
+            axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+            axis.plot(x, mean, c=colour, marker="o", ms=4, label=title)
+        axis.set_ylim(bottom=0)
+        axis.set_xlabel(name)
+        axis.set_ylabel(label)
+        axis.set_title(f"{label} over {name}")
+        if len(lines) > 1:
+            axis.legend()
+        return chart(figure, f"{label} over {name}", "Shaded: 95 % interval of the mean")

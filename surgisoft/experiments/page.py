@@ -1,0 +1,220 @@
+"""The report of an experiment: verdict, table, what varies, first and worst episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from surgisoft.agents.evaluate import RATES
+from surgisoft.agents.report import cell, episode_parts
+from surgisoft.agents.report_charts import spread_chart, sweep_chart
+from surgisoft.experiments.conditions import CONDITIONS
+from surgisoft.experiments.results import Results, SettingResult
+from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
+
+COLUMNS = {
+    "success": "success",
+    "completion": "share cut",
+    "beam_error_mean_mm": "beam error, mean [mm]",
+    "beam_error_p95_mm": "beam error, 95 % [mm]",
+    "healthy_mm2": "healthy tissue [mm2]",
+    "in_view": "time in sight",
+    "clearance_mm": "least clearance [mm]",
+    "time_s": "time [s]",
+    "beam_s": "beam on [s]",
+    "beam_unsafe_longest_s": "beam on while unsafe, longest [s]",
+}
+"""Numbers of the main table, in words."""
+SPREAD = ("completion", "beam_error_mean_mm", "clearance_mm", "time_s")
+"""Numbers that are drawn for every episode."""
+SHOWN = 4
+"""Most settings of which the first episode is shown."""
+HOW = (
+    "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
+    "for all else. The beam's error is how far its axis passes from its target while it is on. "
+    "Clearance, contact and success are judged by exact collision queries on the true bodies.\n\n"
+    "Interlock: the beam is off in every step that begins with the lesion out of sight, with a "
+    "clearance below the limit, or after an abort. What can become unsafe within a step is stopped "
+    "at the next one; the last column of the table says how long the beam was on at the end of "
+    "unsafe steps in a row."
+)
+
+
+def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
+    """films: (setting's label, episode) -> what the endoscope saw, for episodes to show."""
+    sections = [_table(results), _outcomes(results)]
+    if len(results.settings) > 1 or results.experiment.repeats > 1:
+        sections.append(Section("Every episode", [Gallery(_spreads(results))]))
+    sections += _sweeps(results)
+    for label, episode in shown_episodes(results):
+        worst = (label, episode) == results.worst and len(results.rows) > 1
+        title = f"{'Worst of all: ' if worst else ''}{label}, episode {episode}"
+        film = films.get((label, episode))
+        parts = episode_parts(results.log(label, episode))
+        sections.append(Section(title, [*([film] if film else []), *parts]))
+    return Page(
+        title=f"Experiment {results.experiment.name}",
+        verdict=verdict(results),
+        about=about,
+        tone=_tone(results),
+        parts=[
+            *([Text(results.experiment.note)] if results.experiment.note else []),
+            Facts(_facts(results)),
+            *sections,
+            _design(results),
+            Section("How to read this", [Text(HOW)]),
+        ],
+    )
+
+
+def shown_episodes(results: Results) -> list[tuple[str, int]]:
+    """(label, episode): the first of each setting, of the very first where many, and the worst."""
+    settings = results.settings if len(results.settings) <= SHOWN else results.settings[:1]
+    first = [(setting.label, 0) for setting in settings]
+    return list(dict.fromkeys([*first, results.worst]))
+
+
+def verdict(results: Results) -> str:
+    """One or two sentences."""
+    settings, faults = results.settings, results.experiment.faults
+    unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
+    hits = sum(row["collided"] > 0.0 for row in results.rows)
+    if faults:
+        ended = [row for row in results.rows if row["outcome"].startswith("aborted")]
+        first = (
+            f"After the fault {len(ended)} of {len(results.rows)} episodes were aborted; the beam "
+            f"was on for at most {unsafe:.2g} s while it was unsafe"
+        )
+    elif len(settings) <= SHOWN:
+        first = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
+    else:
+        shares = [s.overall["success"].mean for s in settings]
+        low, high = min(shares), max(shares)
+        best, least = settings[shares.index(high)].label, settings[shares.index(low)].label
+        first = f"Success from {low:.0%} ({least}) to {high:.0%} ({best})"
+    last = f"{hits} of {len(results.rows)} episodes had contact."
+    safe = "" if faults else f" The beam was on for at most {unsafe:.2g} s while it was unsafe."
+    return f"{first}. {last}{safe}"
+
+
+def _one(setting: SettingResult) -> str:
+    success, error = setting.overall["success"], setting.overall.get("beam_error_mean_mm")
+    text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
+    if error is not None and error.episodes:
+        text += f", mean beam error {error.mean:.2g} mm"
+    return text
+
+
+def _tone(results: Results) -> str:
+    if any(row["collided"] > 0.0 for row in results.rows):
+        return "bad"
+    if results.experiment.faults:
+        return "good" if all(row["beam_s"] >= 0.0 for row in results.rows) else "bad"
+    shares = [setting.overall["success"].mean for setting in results.settings]
+    return "good" if min(shares) >= 0.95 else "warn"
+
+
+def _facts(results: Results) -> list[tuple[str, str]]:
+    spec, rows = results.experiment, results.rows
+    return [
+        ("episodes", f"{len(rows)}"),
+        ("settings", f"{len(results.settings)}"),
+        ("success", f"{sum(row['success'] for row in rows):.0f} of {len(rows)}"),
+        ("contact", f"{sum(row['collided'] for row in rows):.0f} of {len(rows)}"),
+        ("least clearance", f"{min(row['clearance_mm'] for row in rows):.1f} mm"),
+        ("seed", f"{spec.seed}"),
+    ]
+
+
+def _table(results: Results) -> Section:
+    known = [name for name in COLUMNS if name in results.settings[0].overall]
+    header = ["setting", "episodes", *(COLUMNS[name] for name in known)]
+    rows = [
+        (
+            setting.label,
+            f"{len(setting.rows)}",
+            *(cell(setting.overall[name], name in RATES) for name in known),
+        )
+        for setting in results.settings
+    ]
+    return Section("Results", [Table(header, rows)])
+
+
+def _outcomes(results: Results) -> Section:
+    rows = [
+        (setting.label, outcome, f"{count}", Share(count / len(setting.rows)))
+        for setting in results.settings
+        for outcome, count in setting.outcomes.items()
+    ]
+    return Section("How episodes ended", [Table(["setting", "outcome", "episodes", "share"], rows)])
+
+
+def _spreads(results: Results) -> list[Picture]:
+    drawn = []
+    for name in SPREAD:
+        groups = [
+            (setting.label, [row[name] for row in setting.rows])
+            for setting in results.settings
+            if name in setting.overall
+        ]
+        picture = spread_chart(COLUMNS[name], groups, COLUMNS[name])
+        drawn += [] if picture is None else [picture]
+    return drawn
+
+
+def _sweeps(results: Results) -> list[Section]:
+    """A section for each number that varies: success and error over it."""
+    sections = []
+    for vary in results.experiment.vary:
+        if any(isinstance(value, str) for value in vary.values) or len(vary.values) < 2:
+            continue
+        charts = [
+            sweep_chart(vary.field, COLUMNS[name], _lines(results, vary.field, name))
+            for name in ("success", "completion", "beam_error_mean_mm", "in_view")
+            if name in results.settings[0].overall
+        ]
+        sections.append(Section(f"Over {vary.field}", [Gallery(charts)]))
+    return sections
+
+
+def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
+    """Case and the other values -> (value, mean, low, high) of a number, rising."""
+    lines: dict[str, list[tuple]] = {}
+    for setting in results.settings:
+        others = [f"{k.split('.')[-1]} {v}" for k, v in setting.values.items() if k != field]
+        found = setting.overall[name]
+        point = (setting.values[field], found.mean, found.low, found.high)
+        lines.setdefault(", ".join([setting.case, *others]), []).append(point)
+    return {key: sorted(points) for key, points in lines.items()}
+
+
+def _design(results: Results) -> Section:
+    spec = results.experiment
+    rows = [
+        (
+            phase.name,
+            phase.laser,
+            phase.endoscope,
+            "may be on" if phase.beam else "off",
+            CONDITIONS[phase.until].about if phase.until != "never" else "its time is out",
+            f"{phase.timeout_s:g} s, then {phase.on_timeout}",
+        )
+        for phase in spec.phases
+    ]
+    header = ["phase", "laser arm", "endoscope arm", "beam", "goes on when", "longest"]
+    faults = [
+        f"{fault.arm}: chamber {fault.chamber} goes to 0 kPa from {fault.at_s:g} s on"
+        for fault in spec.faults
+    ]
+    cases = [
+        f"{case.name}: {case.plant}, policy {Path(case.policy).name}"
+        + (f", hidden {', '.join(case.hidden)}" if case.hidden else "")
+        for case in spec.cases
+    ]
+    return Section(
+        "Design", [Table(header, rows), *_lines_of("Cases", cases), *_lines_of("Faults", faults)]
+    )
+
+
+def _lines_of(title: str, lines: Sequence[str]) -> list:
+    return [Table([title], [(line,) for line in lines])] if lines else []

@@ -1,0 +1,176 @@
+"""What an experiment plays: every case on every lesion with every combination of what varies."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.errors import InputError
+from surgisoft.experiments.phased import PhasedAblation
+from surgisoft.experiments.spec import Case, Experiment, Lesion, Vary, merged, task_config
+from surgisoft.measurement.rig.hidden import HIDDEN
+from surgisoft.scene.folder import Scene, open_scene
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.configs import config_table
+from surgisoft.toml_config import Where
+
+Value = int | float | str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One condition of the experiment; `repeats` episodes are played in it."""
+
+    number: int
+    """Its place among all."""
+    case: Case
+    """Who plays, on what."""
+    lesion: Lesion | None
+    """Where is cut; None: the scene's own lesion."""
+    values: tuple[tuple[str, Value], ...]
+    """What varies: field and value."""
+
+    @property
+    def label(self) -> str:
+        """A name of letters, digits, '_', '-', '.' and '=', unique in the experiment."""
+        parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
+        parts += [f"{field.split('.')[-1]}={_short(value)}" for field, value in self.values]
+        return "_".join(parts)
+
+    @property
+    def words(self) -> str:
+        """The same for a person."""
+        parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
+        return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
+
+
+def _short(value: Value) -> str:
+    text = Path(value).name if isinstance(value, str) else f"{value:g}"
+    return "".join(c if c.isalnum() or c in "-." else "-" for c in text)
+
+
+def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
+    """Every setting in order; a value that does not fit is one line."""
+    place = where or Where(Path(spec.name))
+    for i, vary in enumerate(spec.vary):
+        _check_vary(spec, vary, place / "vary" / i)
+    grid = [[(vary.field, value) for value in vary.values] for vary in spec.vary]
+    every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
+    found = [Setting(number, *parts) for number, parts in enumerate(every)]
+    for setting in found:
+        rig_config(setting, place)
+    labels = [setting.label for setting in found]
+    if twice := {label for label in labels if labels.count(label) > 1}:
+        raise (place / "vary").error(f"'{min(twice)}' comes twice", "values that differ")
+    return found
+
+
+def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
+    top, _, name = vary.field.partition(".")
+    if top == "task" and name and name != "scene":
+        for i, value in enumerate(vary.values):
+            try:
+                _configured(spec, ((vary.field, value),))
+            except InputError as error:
+                raise (place / "values" / i).error(
+                    f"{error}", "a value that the task takes"
+                ) from None
+    elif vary.field == "rig.specimen":
+        bad = [value for value in vary.values if not isinstance(value, int) or value < 0]
+        if bad:
+            raise (place / "values").error(f"got {bad[0]}", "whole numbers from 0")
+    elif top == "hidden":
+        if name not in HIDDEN:
+            raise (place / "field").error(
+                f"unknown effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
+            )
+        bad = [value for value in vary.values if isinstance(value, str) or value < 0]
+        if bad:
+            raise (place / "values").error(f"got {bad[0]!r}", "strengths from 0")
+    elif top == "fault" and name in ("chamber", "at_s") and spec.faults:
+        kind = int if name == "chamber" else int | float
+        bad = [v for v in vary.values if not isinstance(v, kind) or v < (name == "chamber")]
+        if bad:
+            raise (place / "values").error(f"got {bad[0]!r}", f"what a fault has as {name}")
+    else:
+        raise (place / "field").error(
+            f"got '{vary.field}'",
+            "task.NAME, hidden.EFFECT, rig.specimen, or (with faults) fault.chamber, fault.at_s",
+        )
+
+
+def _configured(spec: Experiment, values) -> CircleAblationConfig:
+    """The task's configuration with what varies; the scene is still a folder's name."""
+    table = config_table(spec.task)
+    for field, value in values:
+        top, _, name = field.partition(".")
+        if top == "task":
+            change: dict | Value = value
+            for part in reversed(name.split(".")):
+                change = {part: change}
+            table = merged(table, change)
+    try:
+        return task_config(table, Where(Path(spec.name)))
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{spec.name}: ")) from None
+
+
+def rig_config(setting: Setting, place: Where) -> RigConfig | None:
+    """The bench of a setting; None in simulation."""
+    varied = dict(setting.values)
+    if setting.case.plant != "rig":
+        return None
+    hidden: dict[str, float] = {}
+    for text in setting.case.hidden:
+        name, colon, strength = text.partition(":")
+        try:
+            hidden[name] = float(strength) if colon else 1.0
+        except ValueError:
+            raise (place / "cases").error(f"got '{text}'", "NAME or NAME:STRENGTH") from None
+    for field, value in varied.items():
+        if field.startswith("hidden."):
+            hidden[field.removeprefix("hidden.")] = float(value)
+    for name in hidden:
+        if name not in HIDDEN:
+            raise (place / "cases").error(
+                f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
+            )
+    specimen = int(varied.get("rig.specimen", setting.case.specimen))
+    pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
+    return RigConfig(seed=specimen, hidden=pairs)
+
+
+def scene_of(spec: Experiment, setting: Setting) -> Scene:
+    """The scene with the setting's lesion."""
+    scene = open_scene(spec.scene)
+    if setting.lesion is None:
+        return scene
+    lesion = dataclasses.replace(
+        scene.spec.lesion,
+        centre_mm=setting.lesion.centre_mm,
+        diameter_mm=setting.lesion.diameter_mm,
+        path_mm=(),
+    )
+    moved = scene.with_lesion(lesion)
+    try:
+        moved.ring  # noqa: B018  (an InputError where it does not lie on the organ)
+    except InputError as error:
+        raise InputError(f"lesion '{setting.lesion.name}': {error}") from None
+    return moved
+
+
+def build_task(spec: Experiment, setting: Setting) -> PhasedAblation:
+    """The phased task of a setting, its arms on the rig where the case says so."""
+    config = _configured(spec, setting.values)
+    arm = setting.case.arm or config.arm
+    config = dataclasses.replace(config, arm=arm, scene=spec.scene)
+    base = CircleAblation(dataclasses.replace(config, scene=scene_of(spec, setting)))
+    base.config = config
+    rig = rig_config(setting, Where(Path(spec.name)))
+    varied = {f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")}
+    faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
+    spec = dataclasses.replace(spec, faults=faults)
+    return PhasedAblation(base if rig is None else on_rig(base, rig), spec)

@@ -1,0 +1,145 @@
+"""What an experiment brought: tables of episodes and settings, logs of the first and the worst."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.agents.evaluate import RATES, Summary, summary
+from surgisoft.experiments.play import Row, badness
+from surgisoft.experiments.run import log_file
+from surgisoft.experiments.spec import Experiment
+from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.episode_file import load_episode
+from surgisoft.toml_config import write_atomically
+
+TEXTS = ("setting", "case", "lesion", "outcome")
+"""Columns of a row that are words."""
+
+
+@dataclass(frozen=True, eq=False)
+class SettingResult:
+    """One setting's episodes."""
+
+    label: str
+    """The setting's label, see `Setting.label`."""
+    case: str
+    """Its case."""
+    values: dict[str, float | int | str]
+    """What varies, the lesion among it."""
+    rows: list[Row]
+    """Its episodes, in order."""
+    overall: dict[str, Summary]
+    """Number of an episode -> its summary over all."""
+    outcomes: dict[str, int]
+    """How episodes ended -> how many, the most frequent first."""
+
+    @property
+    def worst(self) -> int:
+        """Number of the worst episode."""
+        return max(self.rows, key=badness)["episode"]
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """All of an experiment."""
+
+    experiment: Experiment
+    """What was asked for."""
+    folder: Path
+    """Where it lies."""
+    settings: list[SettingResult]
+    """Every setting, in order."""
+
+    @property
+    def rows(self) -> list[Row]:
+        """Every episode."""
+        return [row for setting in self.settings for row in setting.rows]
+
+    @property
+    def worst(self) -> tuple[str, int]:
+        """Label and number of the worst episode of all."""
+        row = max(self.rows, key=badness)
+        return row["setting"], row["episode"]
+
+    def log(self, label: str, episode: int) -> EpisodeLog:
+        """The log of an episode that was kept: a setting's first and worst."""
+        return load_episode(log_file(self.folder, label, episode))
+
+
+def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
+    """The results out of every row."""
+    varied = ["lesion", *(vary.field for vary in spec.vary)]
+    found = []
+    for label in dict.fromkeys(row["setting"] for row in rows):
+        own = [row for row in rows if row["setting"] == label]
+        numbers = [n for n in own[0] if n not in (*TEXTS, *varied, "episode")]
+        overall = {
+            name: summary(_numbers([row[name] for row in own]), name in RATES) for name in numbers
+        }
+        values = {name: own[0][name] for name in varied if name in own[0]}
+        outcomes = dict(Counter(row["outcome"] for row in own).most_common())
+        found.append(SettingResult(label, own[0]["case"], values, own, overall, outcomes))
+    return Results(spec, folder, found)
+
+
+def write_tables(results: Results) -> list[Path]:
+    """`episodes.csv`, `episodes.parquet` and `summary.json`, each whole or not at all."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    rows, folder = results.rows, results.folder
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = pa.table({name: [row.get(name) for row in rows] for name in names})
+    files = []
+    for name, write in (("episodes.csv", csv.write_csv), ("episodes.parquet", parquet.write_table)):
+        buffer = pa.BufferOutputStream()
+        write(table, buffer)
+        write_atomically(folder / name, buffer.getvalue().to_pybytes())
+        files.append(folder / name)
+    about = {
+        "experiment": results.experiment.name,
+        "confidence": 0.95,
+        "worst": dict(zip(("setting", "episode"), results.worst, strict=True)),
+        "settings": {
+            setting.label: {
+                "case": setting.case,
+                "values": setting.values,
+                "episodes": len(setting.rows),
+                "outcomes": setting.outcomes,
+                "overall": {name: _plain(asdict(v)) for name, v in setting.overall.items()},
+            }
+            for setting in results.settings
+        },
+    }
+    path = folder / "summary.json"
+    write_atomically(path, (json.dumps(about, indent=2) + "\n").encode())
+    return [*files, path]
+
+
+def drop_logs(results: Results) -> None:
+    """Remove the logs of blocks' worst episodes that are not their setting's."""
+    kept = {
+        log_file(results.folder, setting.label, number)
+        for setting in results.settings
+        for number in (0, setting.worst)
+    }
+    for path in (results.folder / "logs").glob("*.npz"):
+        if path not in kept:
+            path.unlink()
+
+
+def _numbers(values: list) -> np.ndarray:
+    return np.array([math.nan if value is None else value for value in values], dtype=float)
+
+
+def _plain(table: dict) -> dict:
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in table.items()
+    }

@@ -1,0 +1,162 @@
+"""Plays a whole experiment into a folder: block by block, over processes, resumed after a break.
+
+The blocks, not the processes, decide what is computed together; so one process and many, a run in
+one go and one that was interrupted give the same rows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from surgisoft.agents.run_folder import versions
+from surgisoft.errors import InputError
+from surgisoft.experiments.plan import Setting, scene_of, settings
+from surgisoft.experiments.play import Row, play_block
+from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
+from surgisoft.tasks.episode_file import save_episode
+from surgisoft.toml_config import write_atomically
+
+Report = Callable[[float, float, str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One block of episodes of one setting."""
+
+    setting: Setting
+    """The setting."""
+    first: int
+    """Number of its first episode."""
+    count: int
+    """Episodes."""
+
+
+def jobs(spec: Experiment) -> list[Job]:
+    """Every block, those of a setting one after the other."""
+    return [
+        Job(setting, first, min(spec.together, spec.repeats - first))
+        for setting in settings(spec)
+        for first in range(0, spec.repeats, spec.together)
+    ]
+
+
+def row_file(folder: Path, setting: Setting, episode: int) -> Path:
+    """Where an episode's numbers lie."""
+    return folder / "rows" / f"{setting.label}-{episode:04d}.json"
+
+
+def log_file(folder: Path, setting: str, episode: int) -> Path:
+    """Where an episode's log lies, if it was kept."""
+    return folder / "logs" / f"{setting}-{episode:04d}.npz"
+
+
+def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bool = False) -> None:
+    """Make the folder of results, or check that this experiment goes on in it."""
+    there = (folder / FILE).is_file()
+    if there and resume and not force:
+        if load_experiment(folder / FILE) != spec:
+            raise InputError(
+                f"{folder}: holds another experiment ({folder / FILE} differs); choose another "
+                "folder, or --force to begin anew"
+            )
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not there:
+            raise InputError(f"{folder}: already there and no results; choose another folder")
+        if not force:
+            raise InputError(
+                f"{folder}: results are already there; --resume goes on, --force begins anew"
+            )
+    for setting in settings(spec):
+        scene_of(spec, setting)
+    if force and there:
+        shutil.rmtree(folder)
+    (folder / "rows").mkdir(parents=True, exist_ok=True)
+    scene = scene_of(spec, settings(spec)[0])
+    about = {"versions": versions(), "scene_hash": scene.content_hash}
+    write_atomically(folder / "versions.json", (json.dumps(about, indent=2) + "\n").encode())
+    save_experiment(spec, folder / FILE)
+
+
+def run_experiment(
+    spec: Experiment, folder: Path, processes: int = 1, report: Report | None = None
+) -> list[Row]:
+    """Play every block that is not there yet; all rows, in order. See `open_results`."""
+    every, told = jobs(spec), report or (lambda done, total, note: None)
+    left = [job for job in every if not _is_done(folder, job)]
+    total = float(sum(job.count for job in every))
+    done = total - sum(job.count for job in left)
+    told(done, total, "")
+    if processes == 1:
+        with _one_thread():
+            for job in left:
+                began = done
+
+                def within(step, steps, job=job, began=began) -> None:
+                    told(began + job.count * step / steps, total, job.setting.words)
+
+                _play(spec, folder, job, within)
+                done += job.count
+                told(done, total, job.setting.words)
+    else:
+        for job in _in_processes(spec, folder, left, processes):
+            done += job.count
+            told(done, total, job.setting.words)
+    return [
+        json.loads(row_file(folder, job.setting, job.first + i).read_text())
+        for job in every
+        for i in range(job.count)
+    ]
+
+
+def _is_done(folder: Path, job: Job) -> bool:
+    files = (row_file(folder, job.setting, job.first + i) for i in range(job.count))
+    return all(file.is_file() for file in files)
+
+
+def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
+    """Play a block; its logs are written first, then each episode's row, whole or not at all."""
+    block = play_block(spec, job.setting, job.first, job.count, progress)
+    for number, log in block.logs.items():
+        save_episode(log, log_file(folder, job.setting.label, number))
+    for row in block.rows:
+        text = json.dumps(row, indent=1) + "\n"
+        write_atomically(row_file(folder, job.setting, row["episode"]), text.encode())
+
+
+def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
+    """Play the blocks in processes of their own; each block as it is done."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        waiting = {pool.submit(_play, spec, folder, job): job for job in left}
+        for future in as_completed(waiting):
+            future.result()
+            yield waiting[future]
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread, as in the processes: the order of sums decides about last digits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

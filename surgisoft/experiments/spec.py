@@ -1,0 +1,329 @@
+"""An experiment's file as frozen dataclasses; every bad field is one line with file and line."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from surgisoft.errors import InputError
+from surgisoft.experiments.conditions import CONDITIONS
+from surgisoft.scene.spec import Length, Point
+from surgisoft.tasks.circle_ablation import CircleAblationConfig
+from surgisoft.tasks.configs import config_table
+from surgisoft.toml_config import Rule, Where, from_table, read_toml, write_toml
+
+FORMAT = 1
+"""Version of the file's format."""
+FILE = "experiment.toml"
+"""Name of the exact configuration in a folder of results."""
+TASK = "circle_ablation"
+"""The task that phases are laid over."""
+HANDS = ("hold", "rest", "scripted", "policy")
+"""Who may move an arm beside the drivers that the file names."""
+PLANTS = ("simulation", "rig")
+"""What the arms are."""
+SCRIPTED, NOMINAL = "scripted", "nominal"
+"""The task's solver, which knows the true state; and the same that believes the scene's mounts."""
+
+Name = Annotated[
+    str,
+    Rule(
+        "a name of letters, digits, '_' and '-' (at most 64)",
+        lambda text: re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) is not None,
+    ),
+]
+Duration = Annotated[float, Rule("a time from 0 to 100000 s", lambda s: 0.0 <= s <= 1e5)]
+Positive = Annotated[float, Rule("a time above 0 s", lambda s: 0.0 < s <= 1e5)]
+Count = Annotated[int, Rule("a whole number from 1 to 100000", lambda n: 1 <= n <= 100_000)]
+Seed = Annotated[int, Rule("a whole number from 0 to 2147483647", lambda n: 0 <= n < 2**31)]
+AnyLength = Annotated[float, Rule("a number from -1000 to 1000 mm", lambda v: abs(v) <= 1000.0)]
+
+
+def _one_of(known: Iterable[str]) -> Rule:
+    known = tuple(known)
+    return Rule("one of " + ", ".join(known), lambda value: value in known)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One part of an episode: who moves which arm, until when."""
+
+    name: Name
+    """Its name, unique in the experiment."""
+    timeout_s: Positive
+    """Longest time in this phase, s."""
+    laser: Name = "hold"
+    """Who moves the laser arm: hold, rest, scripted, policy, or a driver's name."""
+    endoscope: Name = "hold"
+    """Who moves the endoscope arm."""
+    beam: bool = False
+    """Whether the beam may be on; the interlock holds besides."""
+    until: Annotated[str, _one_of(CONDITIONS)] = "never"
+    """The condition to go on to the next phase."""
+    within: Annotated[float, Rule("a number from -1 to 1000", lambda v: -1.0 <= v <= 1e3)] = -1.0
+    """The condition's number, in its own unit; -1: the one it has by itself."""
+    hold_s: Duration = 0.0
+    """How long the condition has to hold without a break, s."""
+    on_timeout: Annotated[str, _one_of(("abort", "go on"))] = "abort"
+    """What happens when the time of this phase is out."""
+
+
+@dataclass(frozen=True)
+class DriverSpec:
+    """A driver of one's own for an arm: a pressure schedule or waypoints."""
+
+    name: Name
+    """By which phases call it."""
+    schedule: str = ""
+    """CSV with t_s and c1_kPa ... cm_kPa, linear between rows, from the phase's begin."""
+    waypoints: tuple[tuple[float, float, float, float], ...] = ()
+    """Rows [t_s, x, y, z] (s from the phase's begin; mm, world frame) that the axis goes through;
+    linear between rows."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm of the experiment's design: what is compared side by side."""
+
+    name: Name
+    """Its name, unique in the experiment."""
+    plant: Annotated[str, _one_of(PLANTS)] = PLANTS[0]
+    """`simulation`: the arm models; `rig`: each arm on the virtual rig."""
+    policy: str = SCRIPTED
+    """Who acts in phases that say `policy`: scripted, nominal, or a training run's folder."""
+    hidden: tuple[str, ...] = ()
+    """On the rig: hidden effects, NAME or NAME:STRENGTH."""
+    specimen: Seed = 0
+    """On the rig: which arm was cast."""
+    arm: str = ""
+    """Arm model of both arms: default or a folder; without it the scene's."""
+
+
+@dataclass(frozen=True)
+class Lesion:
+    """A place to cut in place of the scene's own."""
+
+    name: Name
+    """Its name, unique in the experiment."""
+    centre_mm: Point
+    """Centre, within 0.5 mm of the organ's surface, world frame (mm)."""
+    diameter_mm: Length = 20.0
+    """Diameter of the ring (mm)."""
+
+
+@dataclass(frozen=True)
+class Vary:
+    """One thing that takes several values; several of them make a grid."""
+
+    field: str
+    """`task.NAME` (dots go deeper), `hidden.EFFECT` (strength, on the rig), `rig.specimen`,
+    `fault.chamber` or `fault.at_s`."""
+    values: Annotated[
+        tuple[int | float | str, ...], Rule("a list of at least one value", lambda v: len(v) > 0)
+    ]
+    """Its values."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something breaks in every episode."""
+
+    arm: Annotated[str, _one_of(("laser", "endoscope"))]
+    """Whose chamber."""
+    at_s: Duration
+    """When, s from the episode's begin."""
+    chamber: Count = 1
+    """Which chamber, from 1: its valve stays open, so that it goes to 0 kPa as fast as a pump."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What stops the beam, and what aborts."""
+
+    time_s: Positive = 60.0
+    """Longest time of an episode, s."""
+    clearance_mm: AnyLength = 0.0
+    """The beam is off while any clearance is below this or below the scene's own limit, mm."""
+    abort_clearance_mm: AnyLength = 0.0
+    """Aborts below this clearance, mm."""
+    view_lost_s: Duration = 2.0
+    """Aborts when the lesion is out of sight for longer in a phase with the beam, s."""
+    retreat: str = ""
+    """The phase that an abort goes to, with the beam off for good; without it the episode ends."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A whole experiment's file, its paths made absolute."""
+
+    name: Name
+    """Its name."""
+    scene: str
+    """Folder of the scene, relative to the file."""
+    phases: tuple[Phase, ...]
+    """What happens, in order."""
+    repeats: Count = 1
+    """Episodes of each condition."""
+    seed: Seed = 0
+    """Of all episodes; each condition has the same ones."""
+    together: Count = 8
+    """Episodes played at once: the unit of parallel work and of going on after a break."""
+    cases: tuple[Case, ...] = (Case(PLANTS[0]),)
+    """What is compared side by side."""
+    lesions: tuple[Lesion, ...] = ()
+    """Where to cut; none: the scene's own lesion."""
+    vary: tuple[Vary, ...] = ()
+    """What takes several values."""
+    drivers: tuple[DriverSpec, ...] = ()
+    """Schedules and waypoints that phases name."""
+    faults: tuple[Fault, ...] = ()
+    """What breaks."""
+    limits: Limits = field(default_factory=Limits)
+    """Limits."""
+    task: CircleAblationConfig = field(default_factory=CircleAblationConfig)
+    """The cut: fields of the task `circle_ablation`, without `scene` and `arm`."""
+    note: str = ""
+    """Free text."""
+    format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
+    """Version of this file format."""
+
+
+def load_experiment(path: str | Path) -> Experiment:
+    """Read an experiment's file; whatever is wrong with it is one line."""
+    path = Path(path)
+    table, where = read_toml(path)
+    own = table.pop("task", {})
+    if not isinstance(own, dict):
+        raise (where / "task").error(f"got '{own}'", "a table")
+    for name in ("scene", "arm"):
+        if name in own:
+            raise (where / "task" / name).error(
+                "does not belong here", "the scene at the top, the arm in a case"
+            )
+    plain = config_table(CircleAblationConfig()) | {"scene": ""}
+    task = task_config(merged(plain, own), where)
+    spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
+    _check_whole(spec, where)
+    return _absolute(spec, where)
+
+
+def task_config(table: dict, where: Where) -> CircleAblationConfig:
+    """The task's configuration from a whole table; errors name the file and the field."""
+    try:
+        return from_table(CircleAblationConfig, table, where / "task")
+    except InputError as error:
+        text = str(error)
+        raise InputError(
+            text if text.startswith(str(where.path)) else f"{where.path}: {text}"
+        ) from None
+
+
+def merged(base: Any, changes: Any) -> Any:
+    """A table with the fields of another one changed, at whatever depth they are."""
+    if not (isinstance(base, dict) and isinstance(changes, dict)):
+        return changes
+    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
+
+
+def save_experiment(spec: Experiment, path: Path) -> None:
+    """Write the exact configuration, with every default; loading it gives an equal one."""
+    table = _without_none(config_table(spec))
+    for name in ("scene", "arm"):
+        table["task"].pop(name, None)
+    folder = path.parent.resolve()
+    table["scene"] = os.path.relpath(spec.scene, folder)
+    for driver in table["drivers"]:
+        if driver["schedule"]:
+            driver["schedule"] = os.path.relpath(driver["schedule"], folder)
+    for case in table["cases"]:
+        for name in ("policy", "arm"):
+            if case[name] not in ("", "default", SCRIPTED, NOMINAL):
+                case[name] = os.path.relpath(case[name], folder)
+    write_toml(path, table)
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(part) for key, part in value.items() if part is not None}
+    return [_without_none(part) for part in value] if isinstance(value, list) else value
+
+
+def _absolute(spec: Experiment, where: Where) -> Experiment:
+    """The same with absolute paths, each of which is there."""
+    home = where.path.resolve().parent
+
+    def there(text: str, place: Where, what: str) -> str:
+        path = (home / text).resolve()
+        if not path.exists():
+            raise place.error(f"there is no '{text}' beside this file", what)
+        return str(path)
+
+    def of_case(i: int, case: Case) -> Case:
+        place = where / "cases" / i
+        policy, arm = case.policy, case.arm
+        if policy not in (SCRIPTED, NOMINAL):
+            policy = there(policy, place / "policy", "scripted, nominal, or a run's folder")
+        if arm not in ("", "default"):
+            arm = there(arm, place / "arm", "default, or an arm model's folder")
+        return dataclasses.replace(case, policy=policy, arm=arm)
+
+    def of_driver(i: int, driver: DriverSpec) -> DriverSpec:
+        if not driver.schedule:
+            return driver
+        place = where / "drivers" / i / "schedule"
+        return dataclasses.replace(driver, schedule=there(driver.schedule, place, "a CSV file"))
+
+    return dataclasses.replace(
+        spec,
+        scene=there(spec.scene, where / "scene", "a scene's folder"),
+        cases=tuple(of_case(i, case) for i, case in enumerate(spec.cases)),
+        drivers=tuple(of_driver(i, driver) for i, driver in enumerate(spec.drivers)),
+    )
+
+
+def _check_whole(spec: Experiment, where: Where) -> None:
+    """What only several fields together can break."""
+    for name in ("phases", "cases", "lesions", "drivers"):
+        _check_names(getattr(spec, name), where / name)
+    for name in ("phases", "cases"):
+        if not getattr(spec, name):
+            raise (where / name).error("none is given", "at least one")
+    own = [driver.name for driver in spec.drivers]
+    for i, driver in enumerate(spec.drivers):
+        place = where / "drivers" / i
+        if driver.name in HANDS:
+            raise (place / "name").error(f"got '{driver.name}'", f"none of {', '.join(HANDS)}")
+        if bool(driver.schedule) == bool(driver.waypoints):
+            raise place.error("got both or neither", "either a schedule or waypoints")
+        times = [row[0] for row in driver.waypoints]
+        if times and (times[0] < 0.0 or sorted(set(times)) != times):
+            raise (place / "waypoints").error(f"times {times}", "times that rise from 0 s")
+    for i, phase in enumerate(spec.phases):
+        for arm in ("laser", "endoscope"):
+            if getattr(phase, arm) not in (*HANDS, *own):
+                raise (where / "phases" / i / arm).error(
+                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*HANDS, *own))}"
+                )
+    known = [phase.name for phase in spec.phases]
+    if spec.limits.retreat not in ("", *known):
+        raise (where / "limits" / "retreat").error(
+            f"got '{spec.limits.retreat}'", f"one of the phases: {', '.join(known)}"
+        )
+    for i, case in enumerate(spec.cases):
+        if case.plant != "rig" and (case.hidden or case.specimen):
+            raise (where / "cases" / i).error(
+                "hidden or specimen in simulation", "them with plant = 'rig' only"
+            )
+
+
+def _check_names(items, where: Where) -> None:
+    seen: set[str] = set()
+    for i, item in enumerate(items):
+        if item.name in seen:
+            raise (where / i / "name").error(f"a second '{item.name}'", "names that differ")
+        seen.add(item.name)

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.cross_validation import FITTED, CrossValidation
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.measurement.recording import save_recording
 from surgisoft.surrogate.checkpoint import save_model
+from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
 
 ROWS = 3000
 

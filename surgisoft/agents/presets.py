@@ -91,7 +91,13 @@ STEPS: dict[str, int] = {
 PAPER_STEPS = 20_000_000
 """Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
 
+_FOLLOW = {"gamma": 0.6, "epochs": 8, "desired_kl": 0.03}
+"""Following a path each action shows at once what it was worth."""
+
 TASK_CHANGES: dict[str, dict] = {
+    "track_circle": _FOLLOW,
+    "track_square": _FOLLOW,
+    "laser_plane": _FOLLOW,
     "circle_ablation": {
         "rollout": 16,
         "last_noise": 0.05,

@@ -49,10 +49,17 @@ def body_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
 
 
 def pressure_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
-    """Commands and measured pressures, -1..1 over the range, and directions of change, (B, m)."""
+    """Commands, pressures, directions of change and ways back, each (B, m).
+
+    Commands and measured pressures are -1..1 over the range. A way back is how far a pressure has
+    come from where its chamber last moved on, in dead bands: beyond -1 or 1 the direction of change
+    turns over, and the arm jumps.
+    """
     half = 0.5 * (arm.high - arm.low)
+    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
     return (
         (part.command - arm.low) / half - 1.0,
         (part.seen_kPa - arm.low) / half - 1.0,
         part.arm.direction,
+        back.clamp(-1.5, 1.5),
     )

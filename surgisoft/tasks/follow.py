@@ -103,7 +103,8 @@ class Follow:
     def observe(self, state: TaskState) -> dict[str, Tensor]:
         """Body, errors now and ahead, commands and pressures, direction of change, time.
 
-        Errors in mm through asinh: as they are within 1 mm, by their logarithm beyond.
+        Errors through asinh, in mm and the first two in `fine_mm` as well: as they are within that
+        length, by their logarithm beyond.
         """
         part = state.world.arms["arm"]
         point = self.marker(part.seen_mm)
@@ -111,6 +112,7 @@ class Follow:
         parts = [
             (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
             *(error.asinh() for error in errors),
+            *((error / self.config.fine_mm).asinh() for error in errors[:2]),
             *pressure_part(self.arm, part),
             2.0 * state.world.steps[:, None] / self.steps - 1.0,
         ]

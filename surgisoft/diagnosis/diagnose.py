@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from surgisoft.diagnosis.axes import shares
 from surgisoft.diagnosis.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.confidence import confidence
 from surgisoft.diagnosis.gates import first_shares, studentised
-from surgisoft.diagnosis.problem import Problem, pose, with_reference
+from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
 from surgisoft.diagnosis.ranking import Race, Standing
+from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.static_error import StaticError, static_error
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
 from surgisoft.measurement.recording import Recording
@@ -102,8 +104,23 @@ def diagnose(
     if reference:
         problem = with_reference(problem, reference)
     report("columns of the effects")
-    found = find(problem, candidates(problem), report)
-    return replace(answer(found), seconds=time.perf_counter() - begin)
+    said = answer(find(problem, candidates(problem), report))
+    if said.verdict.kind == "unknown_effect":
+        said = with_axis(said, model, recordings)
+    return replace(said, seconds=time.perf_counter() - begin)
+
+
+def with_axis(said: Diagnosis, model: ArmModel, recordings: list[Recording]) -> Diagnosis:
+    """The diagnosis with the axis that what is left depends on most, on the open part."""
+    rest = residuals(model, recordings)
+    hidden = locked_rows(recordings)
+    measured = np.where(hidden[:, None, None], np.nan, rest.measured_mm)
+    found = shares(replace(rest, measured_mm=measured))
+    if not found or found[0].share <= 0:
+        return said
+    axis = found[0]
+    text = f"{said.verdict.sentence}; it depends most on {axis.axis} ({100 * axis.share:.0f} %)"
+    return replace(said, axis=axis.axis, verdict=replace(said.verdict, sentence=text))
 
 
 def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:

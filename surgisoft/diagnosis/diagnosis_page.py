@@ -111,7 +111,7 @@ def _chart(found: Diagnosis):
         axis.set_yticks(range(len(rows)), [row.effect for row in rows])
         axis.set_xlabel("held-out error with this effect added [mm]")
         axis.set_xlim(left=0)
-        axis.legend(fontsize=7, loc="lower right")
+        axis.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
         return chart(figure, "Held-out error with each effect")
 
 

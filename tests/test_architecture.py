@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "measurement": {"surrogate"},
     "measurement/rig": {"measurement"},
     "diagnosis": {"surrogate", "measurement", "report"},
-    "studies": {"surrogate", "measurement", "diagnosis", "report"},
+    "studies": {"surrogate", "measurement", "diagnosis", "report", "agents", "tasks"},
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
     "agents": {"scene", "surrogate", "measurement", "tasks", "report"},

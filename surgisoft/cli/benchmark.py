@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import write_text
+from surgisoft.cli.files import check_folder, write_text
 from surgisoft.cli.progress import progress
 
 benchmark = typer.Typer(help="Long studies on the virtual rig.", no_args_is_help=True)
@@ -84,6 +84,54 @@ def diagnosis(
     text = f"# Diagnosis results\n\nPrinted by `{command}` on {today}.\n\n{markdown(outcomes)}"
     if images:
         print(f"wrote {draw(outcomes, images)}")
+    if output:
+        write_text(output, text)
+    print(text)
+
+
+@benchmark.command("hidden-effect")
+def hidden_effect(
+    effects: Annotated[
+        str, typer.Option(help="Effects that the model lacks, one after the other.")
+    ] = "creep,line_lag,payload,hysteresis",
+    specimen: Annotated[int, typer.Option(min=0, help="Which arm was cast.")] = 0,
+    strength: Annotated[float, typer.Option(help="Strength of what is hidden in the rig.")] = 1.0,
+    steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 1_000_000,
+    episodes: Annotated[int, typer.Option(min=2, help="Episodes of each driver.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of training and of episodes.")] = 0,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Keeps recordings, models and policies: goes on.")
+    ] = Path("runs/benchmark-hidden-effect"),
+    images: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw the error bars here.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
+    ] = None,
+) -> None:
+    """The loop closed: train, diagnose on a rig that hides an effect, amend, train anew."""
+    import torch
+
+    from surgisoft.studies.hidden_effect import StudyConfig, run
+    from surgisoft.studies.hidden_effect_table import draw, markdown
+
+    check_folder(work)
+    check_folder(images)
+    config = StudyConfig(specimen, strength, steps, seed, episodes)
+    torch.set_num_threads(1)
+    with progress("hidden-effect") as report:
+        outcomes = run(effects.split(","), config, work, report)
+    command = (
+        f"surgisoft benchmark hidden-effect --effects {effects} --specimen {specimen} "
+        f"--strength {strength:g} --steps {steps} --episodes {episodes} --seed {seed}"
+    )
+    today = datetime.date.today().isoformat()
+    shown = ""
+    if images:
+        paths = draw(outcomes, images)
+        shown = "".join(f"\n![{path.stem}](../images/{path.name})\n" for path in paths)
+    text = f"# The loop closed\n\nPrinted by `{command}` on {today}.\n\n"
+    text += markdown(outcomes, config) + shown
     if output:
         write_text(output, text)
     print(text)

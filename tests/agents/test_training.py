@@ -147,7 +147,7 @@ def test_both_agents_learn_at_once(ablation):
 def test_a_run_opens_from_its_folder_alone(ablation, tmp_path):
     """Moved elsewhere it finds its own scene and arm models, and does what it did."""
     preset = replace(TINY, envs=2, rollout=4, evaluate_every=100, evaluation_episodes=1)
-    config = with_fields(config_of("circle_ablation"), view_points=5)
+    config = with_fields(config_of("circle_ablation"), view_points=5, dt_s=1.0)
     plan = replace(plan_of("circle_ablation", 1, preset), task_config=config)
     made = trained(tmp_path / "a", plan)
     moved = tmp_path / "elsewhere" / "b"
@@ -188,9 +188,15 @@ def test_success_counts_before_error():
 def test_it_learns(tmp_path):
     """A minute's share of real training: far better than random actions, and than none."""
     preset = preset_for(
-        "fast", "track_circle", envs=64, last_noise=0.2, evaluate_every=1000, evaluation_episodes=8
+        "fast",
+        "track_circle",
+        envs=64,
+        epochs=5,
+        last_noise=0.2,
+        evaluate_every=1000,
+        evaluation_episodes=8,
     )
-    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=60_000)
+    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=50_000)
     run = trained(tmp_path / "learns", plan)
     learned = run.load(BEST)["evaluation"]["error_mm"]
     random = judge(run.task(), Random(), 8)["error_mm"]

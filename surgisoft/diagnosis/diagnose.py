@@ -24,6 +24,7 @@ from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.static_error import StaticError, static_error
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
 from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
 CHANCE = 0.02
@@ -35,7 +36,7 @@ LEAST_GAIN = 0.25
 """Least share of the squared error above the floor that the first effect explains."""
 NEXT_GAIN = 0.15
 """Least share of the first such error that a further effect explains."""
-BESIDE = (0.3, 0.3, 0.6)
+BESIDE = (0.3, 0.15, 0.75)
 """Or: least share of what the effects before it left, least log gain, and the most that it explains
 alone beside what the first one does alone, for it must not be that one's shadow."""
 LEAST_LOG_GAIN = 0.08
@@ -48,7 +49,7 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
-EXPLAINED, LEFT_SIZE = 0.6, 4.0
+EXPLAINED, LEFT_SIZE = 0.6, 5.0
 """Share of the error above the floor that named effects must explain where what they leave is still
 so many times the surrogate's validated error; else something that is not known is missing."""
 UNKNOWN_SHARE = 0.35
@@ -90,18 +91,18 @@ def diagnose(
     model: ArmModel,
     recordings: list[Recording],
     progress: Progress | None = None,
-    reference: list[Recording] | None = None,
+    reference: list[Recording] | KnownError | None = None,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
-    reference: recordings from before something changed, such as those that the model was fitted
-    to; where given, the question is what has changed since.
+    reference: recordings from before something changed, or what the model's folder keeps of those
+    of its fit; where given, the question is what has changed since.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
     report("predicting")
     problem = pose(model, recordings, part="open")
-    if reference:
+    if reference is not None:
         problem = with_reference(problem, reference)
     report("columns of the effects")
     said = answer(find(problem, candidates(problem), report))

@@ -27,8 +27,8 @@ def diagnose(
         list[Path] | None,
         typer.Option(
             metavar="REC",
-            help="Recordings from before something changed, such as those of the fit: tells what "
-            "has changed since from what the network never learned.",
+            help="Recordings from before something changed, to tell what has changed since from "
+            "what the network never learned; without them what the model keeps of its fit.",
         ),
     ] = None,
     effect_files: Annotated[
@@ -45,7 +45,7 @@ def diagnose(
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.measurement.histories import outside_range
     from surgisoft.measurement.recording import load_recordings
-    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model
     from surgisoft.surrogate.effects import register_effect_file
 
     check_free(json_file, "verdict")
@@ -58,7 +58,7 @@ def diagnose(
         typer.echo(f"surgisoft: warning: {text}", err=True)
 
     measured = load_recordings(recordings, on_warning=warn)
-    before = load_recordings(reference, on_warning=warn) if reference else None
+    before = load_recordings(reference, on_warning=warn) if reference else load_known_error(model)
     torch.set_num_threads(1)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))

@@ -93,7 +93,7 @@ def fit(
             config,
             lambda stage, epoch, of, loss: report(epoch, of, f"{stage}: held-out {loss:.4f} mm2"),
         )
-    save_model(result.model, output, result.report(), force)
+    save_model(result.model, output, result.report(), force, result.known)
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")

@@ -13,6 +13,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.history import History
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
 ROWS = 2000
@@ -45,8 +46,6 @@ class Reference:
     """(S, m) directions of change."""
     residual: np.ndarray
     """(S, n, 3) measured less predicted, mm; NaN where missing."""
-    block: np.ndarray
-    """(S,) block of time of each row, from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,17 +158,23 @@ def pose(
     )
 
 
-def with_reference(problem: Problem, recordings: list[Recording], rows: int = ROWS) -> Problem:
-    """The problem, told where its model was wrong on recordings made before anything changed.
+def with_reference(problem: Problem, given: list[Recording] | KnownError) -> Problem:
+    """The problem, told where its model was wrong before anything changed.
 
     The model's own error has to explain these rows too, by the same function of actuation and
     direction, so it cannot pass for what has changed since.
     """
-    known = pose(problem.model, recordings, rows)
-    return replace(
-        problem,
-        reference=Reference(known.pressure, known.direction, known.residual, known.block),
+    spec = problem.model.spec
+    if not isinstance(given, KnownError):
+        check_fits(spec, given)
+        given = KnownError.of(problem.model, [history_of(given, spec.actuation)], ROWS)
+    low, half = np.array(spec.low), np.array(spec.span) / 2
+    known = Reference(
+        pressure=(given.actuation.double().numpy() - low) / half - 1.0,
+        direction=given.direction.double().numpy(),
+        residual=given.residual_mm.double().numpy(),
     )
+    return replace(problem, reference=known)
 
 
 def noise_of(recordings: list[Recording], measured: np.ndarray) -> tuple[np.ndarray, str]:

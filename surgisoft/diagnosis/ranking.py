@@ -200,8 +200,8 @@ def _validation(problem: Problem, columns: np.ndarray) -> CrossValidation:
         residual = np.concatenate([residual, known.residual])
         nothing = np.zeros((*known.residual.shape, columns.shape[3]), columns.dtype)
         columns = np.concatenate([columns, nothing])
-        block = np.concatenate([block, known.block + len(fold)])
-        fold = np.concatenate([fold, np.full(known.block.max() + 1, FITTED)])
+        block = np.concatenate([block, np.full(len(known.residual), len(fold))])
+        fold = np.append(fold, FITTED)
     features = static_features(pressure, direction)
     if known is not None:
         first = len(problem.block)

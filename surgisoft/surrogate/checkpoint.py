@@ -16,6 +16,8 @@ from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.effects.own import check_files, files_of
+from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel, arm_facts
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
@@ -26,7 +28,7 @@ FORMAT = 1
 DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "default_arm"
 """Name and folder of the arm that comes with the package."""
 
-OWN_FILES = ("config.json", "weights.safetensors", "report.json")
+OWN_FILES = ("config.json", "weights.safetensors", "report.json", KNOWN_ERROR)
 """What a model's folder is made of; a replaced model leaves other files where they are."""
 
 NETWORKS = {
@@ -57,8 +59,17 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     return folder
 
 
-def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, force=False):
-    """Write the model whole or not at all; `report` (JSON-able) is kept beside it."""
+def save_model(
+    model: ArmModel,
+    folder: str | Path,
+    report: dict | None = None,
+    force: bool = False,
+    known: KnownError | None = None,
+) -> None:
+    """Write the model whole or not at all.
+
+    `report` (JSON-able) and `known`, where the model is known to be off, are kept beside it.
+    """
     folder = claim_folder(folder, force)
     config = {
         "format": FORMAT,
@@ -77,6 +88,8 @@ def save_model(model: ArmModel, folder: str | Path, report: dict | None = None, 
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
         if report is not None:
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+        if known is not None:
+            known.save(fresh)
         fresh.chmod(0o755)
         if folder.exists():
             for kept in folder.iterdir():
@@ -141,3 +154,14 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
             f"{folder}: damaged model ({type(error).__name__}: {str(error)[:120]}); fit it again"
         ) from error
     return model.to(device).eval().requires_grad_(False)
+
+
+def load_known_error(folder: str | Path) -> KnownError | None:
+    """Where the model in a folder is known to be off; None where that was not kept."""
+    try:
+        return KnownError.load(Path(folder))
+    except Exception as error:
+        raise InputError(
+            f"{folder}: damaged {KNOWN_ERROR} ({type(error).__name__}: {str(error)[:120]}); "
+            "fit the model again, or delete that file"
+        ) from error

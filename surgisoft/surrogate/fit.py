@@ -24,6 +24,7 @@ from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.excitation import ChamberExcitation, excitation
 from surgisoft.surrogate.fit_recurrent import held_rows, new_recurrent, train_recurrent
 from surgisoft.surrogate.history import History
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.network import HIDDEN, HawNN
 from surgisoft.surrogate.rows import (
@@ -103,6 +104,8 @@ class FitResult:
     seconds: float
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
+    known: KnownError | None = None
+    """Where the model is off on the rows that it was fitted to and judged on."""
 
     def report(self) -> dict:
         """What happened, for a JSON file beside the model."""
@@ -172,6 +175,7 @@ def fit(
         if value is None:
             result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
+    result.known = KnownError.of(result.model, [train] if valid is None else [train, valid])
     result.seconds = time.perf_counter() - start
     return result
 

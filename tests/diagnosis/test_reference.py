@@ -80,3 +80,32 @@ def test_command_takes_a_reference(model, tmp_path, capsys):
     assert "misalignment is missing" in capsys.readouterr().out
     assert run(["diagnose", str(tmp_path / "arm"), now, "--reference", str(tmp_path / "no")]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_fitted_model_keeps_where_it_is_off(tmp_path):
+    """The rows kept are the fit's own: measured less what the loaded model predicts there."""
+    from surgisoft.measurement.histories import arm_spec, history_of
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model
+    from surgisoft.surrogate.fit import FitConfig, fit
+
+    before = measured(2)
+    result = fit(history_of([before]), None, arm_spec([before]), FitConfig(hidden=(8,), epochs=10))
+    save_model(result.model, tmp_path / "arm", known=result.known)
+    known, model = load_known_error(tmp_path / "arm"), load_model(tmp_path / "arm")
+    history = history_of([before])
+    step = ROWS // len(known.residual_mm)
+    np.testing.assert_array_equal(known.actuation, history.pressure[0, ::step])
+    off = before.key_points_mm - model.predict(history)[0].numpy()
+    np.testing.assert_allclose(known.residual_mm, off[::step], atol=1e-4)
+    save_model(model, tmp_path / "arm", force=True)  # an amended one: what was known is void
+    assert load_known_error(tmp_path / "arm") is None
+
+
+def test_damaged_known_error_is_told(model, tmp_path, capsys):
+    save_model(model, tmp_path / "arm")
+    (tmp_path / "arm" / "known_error.safetensors").write_bytes(b"not this")
+    save_recording(measured(1), tmp_path / "now.parquet")
+    assert run(["diagnose", str(tmp_path / "arm"), str(tmp_path / "now.parquet")]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert "known_error" in error[0]

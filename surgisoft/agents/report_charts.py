@@ -19,8 +19,8 @@ OFFSET_MM = 2.0
 """The unrolled dose is shown so far on either side of the ring (mm)."""
 CELL_MM = 0.25
 """Size of a cell of the unrolled dose along the ring, and half of it across (mm)."""
-NEAR_CLEARANCE_MM = 15.0
-"""Clearances beyond this and the limit are not spread out (mm)."""
+LEAST_DOSE = 0.1
+"""Doses below this share of the threshold are left blank."""
 
 
 def episode_charts(log: EpisodeLog) -> list[Picture]:
@@ -38,7 +38,7 @@ def episode_charts(log: EpisodeLog) -> list[Picture]:
     ]
 
 
-def path_chart(log: EpisodeLog) -> Picture:
+def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     """Where the beam burnt (or the point went) over where it should, in the path's plane."""
     wanted = log.path_mm if len(log.path_mm) else log.target_mm
     on = log.beam.on if log.beam is not None else np.ones(log.rows, bool)
@@ -57,9 +57,9 @@ def path_chart(log: EpisodeLog) -> Picture:
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
-        axis.set_title("path over target")
+        axis.set_title(title)
         axis.legend(loc="center")
-        return chart(figure, "path over target", "Seen at right angles to the path's plane")
+        return chart(figure, title, "Seen at right angles to the path's plane")
 
 
 def error_chart(log: EpisodeLog) -> Picture | None:
@@ -126,7 +126,7 @@ def dose_chart(log: EpisodeLog) -> Picture | None:
     """The dose at the end, unrolled along the ring: 1 is the threshold of ablation."""
     if log.dose is None:
         return None
-    from matplotlib.colors import TwoSlopeNorm
+    from matplotlib.colors import LogNorm
 
     dose = log.dose
     near = np.abs(dose.offset_mm) <= OFFSET_MM
@@ -144,17 +144,27 @@ def dose_chart(log: EpisodeLog) -> Picture | None:
     mean = np.divide(total, area, out=np.full_like(total, np.nan), where=area > 0.0)
     with drawing():
         figure, axis = plt.subplots(figsize=(2.0 * CHART[0], 2.4))
-        norm = TwoSlopeNorm(1.0, 0.0, max(2.0, float(np.nanmax(mean))))
+        most = max(10.0, float(np.nanmax(mean)))
+        mean = np.where(mean >= LEAST_DOSE, mean, np.nan)
+        norm = LogNorm(LEAST_DOSE, most)
         shown = axis.pcolormesh(
-            *edges, mean.T, norm=norm, cmap="RdGy", rasterized=True, shading="flat"
+            *edges, mean.T, norm=norm, cmap="YlOrBr", rasterized=True, shading="flat"
         )
         axis.grid(visible=False)
+        middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
+        if np.nanmax(mean, initial=0.0) > 1.0:
+            axis.contour(*middles, np.nan_to_num(mean).T, [1.0], colors=RED, linewidths=0.9)
         axis.axhline(0.0, c=INK, lw=0.8, ls="--")
+        axis.set_ylim(-OFFSET_MM, OFFSET_MM)
         axis.set_xlabel("along the ring [mm]")
         axis.set_ylabel("off the ring [mm]")
-        axis.set_title("dose, unrolled; above 1 the tissue is ablated")
+        axis.set_title("dose, unrolled")
         figure.colorbar(shown, ax=axis, label="dose / threshold", pad=0.01)
-        return chart(figure, "dose unrolled along the ring", "Negative: inside the ring")
+        return chart(
+            figure,
+            "dose unrolled along the ring",
+            "Red: where the dose reaches the threshold of ablation; negative: inside the ring",
+        )
 
 
 def spread_chart(

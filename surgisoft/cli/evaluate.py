@@ -73,9 +73,14 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FILE", help="Replay (.rrd) of the first driver's first episode."),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write report.html here: one file, nothing beside it."),
+    ] = None,
 ) -> None:
     """Play episodes with each driver and say how well they went, with 95 % intervals."""
     _check_files(json_file, replay)
+    check_folder(report)
     rig = _rig_config(on, specimen, hidden, cameras, trust)
     own, table = _task(drivers, task, config, arm, scene)
     place = own
@@ -83,7 +88,8 @@ def evaluate(
         from surgisoft.agents.on_rig import on_rig
 
         place = on_rig(own, rig)
-    results, log = _evaluated(place, drivers, episodes, seed, referee, on, replay is not None)
+    logged = drivers if report else drivers[:1] if replay else []
+    results, logs = _evaluated(place, drivers, episodes, seed, referee, on, logged)
     print(f"{own.name}, {on}: {episodes} episodes of seed {seed}; mean [95 % interval]")
     _show(results)
     if json_file:
@@ -105,9 +111,16 @@ def evaluate(
     if replay:
         from surgisoft.replay.episode_view import write_replay
 
-        with progress("replay") as report:
-            written = write_replay(log, replay, report=report)
+        with progress("replay") as told:
+            written = write_replay(logs[drivers[0]], replay, report=told)
         print(f"wrote {written}")
+    if report:
+        from surgisoft.agents.report import evaluation_page
+        from surgisoft.report import write_page
+
+        about = f"{episodes} episodes of seed {seed}"
+        page = evaluation_page(own.name, on, results, logs, about)
+        print(f"wrote {write_page(page, report / 'report.html')}")
 
 
 def _check_files(json_file: Path | None, replay: Path | None) -> None:
@@ -175,24 +188,24 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
     return make_task(task, own), config_table(own)
 
 
-def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool, on: str, log):
-    """Each driver's evaluation, and the first one's first episode as a log if one is asked for."""
+def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool, on: str, logged):
+    """Each driver's evaluation, and the first episode's log of those that are to be logged."""
     from surgisoft.agents.evaluate import evaluate as evaluate_driver
     from surgisoft.agents.policies import open_driver
     from surgisoft.agents.record import FirstEpisode
 
     opened = {name: open_driver(name, task) for name in drivers}
-    first = FirstEpisode(task, drivers[0], seed, on) if log else None
+    first = {name: FirstEpisode(task, name, seed, on) for name in logged}
     results = []
     for name, driver in opened.items():
-        watch = first if name == drivers[0] else None
+        watch = first.get(name)
         with progress(f"evaluate {name}") as report:
             results.append(
                 evaluate_driver(
                     task, name, driver, episodes, seed, referee, progress=report, watch=watch
                 )
             )
-    return results, first.log() if first else None
+    return results, {name: each.log() for name, each in first.items()}
 
 
 def _show(results) -> None:

@@ -73,15 +73,13 @@ def check(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The experiment.")],
 ) -> None:
     """Say what an experiment would play; a bad file is one line with its line and field."""
-    from surgisoft.experiments.hands import check_drivers
-    from surgisoft.experiments.plan import scene_of, settings
+    from surgisoft.experiments.plan import settings
+    from surgisoft.experiments.run import check_playable
     from surgisoft.experiments.spec import load_experiment
 
     spec = load_experiment(file)
     found = settings(spec, _where(file))
-    check_drivers(spec)
-    for lesion in {setting.lesion: setting for setting in found}.values():
-        scene_of(spec, lesion)
+    check_playable(spec)
     episodes = len(found) * spec.repeats
     print(
         f"{spec.name}: {len(found)} settings, {episodes} episodes of at most "

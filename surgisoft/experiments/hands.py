@@ -127,15 +127,6 @@ class Hands:
         return known[name][agent]
 
 
-def check_drivers(spec: Experiment) -> None:
-    """Raise where a driver's schedule cannot be read; an arm's chambers are not known yet."""
-    from surgisoft.measurement.protocols.schedule_file import load_schedule
-
-    for driver in spec.drivers:
-        if driver.schedule:
-            load_schedule(Path(driver.schedule))
-
-
 def _own(driver: DriverSpec, chambers: int) -> Hand:
     if driver.schedule:
         return Schedule(Path(driver.schedule), chambers)
@@ -143,7 +134,7 @@ def _own(driver: DriverSpec, chambers: int) -> Hand:
 
 
 def _table(times, values) -> tuple[Tensor, Tensor]:
-    return torch.as_tensor(times).double(), torch.as_tensor(values).float()
+    return torch.as_tensor(times).double().contiguous(), torch.as_tensor(values).float()
 
 
 def _between(times: Tensor, values: Tensor, at_s: Tensor) -> Tensor:

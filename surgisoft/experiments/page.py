@@ -7,7 +7,7 @@ from pathlib import Path
 
 from surgisoft.agents.evaluate import RATES
 from surgisoft.agents.report import cell, episode_parts
-from surgisoft.agents.report_charts import spread_chart, sweep_chart
+from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
@@ -46,6 +46,8 @@ def experiment_page(results: Results, films: dict[tuple[str, int], Picture], abo
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))
     sections += _sweeps(results)
+    if 1 < len(results.settings) <= SHOWN:
+        sections.append(_side_by_side(results))
     for label, episode in shown_episodes(results):
         worst = (label, episode) == results.worst and len(results.rows) > 1
         title = f"{'Worst of all: ' if worst else ''}{label}, episode {episode}"
@@ -82,8 +84,9 @@ def verdict(results: Results) -> str:
     if faults:
         ended = [row for row in results.rows if row["outcome"].startswith("aborted")]
         first = (
-            f"After the fault {len(ended)} of {len(results.rows)} episodes were aborted; the beam "
-            f"was on for at most {unsafe:.2g} s while it was unsafe"
+            f"After the fault {len(ended)} of {len(results.rows)} episodes were aborted, "
+            f"{sum(row['success'] for row in results.rows):.0f} were cut all the same; "
+            f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
         )
     elif len(settings) <= SHOWN:
         first = "; ".join(f"{s.label.replace('_', ' ')}: {_one(s)}" for s in settings)
@@ -93,7 +96,8 @@ def verdict(results: Results) -> str:
         best, least = settings[shares.index(high)].label, settings[shares.index(low)].label
         first = f"Success from {low:.0%} ({least}) to {high:.0%} ({best})"
     last = f"{hits} of {len(results.rows)} episodes had contact."
-    safe = "" if faults else f" The beam was on for at most {unsafe:.2g} s while it was unsafe."
+    safe = f"was on for at most {unsafe:.2g} s" if unsafe else "was never on"
+    safe = "" if faults else f" The beam {safe} while it was unsafe."
     return f"{first}. {last}{safe}"
 
 
@@ -109,7 +113,7 @@ def _tone(results: Results) -> str:
     if any(row["collided"] > 0.0 for row in results.rows):
         return "bad"
     if results.experiment.faults:
-        return "good" if all(row["beam_s"] >= 0.0 for row in results.rows) else "bad"
+        return "good" if max(row["beam_unsafe_longest_s"] for row in results.rows) < 0.15 else "bad"
     shares = [setting.overall["success"].mean for setting in results.settings]
     return "good" if min(shares) >= 0.95 else "warn"
 
@@ -128,6 +132,13 @@ def _facts(results: Results) -> list[tuple[str, str]]:
 
 def _table(results: Results) -> Section:
     known = [name for name in COLUMNS if name in results.settings[0].overall]
+    if len(results.settings) <= SHOWN:
+        turned = [
+            (COLUMNS[name], *(cell(s.overall[name], name in RATES) for s in results.settings))
+            for name in known
+        ]
+        header = ["mean [95 % interval]", *(setting.label for setting in results.settings)]
+        return Section("Results", [Table(header, turned)])
     header = ["setting", "episodes", *(COLUMNS[name] for name in known)]
     rows = [
         (
@@ -147,6 +158,13 @@ def _outcomes(results: Results) -> Section:
         for outcome, count in setting.outcomes.items()
     ]
     return Section("How episodes ended", [Table(["setting", "outcome", "episodes", "share"], rows)])
+
+
+def _side_by_side(results: Results) -> Section:
+    """The paths of each setting's first episode."""
+    logs = {setting.label: results.log(setting.label, 0) for setting in results.settings}
+    paths = [path_chart(log, label) for label, log in logs.items()]
+    return Section("First episodes side by side", [Gallery(paths)])
 
 
 def _spreads(results: Results) -> list[Picture]:

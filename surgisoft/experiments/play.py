@@ -36,7 +36,8 @@ class Block:
 
 
 @lru_cache(maxsize=1)
-def _opened(spec: Experiment, setting: Setting) -> tuple[PhasedAblation, Hands]:
+def opened(spec: Experiment, setting: Setting) -> tuple[PhasedAblation, Hands]:
+    """A setting's task and who drives it; the last one is kept."""
     task = build_task(spec, setting)
     return task, Hands(spec, task, setting.case.policy)
 
@@ -49,7 +50,7 @@ def play_block(
     progress: Callable[[int, int], None] | None = None,
 ) -> Block:
     """Play episodes `first` to `first + count - 1` of a setting."""
-    task, hands = _opened(spec, setting)
+    task, hands = opened(spec, setting)
     judge, recorders = EpisodeReferee(task), _Recorders(task, spec, setting)
 
     def watch(now: Instant) -> None:

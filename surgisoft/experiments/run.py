@@ -10,7 +10,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -18,7 +18,7 @@ import torch
 from surgisoft.agents.run_folder import versions
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import Setting, scene_of, settings
-from surgisoft.experiments.play import Row, play_block
+from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
 from surgisoft.tasks.episode_file import save_episode
 from surgisoft.toml_config import write_atomically
@@ -74,8 +74,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
             raise InputError(
                 f"{folder}: results are already there; --resume goes on, --force begins anew"
             )
-    for setting in settings(spec):
-        scene_of(spec, setting)
+    check_playable(spec)
     if force and there:
         shutil.rmtree(folder)
     (folder / "rows").mkdir(parents=True, exist_ok=True)
@@ -83,6 +82,22 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
     about = {"versions": versions(), "scene_hash": scene.content_hash}
     write_atomically(folder / "versions.json", (json.dumps(about, indent=2) + "\n").encode())
     save_experiment(spec, folder / FILE)
+
+
+def check_playable(spec: Experiment) -> None:
+    """Raise unless every lesion lies on the organ and every driver fits its arm.
+
+    In simulation, whatever the case: what a driver sees and moves is the same on the rig.
+    """
+    found, seen = settings(spec), set()
+    for setting in {setting.lesion: setting for setting in found}.values():
+        scene_of(spec, setting)
+    for setting in found:
+        case = setting.case
+        if (case.policy, case.arm) not in seen:
+            plain = replace(case, plant="simulation", hidden=(), specimen=0)
+            opened(spec, replace(setting, case=plain))
+            seen.add((case.policy, case.arm))
 
 
 def run_experiment(

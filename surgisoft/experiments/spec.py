@@ -41,6 +41,7 @@ Duration = Annotated[float, Rule("a time from 0 to 100000 s", lambda s: 0.0 <= s
 Positive = Annotated[float, Rule("a time above 0 s", lambda s: 0.0 < s <= 1e5)]
 Count = Annotated[int, Rule("a whole number from 1 to 100000", lambda n: 1 <= n <= 100_000)]
 Seed = Annotated[int, Rule("a whole number from 0 to 2147483647", lambda n: 0 <= n < 2**31)]
+Format = Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)]
 AnyLength = Annotated[float, Rule("a number from -1000 to 1000 mm", lambda v: abs(v) <= 1000.0)]
 
 
@@ -189,7 +190,7 @@ class Experiment:
     """The cut: fields of the task `circle_ablation`, without `scene` and `arm`."""
     note: str = ""
     """Free text."""
-    format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
+    format: Format = FORMAT
     """Version of this file format."""
 
 

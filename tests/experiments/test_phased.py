@@ -1,0 +1,177 @@
+"""Phases, interlock, faults and hands, held against hand-made states and the energy delivered."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.experiments.hands import Schedule, Waypoints, _between
+from surgisoft.experiments.phased import CLOSE, LATE, LOST, PhasedAblation
+from surgisoft.experiments.plan import settings
+from surgisoft.experiments.play import play_block
+from surgisoft.experiments.spec import Fault, load_experiment
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import CircleAblation
+from tests.experiments.tiny import FAULT, TINY, write
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    text = TINY.replace("time_s = 0.5", "time_s = 3.0\nview_lost_s = 0.4")
+    return load_experiment(write(tmp_path_factory.mktemp("spec"), text))
+
+
+@pytest.fixture(scope="module")
+def base(spec):
+    return CircleAblation(replace(spec.task, scene=spec.scene))
+
+
+@pytest.fixture(scope="module")
+def cutting(spec, base):
+    """The phased task, and two of its episodes in the phase with the beam, all well."""
+    task = PhasedAblation(base, spec)
+    state = Episodes(task).seeded(0, 2)
+    state = replace(state, goal=replace(state.goal, phase=state.goal.phase + 1))
+    return task, _with(state, fraction=1.0, clearance=20.0)
+
+
+def _with(state, fraction=None, clearance=None):
+    """The state with what is seen (0..1) and the clearance (mm) of both episodes."""
+    scenery = state.world.scenery
+    ones = torch.ones_like(scenery.view.fraction)
+    if fraction is not None:
+        scenery = replace(scenery, view=replace(scenery.view, fraction=fraction * ones))
+    if clearance is not None:
+        room = SimpleNamespace(least_mm=clearance * ones, collides=clearance * ones < 0.0)
+        scenery = replace(scenery, clearance=room)
+    return replace(state, world=replace(state.world, scenery=scenery))
+
+
+def test_the_interlock_lets_the_beam_on_only_when_all_is_well(cutting):
+    task, state = cutting
+    assert task.released(state).all()
+    limits = task.base.spec.limits
+    assert not task.released(_with(state, fraction=limits.view_fraction - 0.01)).any()
+    assert not task.released(_with(state, clearance=limits.clearance_mm - 0.01)).any()
+    assert task.released(_with(state, clearance=limits.clearance_mm + 0.01)).all()
+    for change in ({"phase": state.goal.phase - 1}, {"reason": state.goal.reason + LATE}):
+        assert not task.released(replace(state, goal=replace(state.goal, **change))).any()
+
+
+def test_an_experiment_cannot_loosen_the_scene_s_clearance(cutting, spec, base):
+    loose = replace(spec, limits=replace(spec.limits, clearance_mm=-5.0))
+    assert PhasedAblation(base, loose).clear_mm == base.spec.limits.clearance_mm
+    strict = replace(spec, limits=replace(spec.limits, clearance_mm=7.0))
+    _, state = cutting
+    assert not PhasedAblation(base, strict).released(_with(state, clearance=6.9)).any()
+
+
+def _walk(task, state, steps, **world):
+    """The progress after so many steps in which the world stays as it is told."""
+    for _ in range(steps):
+        after = _with(replace(state, goal=state.goal.cut), **world)
+        state = replace(state, goal=task._further(state.goal, after))
+    return state.goal
+
+
+def test_phases_go_on_by_their_time_and_view_lost_aborts(cutting):
+    task, state = cutting
+    first = replace(state, goal=replace(state.goal, phase=state.goal.phase * 0))
+    well = {"fraction": 0.9, "clearance": 20.0}
+    assert _walk(task, first, 2, **well).phase.tolist() == [0, 0]
+    goal = _walk(task, first, 3, **well)
+    assert goal.phase.tolist() == [1, 1]
+    assert goal.since.tolist() == [0, 0]
+    lost = {"fraction": 0.0, "clearance": 20.0}
+    assert _walk(task, state, 4, **lost).reason.tolist() == [0, 0]
+    goal = _walk(task, state, 5, **lost)
+    assert goal.reason.tolist() == [LOST, LOST]
+    assert goal.where.tolist() == [1, 1]
+    assert goal.phase.tolist() == [2, 2]
+    assert _walk(task, state, 1, fraction=1.0, clearance=-0.1).reason.tolist() == [CLOSE, CLOSE]
+
+
+def test_an_abort_retreats_and_then_ends(cutting, base, spec):
+    third = replace(spec.phases[0], name="out", until="never", timeout_s=0.2)
+    limits = replace(spec.limits, retreat="out")
+    task = PhasedAblation(base, replace(spec, phases=(*spec.phases, third), limits=limits))
+    goal = _walk(task, cutting[1], 5, fraction=0.0, clearance=20.0)
+    assert goal.phase.tolist() == [2, 2]
+    state = replace(cutting[1], goal=goal)
+    assert not task.released(_with(state, fraction=1.0)).any()
+    goal = _walk(task, state, 2, fraction=1.0, clearance=20.0)
+    assert goal.phase.tolist() == [3, 3]
+    assert task.ended(replace(state, goal=goal)).all()
+
+
+def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
+    look = replace(spec.phases[0], until="centred", within=1000.0, hold_s=0.2, timeout_s=9.0)
+    task = PhasedAblation(base, replace(spec, phases=(look, spec.phases[1])))
+    state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
+    good, bad = {"fraction": 1.0, "clearance": 20.0}, {"fraction": 0.5, "clearance": 20.0}
+    goal = _walk(task, state, 1, **good)
+    goal = _walk(task, replace(state, goal=goal), 1, **bad)
+    goal = _walk(task, replace(state, goal=goal), 1, **good)
+    assert goal.phase.tolist() == [0, 0]
+    assert _walk(task, replace(state, goal=goal), 1, **good).phase.tolist() == [1, 1]
+
+
+def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
+    """No energy reaches the organ in a step that begins with the lesion out of sight."""
+    text = TINY.replace("time_s = 0.5", "time_s = 3.4\nview_lost_s = 0.3") + FAULT
+    text = text.replace("timeout_s = 0.3", "timeout_s = 1.5")
+    spec = load_experiment(write(tmp_path, text))
+    block = play_block(spec, settings(spec)[0], 0, 1)
+    log, row = block.logs[0], block.rows[0]
+    seen = log.view_fraction >= log.limits["view_fraction"]
+    lost = int(np.flatnonzero(seen)[-1]) + 1
+    assert seen[lost - 5 : lost].all()
+    assert log.beam.on[lost - 5 : lost].all()
+    unsafe_before = np.flatnonzero(~seen[:-1] | (log.clearance_mm[:-1] < 1.0)) + 1
+    assert (log.beam.power_w[unsafe_before] == 0.0).all()
+    assert not log.beam.on[lost + 1 :].any()
+    assert log.arms["endoscope"].pressure_kPa[-1, 2] == pytest.approx(0.0, abs=4.0)
+    assert row["outcome"] == "aborted in cut: lesion out of sight"
+    assert row["beam_unsafe_longest_s"] <= 0.1 + 1e-6
+    assert row["beam_s"] == pytest.approx(0.1 * log.beam.on.sum(), abs=1e-3)
+
+
+def test_a_fault_needs_a_chamber_that_is_there(spec, base):
+    wrong = replace(spec, faults=(Fault("laser", 1.0, 4),))
+    with pytest.raises(InputError, match="chamber 4 of arm 'laser', expected 1 to 3"):
+        PhasedAblation(base, wrong)
+
+
+def test_values_between_rows_are_linear():
+    times = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+    values = torch.tensor([[0.0], [10.0], [0.0]])
+    at = torch.tensor([0.0, 1.5, 2.0, 3.0, 9.0])
+    assert _between(times, values, at)[:, 0].tolist() == [0.0, 5.0, 10.0, 5.0, 0.0]
+    assert _between(times[:1], values[1:2], at)[:, 0].tolist() == [10.0] * 5
+
+
+def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, tmp_path):
+    long = replace(spec.phases[0], until="never", timeout_s=9.0)
+    task, state = PhasedAblation(base, replace(spec, phases=(long,))), cutting[1]
+    state = replace(state, goal=replace(state.goal, phase=state.goal.phase * 0))
+    file = tmp_path / "press.csv"
+    file.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1.0,5,0,0\n")
+    hand, play = Schedule(file, 3), Episodes(task)
+    point = task.base.centre_mm(state)[0]
+    way = Waypoints([(0.0, *point.tolist())])
+    for _ in range(12):
+        seen = play.observe(state)
+        actions = {
+            "laser": way(task, "laser", state, seen),
+            "endoscope": hand(task, "endoscope", state, seen),
+        }
+        state, _ = play.step(state, actions)
+    command = state.world.arms["endoscope"].command
+    assert torch.allclose(command, torch.tensor([5.0, 0.0, 0.0]).expand(2, 3), atol=1e-4)
+    miss = task.base.aims["laser"].miss(state.world.arms["laser"].points_mm, point.expand(2, 3))
+    assert (miss.norm(dim=1) < 8.0).all()
+    with pytest.raises(InputError, match="expected 2 in kPa"):
+        Schedule(file, 2)

@@ -1,0 +1,100 @@
+"""Whole runs: interrupted or not, by one process or two, give the same rows and one report."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.experiments.run import open_results, run_experiment
+from surgisoft.experiments.spec import load_experiment
+from tests.experiments.tiny import TINY, write
+from tests.report.browser import chromium, look
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An experiment through the command, in one go."""
+    folder = tmp_path_factory.mktemp("whole")
+    file, results = write(folder), folder / "results"
+    assert run(["experiment", "run", str(file), "-o", str(results), "--no-replays"]) == 0
+    return file, results
+
+
+def _rows(folder):
+    return [json.loads(path.read_text()) for path in sorted((folder / "rows").iterdir())]
+
+
+def test_tables_hold_every_episode(whole):
+    _, folder = whole
+    rows = _rows(folder)
+    assert [row["episode"] for row in rows] == [0, 1, 2]
+    table = pq.read_table(folder / "episodes.parquet").to_pylist()
+    assert table == rows
+    lines = (folder / "episodes.csv").read_text().splitlines()
+    assert len(lines) == 4
+    overall = json.loads((folder / "summary.json").read_text())["settings"]["simulation"]["overall"]
+    mean = sum(row["clearance_mm"] for row in rows) / 3
+    assert overall["clearance_mm"]["mean"] == pytest.approx(mean)
+    assert overall["success"]["high"] == pytest.approx(0.5615, abs=1e-3)  # Wilson: 0 of 3
+    assert load_experiment(folder / "experiment.toml").repeats == 3
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(whole, tmp_path):
+    file, folder = whole
+    spec, began = load_experiment(file), []
+
+    def interrupt(done, total, note):
+        if done > 1.0:
+            raise KeyboardInterrupt
+
+    open_results(spec, tmp_path / "r")
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(spec, tmp_path / "r", report=interrupt)
+    first = _rows(tmp_path / "r")
+    assert [row["episode"] for row in first] == [0]
+    open_results(spec, tmp_path / "r", resume=True)
+    run_experiment(spec, tmp_path / "r", report=lambda done, total, note: began.append(done))
+    assert began[0] == 1.0
+    assert _rows(tmp_path / "r") == _rows(folder)
+
+
+def test_two_processes_give_the_same_rows(whole, tmp_path):
+    file, folder = whole
+    spec = load_experiment(file)
+    open_results(spec, tmp_path / "r")
+    rows = run_experiment(spec, tmp_path / "r", processes=2)
+    assert rows == _rows(folder)
+
+
+def test_results_are_not_overwritten(whole, tmp_path, capsys):
+    file, folder = whole
+    before = _rows(folder)
+    assert run(["experiment", "run", str(file), "-o", str(folder)]) == 2
+    assert "--resume goes on, --force begins anew" in capsys.readouterr().err
+    other = write(tmp_path, TINY.replace("seed = 3", "seed = 4"))
+    with pytest.raises(InputError, match="holds another experiment"):
+        open_results(load_experiment(other), folder, resume=True)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("x")
+    with pytest.raises(InputError, match="already there and no results"):
+        open_results(load_experiment(other), tmp_path / "full", force=True)
+    assert _rows(folder) == before
+
+
+def test_the_report_stands_alone_and_fits_a_telephone(whole, tmp_path):
+    _, folder = whole
+    text = (folder / "report.html").read_text()
+    assert "success 0 of 3" in text
+    with chromium() as browser:
+        for width in (1280, 400):
+            overflow, foreign, broken, _ = look(browser, folder / "report.html", width)
+            assert (overflow, foreign, broken) == (0, [], 0)
+
+
+def test_list_names_what_is_shipped(capsys):
+    assert run(["experiment", "list"]) == 0
+    out = capsys.readouterr().out
+    for name in ("liver", "multi_lesion", "fault", "sweep"):
+        assert f"{name}.toml: " in out

@@ -1,0 +1,100 @@
+"""Files of experiments: what is shipped loads, what is wrong is one line with its place."""
+
+import dataclasses
+
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.experiments.plan import settings
+from surgisoft.experiments.spec import load_experiment, save_experiment
+from surgisoft.tasks.world_scene import PHANTOM
+from surgisoft.toml_config import read_toml
+from tests.experiments.tiny import FAULT, TINY, write
+
+SHIPPED = sorted((PHANTOM / "experiments").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_experiments_load_and_their_exact_configuration_is_the_same(path, tmp_path):
+    spec = load_experiment(path)
+    assert spec.name == path.stem
+    assert settings(spec)
+    save_experiment(spec, tmp_path / "experiment.toml")
+    assert load_experiment(tmp_path / "experiment.toml") == spec
+
+
+def test_the_paper_s_experiment_is_what_it_says():
+    spec = load_experiment(PHANTOM / "experiments" / "liver.toml")
+    assert spec.limits.time_s == 60.0
+    assert [case.plant for case in spec.cases] == ["simulation", "rig"]
+
+
+BAD = {
+    'until = "centred"': ('until = "centered"', "phases[0].until", "one of centred"),
+    "seed = 3": ("sead = 3", "sead", "did you mean 'seed'"),
+    "repeats = 3": ("repeats = 0", "repeats", "whole number from 1"),
+    "timeout_s = 0.3": ('timeout_s = "long"', "phases[0].timeout_s", "a time above 0 s"),
+    "fire_mm = 50.0": ("fire_mn = 50.0", "task.fire_mn", "did you mean 'fire_mm'"),
+    'laser = "policy"': ('laser = "pilot"', "phases[1].laser", "one of hold, rest"),
+    'name = "cut"': ('name = "look"', "phases[1].name", "names that differ"),
+    'scene = "{scene}"': ('scene = "nowhere"', "scene", "a scene's folder"),
+    "time_s = 0.5": ('time_s = 0.5\nretreat = "out"', "limits.retreat", "one of the phases"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "field", "expected"), [(k, *v) for k, v in BAD.items()])
+def test_a_bad_field_is_named_with_its_line(old, new, field, expected, tmp_path, capsys):
+    text = TINY.replace(old, new, 1)
+    line = 1 + text[: text.rindex(new.splitlines()[-1])].count("\n")
+    path = write(tmp_path, text)
+    assert run(["experiment", "check", str(path)]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"surgisoft: error: {path}:{line}: {field}: ")
+    assert expected in told
+    assert told.count("\n") == 1
+
+
+VARY = '[[vary]]\nfield = "{field}"\nvalues = [{values}]\n'
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "place"),
+    [
+        ("task.fire_mm", "1.0, -1.0", "vary[0].values[1]"),
+        ("task.fire_mn", "1.0", "vary[0].values[0]"),
+        ("hidden.grep", "1.0", "vary[0].field"),
+        ("fault.chamber", "1", "vary[0].field"),
+        ("mount", "1.0", "vary[0].field"),
+        ("rig.specimen", "0.5", "vary[0].values"),
+    ],
+)
+def test_what_cannot_vary_is_named(field, values, place, tmp_path):
+    path = write(tmp_path, TINY + VARY.format(field=field, values=values))
+    with pytest.raises(InputError, match=r"tiny\.toml:\d+: " + place.replace("[", r"\[")):
+        settings(load_experiment(path), read_toml(path)[1])
+
+
+def test_what_varies_makes_a_grid(tmp_path):
+    text = TINY + FAULT
+    text += VARY.format(field="task.fire_mm", values="0.5, 1")
+    text += VARY.format(field="fault.chamber", values="1, 2, 3")
+    found = settings(load_experiment(write(tmp_path, text)))
+    assert [setting.number for setting in found] == list(range(6))
+    assert found[4].label == "simulation_fire_mm=1_chamber=2"
+    assert dict(found[4].values) == {"task.fire_mm": 1, "fault.chamber": 2}
+
+
+def test_hidden_effects_are_for_the_rig(tmp_path):
+    case = '[[cases]]\nname = "a"\nhidden = ["creep"]\n'
+    with pytest.raises(InputError, match=r"cases\[0\]: hidden or specimen in simulation"):
+        load_experiment(write(tmp_path, TINY + case))
+    text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
+    with pytest.raises(InputError, match="unknown hidden effect 'grep'"):
+        settings(load_experiment(write(tmp_path, text)))
+
+
+def test_specs_are_values(tmp_path):
+    spec = load_experiment(write(tmp_path))
+    assert hash(spec) == hash(load_experiment(write(tmp_path)))
+    assert spec != dataclasses.replace(spec, seed=4)

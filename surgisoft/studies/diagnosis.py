@@ -28,6 +28,8 @@ from surgisoft.measurement.recording import Recording
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.rows import Data, model_rows, validated_error
 
@@ -156,15 +158,20 @@ def base_model(robot: int, folder: Path, undertrained: bool = False) -> ArmModel
         config = replace(config, epochs=10)
     result = fit(history_of([train]), history_of([valid]), arm_spec([train]), config)
     folder.mkdir(parents=True, exist_ok=True)
-    save_model(result.model, place, result.report(), force=True)
+    save_model(result.model, place, result.report(), force=True, known=result.known)
     return load_model(place)
+
+
+def validation_of(robot: int) -> History:
+    """The settled points that a specimen's models are validated on."""
+    rig = VirtualRig(robot)
+    valid, _ = rig.record(make_protocol("validation", rig.limits, None, seed=robot))
+    return history_of([valid])
 
 
 def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
     """The model with a smooth static error, so that its validated error is `wanted_mm`."""
-    rig = VirtualRig(robot)
-    valid, _ = rig.record(make_protocol("validation", rig.limits, None, seed=robot))
-    history = history_of([valid])
+    history = validation_of(robot)
     generator = torch.Generator().manual_seed(seed)
     noise = {
         name: torch.randn(value.shape, generator=generator) * value.std()
@@ -230,8 +237,9 @@ def run_case(case: Case, folder: Path) -> Outcome:
     model = base_model(case.robot, folder, case.undertrained)
     if case.surrogate_mm > model.validation["rmse_mm"]:
         model = bent(model, case.robot, case.surrogate_mm, case.take)
+    known = KnownError.of(model, [validation_of(case.robot)])
     recording, size = record(case)
-    found = diagnose(model, [recording])
+    found = diagnose(model, [recording], reference=known)
     return Outcome(
         case=case,
         kind=found.verdict.kind,

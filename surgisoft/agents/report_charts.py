@@ -58,7 +58,7 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
         axis.set_title(title)
-        axis.legend(loc="center")
+        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
         return chart(figure, title, "Seen at right angles to the path's plane")
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder
+from surgisoft.cli.files import check_folder, write_text
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
@@ -164,7 +164,7 @@ def _with_time_left(report: Callable) -> Callable[[float, float, str], None]:
 def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
     """Write everything that follows from the rows, and say what came out."""
     from surgisoft.experiments.film import film
-    from surgisoft.experiments.page import experiment_page, shown_episodes, verdict
+    from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
     from surgisoft.experiments.pictures import write_pictures
     from surgisoft.experiments.results import drop_logs, sum_up, write_tables
     from surgisoft.report import write_page
@@ -182,8 +182,10 @@ def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
     drop_logs(results)
     if replays:
         files += _replays(results)
-    print(verdict(results))
-    return files
+    text = markdown(results)
+    write_text(output / "summary.md", text)
+    print(text)
+    return [*files, output / "summary.md"]
 
 
 def _replays(results) -> list[Path]:

@@ -131,14 +131,9 @@ def _facts(results: Results) -> list[tuple[str, str]]:
 
 
 def _table(results: Results) -> Section:
-    known = [name for name in COLUMNS if name in results.settings[0].overall]
     if len(results.settings) <= SHOWN:
-        turned = [
-            (COLUMNS[name], *(cell(s.overall[name], name in RATES) for s in results.settings))
-            for name in known
-        ]
-        header = ["mean [95 % interval]", *(setting.label for setting in results.settings)]
-        return Section("Results", [Table(header, turned)])
+        return Section("Results", [Table(*turned_table(results))])
+    known = [name for name in COLUMNS if name in results.settings[0].overall]
     header = ["setting", "episodes", *(COLUMNS[name] for name in known)]
     rows = [
         (
@@ -149,6 +144,24 @@ def _table(results: Results) -> Section:
         for setting in results.settings
     ]
     return Section("Results", [Table(header, rows)])
+
+
+def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Header and rows of the main table, a column for each setting."""
+    known = [name for name in COLUMNS if name in results.settings[0].overall]
+    rows = [
+        (COLUMNS[name], *(cell(s.overall[name], name in RATES) for s in results.settings))
+        for name in known
+    ]
+    return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows
+
+
+def markdown(results: Results) -> str:
+    """Verdict and main table for a text file."""
+    header, rows = turned_table(results)
+    lines = [header, ["---"] * len(header), *rows]
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return f"{verdict(results)}\n\n{table}\n"
 
 
 def _outcomes(results: Results) -> Section:

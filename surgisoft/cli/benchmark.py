@@ -135,3 +135,50 @@ def hidden_effect(
     if output:
         write_text(output, text)
     print(text)
+
+
+@benchmark.command()
+def control(
+    runs: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Training runs as TASK-seed-N: taken as they are, trained where missing.",
+        ),
+    ] = Path("runs/benchmark-control"),
+    tasks: Annotated[
+        str | None, typer.Option(help="Tasks, such as track_circle,keyhole; default: all.")
+    ] = None,
+    seeds: Annotated[str, typer.Option(help="Seeds of the training runs.")] = "1,2,3",
+    episodes: Annotated[int, typer.Option(min=2, help="Episodes in simulation.")] = 100,
+    rig_episodes: Annotated[int, typer.Option(min=2, help="Episodes on the rig.")] = 20,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
+    ] = None,
+) -> None:
+    """Learned beside scripted beside random on every task, in simulation and on the rig."""
+    import torch
+
+    from surgisoft.errors import InputError
+    from surgisoft.studies.control import TASKS, ControlConfig, run
+    from surgisoft.studies.control_table import markdown
+
+    check_folder(runs)
+    try:
+        numbers = tuple(int(word) for word in seeds.split(","))
+    except ValueError:
+        raise InputError(f"--seeds '{seeds}': expected whole numbers such as 1,2,3") from None
+    chosen = tuple(tasks.split(",")) if tasks else TASKS
+    config = ControlConfig(chosen, numbers, episodes, rig_episodes)
+    torch.set_num_threads(1)
+    with progress("control") as report:
+        results = run(config, runs, report)
+    command = f"surgisoft benchmark control --seeds {seeds}"
+    command += f" --tasks {tasks}" if tasks else ""
+    command += f" --episodes {episodes} --rig-episodes {rig_episodes}"
+    today = datetime.date.today().isoformat()
+    text = f"# Control results\n\nPrinted by `{command}` on {today}.\n\n"
+    text += markdown(results, config)
+    if output:
+        write_text(output, text)
+    print(text)

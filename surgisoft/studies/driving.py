@@ -130,7 +130,9 @@ def _rows(folder: Path) -> list[dict]:
 
 
 def _finished(folder: Path, plan: Plan) -> bool:
+    """Whether all that was planned is done; a run that was cut off before its first turn is not."""
     file = folder / "metrics.jsonl"
     if not file.is_file() or not file.read_text().strip():
         return False
-    return _rows(folder)[-1]["steps"] >= plan.steps
+    last = _rows(folder)[-1]
+    return plan.share(last["steps"], last["wall_s"]) >= 1.0

@@ -53,13 +53,13 @@ def amend(
     from surgisoft.diagnosis.amend import amend as amend_model
     from surgisoft.measurement.histories import outside_range
     from surgisoft.measurement.recording import load_recordings
-    from surgisoft.surrogate.checkpoint import load_model, save_model
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model, save_model
     from surgisoft.surrogate.effects import named_effect
 
     claim_other_folder(output, model, force)
     check_free(json_file, "error_mm")
     check_folder(report)
-    arm = load_model(model)
+    arm, known = load_model(model), load_known_error(model)
     names = [named_effect(given) for given in effects]
     measured = load_recordings(data, on_warning=_warn)
     torch.set_num_threads(1)
@@ -79,7 +79,9 @@ def amend(
             "amended_from": model.name,
             "recordings": [recording.name for recording in measured],
         }
-        save_model(result.model, output, account, force)
+        # A network that was re-tuned is off elsewhere.
+        kept = None if account["network_retuned"] else known
+        save_model(result.model, output, account, force, kept)
     if json_file:
         write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
     if report:

@@ -47,7 +47,7 @@ def improve(
     from surgisoft.diagnosis.improve import improve as improve_model
     from surgisoft.measurement.histories import outside_range
     from surgisoft.measurement.recording import load_recordings
-    from surgisoft.surrogate.checkpoint import load_model, save_model
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model, save_model
     from surgisoft.surrogate.effects import register_effect_file
 
     claim_other_folder(output, model, force)
@@ -55,7 +55,7 @@ def improve(
     check_folder(report)
     for path in effect_files or []:
         register_effect_file(path)
-    arm = load_model(model)
+    arm, known = load_model(model), load_known_error(model)
     measured = load_recordings(
         recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
     )
@@ -69,14 +69,16 @@ def improve(
             done.append(each)
             tell(len(done), most + 2, each.step or each.verdict)
 
-        result = improve_model(arm, measured, most, after)
+        result = improve_model(arm, measured, most, after, known)
     _show(result)
     if result.claimed:
         account = result.to_json() | {
             "amended_from": model.name,
             "recordings": [recording.name for recording in measured],
         }
-        save_model(result.model, output, account, force)
+        # A network that was re-tuned is off elsewhere.
+        kept = None if account["network_retuned"] else known
+        save_model(result.model, output, account, force, kept)
     if json_file:
         write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
     if report:

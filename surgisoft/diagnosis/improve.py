@@ -19,6 +19,7 @@ from surgisoft.diagnosis.refine_network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
 from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
 MOST_EFFECTS = 6
@@ -104,8 +105,12 @@ def improve(
     recordings: list[Recording],
     most_effects: int = MOST_EFFECTS,
     progress: Progress | None = None,
+    reference: list[Recording] | KnownError | None = None,
 ) -> Improvement:
-    """Add effect after effect to a model, until no gate lets another through."""
+    """Add effect after effect to a model, until no gate lets another through.
+
+    reference: as for `diagnose`.
+    """
     if most_effects < 1:
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
@@ -120,7 +125,7 @@ def improve(
 
     going = True
     while going and len(added) < most_effects:
-        found = diagnose(models[-1], recordings)
+        found = diagnose(models[-1], recordings, reference=reference)
         error = fall_of(problem, problem.with_model(models[-1])).after
         said = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]

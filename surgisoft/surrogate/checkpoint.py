@@ -107,14 +107,18 @@ def save_model(
         raise
 
 
+def _place(folder: str | Path) -> Path:
+    """A model's folder; that of the embedded arm for its name."""
+    folder = Path(folder)
+    return DEFAULT_FOLDER if str(folder) == DEFAULT and not folder.exists() else folder
+
+
 def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmModel:
     """The model in a folder, ready to evaluate; bit-equal to what was saved.
 
     `default`, where there is no such folder, is the arm that comes with the package.
     """
-    folder = Path(folder)
-    if str(folder) == DEFAULT and not folder.exists():
-        folder = DEFAULT_FOLDER
+    folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
             f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
@@ -159,7 +163,7 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
 def load_known_error(folder: str | Path) -> KnownError | None:
     """Where the model in a folder is known to be off; None where that was not kept."""
     try:
-        return KnownError.load(Path(folder))
+        return KnownError.load(_place(folder))
     except Exception as error:
         raise InputError(
             f"{folder}: damaged {KNOWN_ERROR} ({type(error).__name__}: {str(error)[:120]}); "

@@ -25,7 +25,7 @@ def recited(monkeypatch):
 
     def recite(*answers: Diagnosis) -> None:
         left = iter(answers)
-        monkeypatch.setattr(loop, "diagnose", lambda model, recordings: next(left))
+        monkeypatch.setattr(loop, "diagnose", lambda model, recordings, reference: next(left))
 
     return recite
 

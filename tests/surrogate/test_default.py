@@ -11,7 +11,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.checkpoint import load_known_error, load_model
 from surgisoft.surrogate.default import default_arm
 
 
@@ -45,3 +45,11 @@ def test_the_word_default_opens_it(tmp_path, monkeypatch):
     (tmp_path / "default").mkdir()
     with pytest.raises(InputError, match="no arm model there"):
         load_model("default")
+
+
+def test_where_its_network_is_off_comes_with_it():
+    """The residual on rows of its fit, as large as what it was validated to."""
+    known, model = load_known_error("default"), default_arm()
+    size = known.residual_mm.square().sum(-1).mean().sqrt().item()
+    assert 0.03 < size < 1.5 * model.validation["rmse_mm"]
+    assert known.actuation.shape[1] == model.spec.chambers

@@ -211,9 +211,11 @@ def error_over_time(rest: Residuals, title: str = ""):
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(11, 3.8), layout="constrained", width_ratios=(3, 1)
     )
-    left.plot(error[:, -1], c=PREDICTED, lw=0.6, label="tip")
-    seen = np.maximum((~np.isnan(error)).sum(axis=1), 1)
-    left.plot(np.nansum(error, axis=1) / seen, c=MEASURED, lw=0.6, label="mean of the key points")
+    # Rows that lack a key point are left out: a mean over the others jumps to the base's error.
+    whole = np.flatnonzero(~np.isnan(error).any(axis=1))
+    left.plot(whole, error[whole, -1], c=PREDICTED, lw=0.6, label="tip")
+    mean = error[whole].mean(axis=1)
+    left.plot(whole, mean, c=MEASURED, lw=0.6, label="mean of the key points")
     for edge in np.flatnonzero(np.diff(rest.run)):
         left.axvline(edge + 0.5, c="#bbbbbb", lw=0.6)
     left.set_xlabel("row (runs are divided by lines)")

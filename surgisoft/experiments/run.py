@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -150,20 +151,32 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
     """Play the blocks in processes of their own; each block as it is done."""
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures.process import BrokenProcessPool
 
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ProcessPoolExecutor(processes, context, initializer=_begin_worker)
     try:
         waiting = {pool.submit(_play, spec, folder, job): job for job in left}
         for future in as_completed(waiting):
             future.result()
             yield waiting[future]
+    except BrokenProcessPool:
+        raise InputError(
+            f"a process of {processes} was ended from outside, memory may be short; go on with "
+            "--resume and fewer --processes"
+        ) from None
     except BaseException:
         for process in list((pool._processes or {}).values()):
             process.terminate()
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """One thread; Ctrl-C is for the process that asked, which ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
 
 
 @contextlib.contextmanager

@@ -27,6 +27,7 @@ from surgisoft.measurement.recording import Recording
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.studies.driving import cost, plan_of, played, trained
 from surgisoft.studies.hidden_effect_bench import Bench
+from surgisoft.studies.hidden_effect_rates import by_rate
 from surgisoft.studies.kept import Kept, Meter, Report, model_digest
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.default import default_arm
@@ -115,6 +116,8 @@ class Outcome:
     """RMS distance of a key point on the judging recording: before, after, oracle, floor."""
     falls: dict[str, dict]
     """after, oracle -> `Fall` from before."""
+    rates: tuple[dict, ...]
+    """The models by the rate of the actuation, see `by_rate`."""
     driven: dict[str, dict]
     """MODEL/DRIVER/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
     training: dict[str, dict]
@@ -141,6 +144,10 @@ class Study:
         oracle = self._oracle(case, before, bench, tell)
         models = {"before": before, "after": after["model"] or before, "oracle": oracle}
         judged = self._judged(name, models, bench)
+        about = {key: model_digest(folder) for key, folder in models.items()} | bench.about
+        rates = self.kept.values(
+            f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
+        )
         driven, training = self._driven(name, models, hidden, meter)
         return Outcome(
             case=name,
@@ -149,6 +156,7 @@ class Study:
             amended=tuple(found["effects"] if after["model"] else ()),
             parameters=tuple(after["parameters"]),
             claim=after["claim"],
+            rates=tuple(rates),
             driven=driven,
             training=training,
             **judged,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from surgisoft.diagnosis.refine_intervals import values_text
 from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.studies.hidden_effect import CASES, MODELS, SIGHTS, TASK, Outcome, StudyConfig
@@ -23,7 +24,8 @@ def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
     parts.append("## The policy")
     for sight in SIGHTS:
         parts += [f"On the rig, {WORDS[sight]}.", _driven(outcomes, sight)]
-    parts += ["### What retraining brought", "\n".join(_brought(outcomes)), _costs(outcomes)]
+    parts += ["### What retraining brought", "\n".join(_brought(outcomes)), *_why(outcomes)]
+    parts.append(_costs(outcomes))
     return "\n\n".join(parts) + "\n"
 
 
@@ -94,19 +96,12 @@ def _said(outcomes: list[Outcome]) -> list[str]:
                 lines.append("- still ambiguous: the first one is put in")
         lines.append(f"- amend: {o.claim}")
         for p in o.parameters:
-            lines.append(
-                f"- {p['effect']} {p['name']}: {_plain(p['value'])} {p['unit']} "
-                f"({_plain(p['low'])} to {_plain(p['high'])})"
-            )
+            low, high = (values_text(end) for end in p["ci95"])
+            unit = f" {p['unit']}" if p["unit"] else ""
+            value = values_text(p["value"])
+            lines.append(f"- {p['effect']} {p['name']}: {value}{unit} ({low} to {high})")
         answer.append("\n".join([lines[0], "", *lines[1:]]))
     return answer
-
-
-def _plain(value) -> str:
-    """A number, or a list of them that may be nested, with three digits."""
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_plain(each) for each in value) + "]"
-    return f"{value:.3g}"
 
 
 def _driven(outcomes: list[Outcome], sight: str) -> str:
@@ -150,6 +145,30 @@ def _brought(outcomes: list[Outcome]) -> list[str]:
                 f"amended model {what} ({before['mean']:.3f} to {after['mean']:.3f} mm)"
             )
     return lines
+
+
+def _why(outcomes: list[Outcome]) -> list[str]:
+    """Where a driver got worse: whether the arm trails the models, by the rate of actuation."""
+    answer = []
+    for o in outcomes:
+        before, after = (o.driven[f"{key}/scripted/{SIGHTS[0]}"] for key in ("before", "after"))
+        if after["low"] <= before["high"]:
+            continue
+        lines = [
+            f"**Why {o.case} gets worse.** By how much the arm trails the model (negative: the "
+            "model trails the arm), and the model's error, on the judging recording:",
+            "",
+            "| fastest chamber, kPa/s | rows | " + " | ".join(f"{key}" for key in MODELS) + " |",
+            "|---|---|" + "---|" * len(MODELS),
+        ]
+        for band in o.rates:
+            cells = [
+                f"{band[key]['trails_s']:+.3f} s, {band[key]['rmse_mm']:.3f} mm" for key in MODELS
+            ]
+            span = f"{band['low']:g} to {band['high']:g}"
+            lines.append(f"| {span} | {band['rows']} | " + " | ".join(cells) + " |")
+        answer.append("\n".join(lines))
+    return answer
 
 
 def _costs(outcomes: list[Outcome]) -> str:

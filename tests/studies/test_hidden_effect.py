@@ -13,6 +13,7 @@ from surgisoft.measurement.rig import VirtualRig
 from surgisoft.studies import hidden_effect
 from surgisoft.studies.hidden_effect import MODELS, Outcome, StudyConfig, run
 from surgisoft.studies.hidden_effect_bench import Bench
+from surgisoft.studies.hidden_effect_rates import trails_s
 from surgisoft.studies.hidden_effect_table import draw, markdown
 from surgisoft.studies.kept import Kept, Meter, digest, model_digest
 from surgisoft.surrogate.checkpoint import save_model
@@ -123,6 +124,17 @@ def test_a_study_that_was_done_is_not_done_again(payload, monkeypatch):
     assert run(["payload"], SMALL, folder, nothing) == [outcome]
 
 
+def test_a_trailing_arm_is_told_from_one_that_runs_ahead():
+    t = np.linspace(0.0, 6.0, 600)
+    points = np.stack([np.sin(t), np.cos(t), 0 * t], 1)[:, None]
+    velocity = np.stack([np.cos(t), -np.sin(t), 0 * t], 1)[:, None]
+    for shift in (0.05, -0.02):
+        later = np.stack([np.sin(t - shift), np.cos(t - shift), 0 * t], 1)[:, None]
+        residual = later - points
+        residual[5] = np.nan
+        assert trails_s(residual, velocity) == pytest.approx(shift, rel=1e-3)
+
+
 def _summary(mean, half):
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
@@ -139,11 +151,14 @@ def _outcome(name: str, after: float, kind: str = "identified") -> Outcome:
     verdict = {"kind": kind, "effects": [name], "sentence": f"{name} is missing"}
     said = {"verdict": verdict, "ranking": [{"confidence": 0.97}]}
     plan = {"name": "steps", "minutes": 5, "separates": [["creep", "drift"]]}
+    known = {"effect": name, "name": "tau_s", "value": 0.156, "unit": "s", "ci95": [0.14, 0.173]}
+    band = {"low": 1, "high": 3, "rows": 9}
+    band |= {key: {"trails_s": 0.1, "rmse_mm": 0.2} for key in MODELS}
     fall = {"fall": 0.3, "ci95": [0.2, 0.4]}
     return Outcome(
-        name, (said, said), plan, (name,), (), "error 0.5 to 0.2 mm",
+        name, (said, said), plan, (name,), (known,), "error 0.5 to 0.2 mm",
         {"before": 0.5, "after": 0.2, "oracle": 0.1, "floor": 0.07},
-        {"after": fall, "oracle": fall}, driven,
+        {"after": fall, "oracle": fall}, (band,), driven,
         {key: {"steps": 10, "wall_s": 4.0, "cpu_s": 2.0} for key in MODELS},
     )  # fmt: skip
 
@@ -157,6 +172,10 @@ def test_the_tables_tell_help_from_chance_and_harm():
     assert "payload, cameras: retraining on the amended model does not help beyond chance" in text
     assert "line_lag, cameras: retraining on the amended model harms: 50 % more error" in text
     assert "took 2 s of processor (4 s of wall time" in text
+    assert "**Why line_lag gets worse.**" in text
+    assert "Why payload" not in text
+    assert "| 1 to 3 | 9 | +0.100 s, 0.200 mm |" in text
+    assert "- creep tau_s: 0.156 s (0.14 to 0.173)" in text
     assert "still ambiguous" not in text
     assert "still ambiguous" in markdown([_outcome("creep", 0.5, "ambiguous")], StudyConfig())
 

@@ -105,7 +105,7 @@ def run(config: ControlConfig, folder: Path, report: Report) -> Results:
         place = folder / f"{task}-seed-{seed}"
         one = _learned(place, task, seed, meter.stage(100, f"train {place.name}"))
         runs.append(one)
-        drivers.append((task, f"learned, seed {seed}", str(place)))
+        drivers.append((task, f"learned, seed {one.seed}", str(place)))
     paper = _paper(config, folder, meter) if config.rate_steps else None
     drivers += [(task, name, name) for task in config.tasks for name in ("scripted", "random")]
     kept, shown = Kept(folder / "results"), []

@@ -9,6 +9,12 @@ from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.studies.hidden_effect import CASES, MODELS, SIGHTS, TASK, Outcome, StudyConfig
 
+FORMS = {
+    "line_lag": "The rig's tube has quadratic flow, whose lag grows with the rate; the model's lag "
+    "is of first order, the same at every rate, and fitted best where the error is largest: in "
+    "quick motion. The circle is slow motion, where it is too long."
+}
+"""What is known of the two forms of an effect, the rig's and the model's."""
 COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}
 """Of the three models, in every picture."""
 WORDS = {
@@ -168,6 +174,8 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             span = f"{band['low']:g} to {band['high']:g}"
             lines.append(f"| {span} | {band['rows']} | " + " | ".join(cells) + " |")
         answer.append("\n".join(lines))
+        if o.case in FORMS:
+            answer.append(FORMS[o.case])
     return answer
 
 
@@ -198,11 +206,18 @@ def _draw_models(outcomes: list[Outcome], folder: Path) -> Path:
         figure, axis = plt.subplots(figsize=(6.4, 3.4))
         for k, key in enumerate(MODELS):
             heights = [o.model_mm[key] for o in outcomes]
-            _bars(axis, k, heights, None, key)
+            ends = None
+            if key in outcomes[0].falls:
+                falls = [(o.falls[key]["fall"], *o.falls[key]["ci95"]) for o in outcomes]
+                ends = [
+                    [high - fall for fall, _, high in falls],
+                    [fall - low for fall, low, _ in falls],
+                ]
+            _bars(axis, k, heights, ends, key)
         for place, o in enumerate(outcomes):
             axis.plot([place - 0.42, place + 0.42], [o.model_mm["floor"]] * 2, c=MUTED, ls="--")
         axis.plot([], [], c=MUTED, ls="--", label="noise floor")
-        axis.set_ylabel("model error, key points [mm]")
+        axis.set_ylabel("model error [mm]\n(bars: 95 % of the fall)")
         axis.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.16))
         _name(axis, outcomes)
         return _saved(figure, folder / "hidden_model.png")
@@ -226,7 +241,8 @@ def _draw_tracking(outcomes: list[Outcome], tracking: dict, folder: Path) -> Pat
             axis.set_title("model alone" if sight == "blind" else "with cameras")
             axis.set_ylabel("tracking error on the rig [mm]")
             _name(axis, outcomes)
-        axes[0].legend()
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=4, loc="outside upper center")
         return _saved(figure, folder / "hidden_tracking.png")
 
 

@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
+import multiprocessing.connection
+import os
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,7 +153,6 @@ def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
 
 def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
     """Play the blocks in processes of their own; each block as it is done."""
-    import multiprocessing
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from concurrent.futures.process import BrokenProcessPool
 
@@ -174,9 +177,16 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
 
 
 def _begin_worker() -> None:
-    """One thread; Ctrl-C is for the process that asked, which ends the others."""
+    """One thread; Ctrl-C is for the process that asked, and this one ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
+    asker = multiprocessing.parent_process().sentinel
+
+    def end_with_it() -> None:
+        multiprocessing.connection.wait([asker])
+        os._exit(1)
+
+    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -225,10 +225,14 @@ def answer(found: Findings) -> Diagnosis:
 
 
 def _order(found: Findings) -> list[Standing]:
-    """All effects, the named ones first."""
-    names = [standing.effect for standing in found.named]
-    named = {standing.effect: standing for standing in found.first}
-    return [named[n] for n in names] + [s for s in found.first if s.effect not in names]
+    """All effects, the named ones first.
+
+    One that is plausible only on top of another stands as it does there.
+    """
+    alone = {standing.effect: standing for standing in found.first}
+    named = [alone.get(standing.effect, standing) for standing in found.named]
+    names = [standing.effect for standing in named]
+    return named + [s for s in found.first if s.effect not in names]
 
 
 def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:

@@ -96,3 +96,17 @@ def test_too_little_data_is_told(tmp_path, capsys):
     error = capsys.readouterr().err
     assert "blocks of time" in error
     assert len(error.strip().splitlines()) == 1
+
+
+def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
+    """Named second, absent from the effects alone: it stands as it does on top of the first."""
+    from surgisoft.diagnosis import diagnose as module
+    from surgisoft.diagnosis.candidates import candidates
+    from surgisoft.diagnosis.problem import pose
+
+    problem = pose(default_arm(), [recorded([("creep", 1.0)], points=3000)], part="open")
+    found = module.find(problem, candidates(problem, ["creep", "payload"]), lambda text: None)
+    second = next(s for s in found.first if s.effect == "payload")
+    first = [s for s in found.first if s.effect != "payload"]
+    both = module.replace(found, first=first, named=[*found.named, second])
+    assert [row.effect for row in module.answer(both).ranking] == ["creep", "payload"]

@@ -105,8 +105,8 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
     from surgisoft.diagnosis.problem import pose
 
     problem = pose(default_arm(), [recorded([("creep", 1.0)], points=3000)], part="open")
-    found = module.find(problem, candidates(problem, ["creep", "payload"]), lambda text: None)
-    second = next(s for s in found.first if s.effect == "payload")
-    first = [s for s in found.first if s.effect != "payload"]
+    found = module.find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
+    second = next(s for s in found.first if s.effect == "misalignment")
+    first = [s for s in found.first if s.effect != "misalignment"]
     both = module.replace(found, first=first, named=[*found.named, second])
-    assert [row.effect for row in module.answer(both).ranking] == ["creep", "payload"]
+    assert [row.effect for row in module.answer(both).ranking] == ["creep", "misalignment"]

@@ -72,7 +72,8 @@ class EpisodeReferee:
         """The task's world has surroundings, see `has_referee`."""
         around = task.world.surroundings
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
-        self.referee, self.beam_mm = Referee(around.geometry.bodies), around.beam_mm
+        self.referee = Referee(around.geometry.bodies)
+        self.beam_mm = around.beam_mm if LASER in task.world.arms else None
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
 
     def __call__(self, now: Instant) -> None:

@@ -6,7 +6,7 @@ from surgisoft.errors import InputError
 from surgisoft.studies import control
 from surgisoft.studies.control import ControlConfig, Played, Results, Trained, run
 from surgisoft.studies.control_table import markdown
-from surgisoft.studies.driving import Cost, cost, plan_of, trained
+from surgisoft.studies.driving import Cost, cost, plan_of, played, trained
 
 TINY = ControlConfig(("track_circle",), (4,), 2, 1, rate_steps=0)
 
@@ -49,6 +49,14 @@ def test_another_plan_is_not_taken_for_the_wanted_one(folder):
         trained(place, plan_of("track_circle", 5, 3072), nothing)
     with pytest.raises(InputError, match="its steps: 3072, expected 6144"):
         trained(place, plan_of("track_circle", 4, 6144), nothing)
+
+
+def test_every_task_has_numbers_and_those_with_bodies_a_referee():
+    """A task whose bodies meet no beam, and one with nothing around."""
+    keyhole, circle = (played(name, "scripted", 1, 0) for name in ("keyhole", "track_circle"))
+    assert keyhole["collided"]["mean"] == 0.0
+    assert 0.0 < keyhole["clearance_mm"]["mean"] < 20.0
+    assert "collided" not in circle
 
 
 def test_cost_is_that_of_the_last_turn(folder):

@@ -170,6 +170,7 @@ def test_pixels_are_evenly_spaced_on_the_picture_plane():
 
 
 def test_twenty_pictures_a_second():
+    """Of one core: processor time, which a busy machine does not stretch."""
     camera = Camera()
     renderer = Renderer([Body("organ", "organ", lumpy(5))], camera)
     pose = frames.look_at(np.array([0, 0, 90.0]), np.zeros(3))
@@ -177,7 +178,7 @@ def test_twenty_pictures_a_second():
     beam = np.array([[20.0, 0, 50], [0, 0, 40]])
     best = math.inf
     for _ in range(8):
-        start = time.perf_counter()
+        start = time.process_time()
         renderer.image(pose, arms, beam_mm=beam)
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     assert best < 1 / 20

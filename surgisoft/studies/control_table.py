@@ -111,7 +111,7 @@ def _met(played: Played, goal: Goal) -> str:
     value = (played.numbers.get(goal.number) or {}).get("mean")
     if value is None:
         return "-"
-    text = f"{value:.1%}" if goal.number in RATES else f"{value:.4f}"
+    text = f"{value:.1%}" if goal.number in RATES else f"{value:.3g}"
     good = value >= goal.limit if goal.at_least else value <= goal.limit
     return f"**{text}**" if good else text
 

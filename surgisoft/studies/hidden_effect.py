@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from surgisoft.agents.on_rig import RigConfig
 from surgisoft.diagnosis.amend import EVERY_ROW, amend, fall_of
 from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
 from surgisoft.diagnosis.experiments import ON_THE_RIG
@@ -25,28 +24,25 @@ from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recording import Recording
 from surgisoft.measurement.rig import VirtualRig
-from surgisoft.studies.driving import cost, plan_of, played, trained
 from surgisoft.studies.hidden_effect_bench import Bench
+from surgisoft.studies.hidden_effect_drivers import PLAY, TRAIN, Drivers
 from surgisoft.studies.hidden_effect_rates import by_rate
 from surgisoft.studies.kept import Kept, Meter, Report, model_digest
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.default import default_arm
 from surgisoft.surrogate.fit import FitConfig, fit
-from surgisoft.tasks.configs import config_table, with_fields
 
-TASK = "track_circle"
-"""What the policies learn."""
 DEFAULT_SPECIMEN = 0
 """The specimen that the default arm model was fitted on."""
 ORACLE_TAKES = 3
 """Recordings that the oracle is fitted on; the diagnosis has one."""
-TAKE, JUDGING_TAKE, FURTHER_TAKE = 1, 9, 20
-"""Numbers of the recording that is diagnosed, of the one that judges, of the next experiment."""
+TAKE, JUDGING_TAKE, FURTHER_TAKE, PACED_TAKE = 1, 9, 20, 33
+"""Numbers of the recordings: diagnosed, judging, next experiment, circles at the task's pace."""
 MODELS = ("before", "after", "oracle")
 """The model without the effect, the one amended by the diagnosis, the one told the name."""
-SIGHTS = ("blind", "cameras")
-"""Without the cameras' key points, where the model alone says where the body is, and with them."""
-STAGES = 3 * 15 + 3 * 100 + 14 * 8
+LASTING = ("learned", "scripted")
+"""Drivers that know the arm by a model."""
+STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
 """Length of one effect, by the meter."""
 
 
@@ -118,6 +114,8 @@ class Outcome:
     """after, oracle -> `Fall` from before."""
     rates: tuple[dict, ...]
     """The models by the rate of the actuation, see `by_rate`."""
+    paced: dict | None
+    """Where drivers got worse: the same amended on circles at the task's pace instead."""
     driven: dict[str, dict]
     """MODEL/DRIVER/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
     training: dict[str, dict]
@@ -148,7 +146,13 @@ class Study:
         rates = self.kept.values(
             f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
         )
-        driven, training = self._driven(name, models, hidden, meter)
+        drivers = Drivers(
+            self.kept, config.specimen, hidden, config.steps, config.seed, config.episodes
+        )
+        driven, training = self._driven(name, models, drivers, meter)
+        paced = None
+        if worse(driven):
+            paced = self._paced(name, before, found["effects"], bench, drivers, meter)
         return Outcome(
             case=name,
             verdicts=tuple(found["verdicts"]),
@@ -157,6 +161,7 @@ class Study:
             parameters=tuple(after["parameters"]),
             claim=after["claim"],
             rates=tuple(rates),
+            paced=paced,
             driven=driven,
             training=training,
             **judged,
@@ -281,55 +286,44 @@ class Study:
 
         return self.kept.values(f"errors/{name}", about, make)
 
-    def _driven(self, name: str, models: dict[str, Path], hidden, meter: Meter):
-        """Policies trained on each model; they and the other drivers played on the rig."""
-        config, driven, training = self.config, {}, {}
+    def _driven(self, name: str, models: dict[str, Path], drivers: Drivers, meter: Meter):
+        """MODEL/DRIVER/SIGHT -> summary, MODEL -> cost of its policy."""
+        driven, training = {}, {}
         for key, arm in models.items():
-            tell = meter.stage(100, f"{name}: policy on the model {key}")
-            plan = plan_of(TASK, config.seed, config.steps, arm)
-            told = _told(plan, arm)
-            run = trained(self.kept.place(f"policies/{TASK}", told), plan, tell)
-            training[key] = asdict(cost(run))
-            drivers = {"learned": str(run.path), "scripted": "scripted"}
-            if key == "before":
-                drivers["random"] = "random"
-            for sight in SIGHTS:
-                rig = RigConfig(config.specimen, hidden, cameras=sight == "cameras")
-                for driver, opened in drivers.items():
-                    tell = meter.stage(8, f"{name}: {driver} on the rig, {sight}, model {key}")
-                    driven[f"{key}/{driver}/{sight}"] = self._played(
-                        f"{name}-{driver}", opened, told, arm, rig, tell
-                    )
+            names = ("learned", "scripted", "random") if key == "before" else LASTING
+            found, training[key] = drivers.on_model(f"{name}, model {key}", arm, meter, names)
+            driven |= {f"{key}/{which}": summary for which, summary in found.items()}
         return driven, training
 
-    def _played(self, name: str, driver: str, told: dict, arm: Path, rig: RigConfig, tell) -> dict:
-        """Summary of the mean error of each episode on the rig, mm."""
-        config = self.config
-        about = {
-            "plan": told,
-            "learned": driver not in ("scripted", "random"),
-            "rig": config_table(rig),
-            "episodes": config.episodes,
-            "seed": config.seed,
+    def _paced(self, name: str, before: Path, effects, bench: Bench, drivers: Drivers, meter):
+        """The same effects amended on circles at the task's own pace, where that is called for."""
+        about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
+        folder = self.kept.place(f"models/{name}-paced", about)
+        seen = bench.circles(PACED_TAKE)
+
+        def make() -> dict:
+            result = amend(load_model(before), [seen], effects)
+            save_model(result.model, folder, result.to_json(), force=True)
+            first = pose(load_model(before), [bench.mixed(JUDGING_TAKE)], EVERY_ROW, part="all")
+            return result.to_json() | {
+                "mixed_mm": fall_of(first, first.with_model(result.model)).after
+            }
+
+        told = self.kept.values(f"amendments/{name}-paced", about, make)
+        beside = Meter(lambda done, total, note: meter.stage(0, note), 1.0)
+        found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
+        return {
+            "claim": told["sentence"],
+            "parameters": told["parameters"],
+            "mixed_mm": told["mixed_mm"],
+            "driven": found,
         }
-        return self.kept.values(
-            f"driven/{name}",
-            about,
-            lambda: played(TASK, driver, config.episodes, config.seed, rig, arm, tell)[
-                "error_mean_mm"
-            ],
-        )
 
 
-def _told(plan, arm: Path) -> dict:
-    """What a policy depends on; the arm by its content, not by its place."""
-    return {
-        "task": plan.task,
-        "config": config_table(with_fields(plan.task_config, arm=model_digest(arm))),
-        "hyper_parameters": asdict(plan.preset),
-        "steps": plan.steps,
-        "seed": plan.seed,
-    }
+def worse(driven: dict[str, dict]) -> bool:
+    """Whether the script does worse with the amended model, beyond chance, without cameras."""
+    before, after = (driven[f"{key}/scripted/blind"] for key in ("before", "after"))
+    return after["low"] > before["high"]
 
 
 def run(names: list[str], config: StudyConfig, folder: Path, report: Report) -> list[Outcome]:

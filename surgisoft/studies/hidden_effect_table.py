@@ -7,7 +7,8 @@ from pathlib import Path
 from surgisoft.diagnosis.refine_intervals import values_text
 from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
-from surgisoft.studies.hidden_effect import CASES, MODELS, SIGHTS, TASK, Outcome, StudyConfig
+from surgisoft.studies.hidden_effect import CASES, MODELS, Outcome, StudyConfig
+from surgisoft.studies.hidden_effect_drivers import SIGHTS, TASK
 
 FORMS = {
     "line_lag": "The rig's tube has quadratic flow, whose lag grows with the rate; the model's lag "
@@ -157,8 +158,7 @@ def _why(outcomes: list[Outcome]) -> list[str]:
     """Where a driver got worse: whether the arm trails the models, by the rate of actuation."""
     answer = []
     for o in outcomes:
-        before, after = (o.driven[f"{key}/scripted/{SIGHTS[0]}"] for key in ("before", "after"))
-        if after["low"] <= before["high"]:
+        if o.paced is None:
             continue
         lines = [
             f"**Why {o.case} gets worse.** By how much the arm trails the model (negative: the "
@@ -176,6 +176,23 @@ def _why(outcomes: list[Outcome]) -> list[str]:
         answer.append("\n".join(lines))
         if o.case in FORMS:
             answer.append(FORMS[o.case])
+        found = o.paced["driven"]
+        cells = [
+            f"{driver} {_interval(found[f'{driver}/{sight}'])} mm {word}"
+            for sight, word in (("blind", "without cameras"), ("cameras", "with them"))
+            for driver in ("learned", "scripted")
+            if f"{driver}/{sight}" in found
+        ]
+        values = ", ".join(
+            f"{p['name']} {values_text(p['value'])} {p['unit']}".strip()
+            for p in o.paced["parameters"]
+        )
+        answer.append(
+            "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
+            f"slow circles instead: {o.paced['claim']} ({values}). On the mixed judging recording, "
+            f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
+            f"on it and script, on the rig: {'; '.join(cells)}."
+        )
     return answer
 
 

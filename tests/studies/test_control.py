@@ -83,7 +83,7 @@ def test_goals_are_bold_where_they_are_reached_and_only_there():
     one = Trained("track_circle", 1, "fast", Cost(4_000_000, 400.0, 200.0), {"error_mm": 0.005})
     results = Results((one,), shown, Cost(1_000_000, 2000.0, 1000.0))
     text = markdown(results, ControlConfig(("track_circle", "circle_ablation")))
-    assert "**0.0050**, 0.0051 | **0.0010** | 30.0000 |" in text
+    assert "**0.005**, 0.0051 | **0.001** | 30 |" in text
     assert "success | >= 0.99 |  | 98.0% | **100.0%** | 0.0% |" in text
     assert "collided | <= 0 |  | **0.0%** | 1.0% | 100.0% |" in text
     # 20 M steps at 1,000 and 20,000 steps a second; half of the latter on two cores.

@@ -10,9 +10,9 @@ from surgisoft.cli import run as run_command
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recording import load_recording
 from surgisoft.measurement.rig import VirtualRig
-from surgisoft.studies import hidden_effect
-from surgisoft.studies.hidden_effect import MODELS, Outcome, StudyConfig, run
-from surgisoft.studies.hidden_effect_bench import Bench
+from surgisoft.studies import hidden_effect, hidden_effect_drivers
+from surgisoft.studies.hidden_effect import MODELS, Outcome, StudyConfig, run, worse
+from surgisoft.studies.hidden_effect_bench import Bench, circles
 from surgisoft.studies.hidden_effect_rates import trails_s
 from surgisoft.studies.hidden_effect_table import draw, markdown
 from surgisoft.studies.kept import Kept, Meter, digest, model_digest
@@ -89,7 +89,7 @@ def payload(tmp_path_factory):
     """The outcome of a payload with policies that hardly learned anything, and its folder."""
     folder = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hidden_effect, "SIGHTS", ("blind",))
+        patch.setattr(hidden_effect_drivers, "SIGHTS", ("blind",))
         patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
         yield run(["payload"], SMALL, folder, nothing)[0], folder
 
@@ -117,11 +117,26 @@ def test_the_script_tracks_the_hidden_payload_better_with_the_amended_model(payl
 
 def test_a_study_that_was_done_is_not_done_again(payload, monkeypatch):
     outcome, folder = payload
-    monkeypatch.setattr(hidden_effect, "SIGHTS", ("blind",))
+    monkeypatch.setattr(hidden_effect_drivers, "SIGHTS", ("blind",))
     monkeypatch.setattr(hidden_effect, "ORACLE_TAKES", 1)
-    for name in ("diagnose", "amend", "fit", "played", "fall_of"):
+    for name in ("diagnose", "amend", "fit", "fall_of"):
         monkeypatch.setattr(hidden_effect, name, lambda *_, name=name: pytest.fail(name))
+    monkeypatch.setattr(hidden_effect_drivers, "played", lambda *_: pytest.fail("played"))
     assert run(["payload"], SMALL, folder, nothing) == [outcome]
+
+
+def test_circles_go_round_at_the_pace_of_the_task():
+    limits = VirtualRig(0).limits
+    protocol = circles(7200, limits, 1)
+    t, p = protocol.t_s.reshape(3, -1), protocol.commands.reshape(3, 240, 3)
+    assert t[0, -1] == pytest.approx(120.0, abs=1.0)
+    late = t[0] >= 20.0
+    np.testing.assert_allclose(p[:, late][:, 40:], p[:, late][:, :-40], atol=1e-9)  # 20 s
+    mean = p[:, late].mean(2)
+    np.testing.assert_allclose(mean, mean[:, :1].repeat(mean.shape[1], 1), atol=1e-9)
+    assert (p >= limits[:, 0]).all()
+    assert (p <= limits[:, 1]).all()
+    assert np.abs(np.diff(p[:, late], axis=1)).max() / 0.5 < 6.0  # kPa/s: slow motion
 
 
 def test_a_trailing_arm_is_told_from_one_that_runs_ahead():
@@ -154,11 +169,13 @@ def _outcome(name: str, after: float, kind: str = "identified") -> Outcome:
     known = {"effect": name, "name": "tau_s", "value": 0.156, "unit": "s", "ci95": [0.14, 0.173]}
     band = {"low": 1, "high": 3, "rows": 9}
     band |= {key: {"trails_s": 0.1, "rmse_mm": 0.2} for key in MODELS}
+    paced = {"claim": "a fall", "parameters": [known], "mixed_mm": 0.31}
+    paced["driven"] = {f"{who}/blind": _summary(0.12, 0.01) for who in ("learned", "scripted")}
     fall = {"fall": 0.3, "ci95": [0.2, 0.4]}
     return Outcome(
         name, (said, said), plan, (name,), (known,), "error 0.5 to 0.2 mm",
         {"before": 0.5, "after": 0.2, "oracle": 0.1, "floor": 0.07},
-        {"after": fall, "oracle": fall}, (band,), driven,
+        {"after": fall, "oracle": fall}, (band,), paced if worse(driven) else None, driven,
         {key: {"steps": 10, "wall_s": 4.0, "cpu_s": 2.0} for key in MODELS},
     )  # fmt: skip
 
@@ -174,6 +191,8 @@ def test_the_tables_tell_help_from_chance_and_harm():
     assert "took 2 s of processor (4 s of wall time" in text
     assert "**Why line_lag gets worse.**" in text
     assert "Why payload" not in text
+    assert "off by 0.310 mm" in text
+    assert "scripted 0.120 (0.110 to 0.130) mm without cameras." in text
     assert "| 1 to 3 | 9 | +0.100 s, 0.200 mm |" in text
     assert "- creep tau_s: 0.156 s (0.14 to 0.173)" in text
     assert "still ambiguous" not in text

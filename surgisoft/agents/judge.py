@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 
 from surgisoft.agents.policies import Driver
+from surgisoft.agents.record import FirstEpisode
 from surgisoft.agents.rollout import rollout
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.episode import EpisodeLog
 
 SEED = 0x5EED
 """Seed of the episodes that choose the best checkpoint; no other evaluation should use it."""
 
 
-def judge(task: Task, driver: Driver, episodes: int) -> dict[str, float]:
+def judge(task: Task, driver: Driver, episodes: int) -> tuple[dict[str, float], EpisodeLog]:
     """What whole episodes without noise bring: `error_mm`, `success`, and means of the rest.
 
     error_mm: mean over steps and episodes; success: share of episodes, absent where a task has
-    none.
+    none. Beside it the log of the first episode.
     """
-    played = rollout(task, driver, episodes, SEED)
+    watch = FirstEpisode(task, "learned", SEED)
+    played = rollout(task, driver, episodes, SEED, watch=watch)
     answer = {}
     for name, trace in played.measures.items():
         if name == "success":
@@ -29,7 +32,7 @@ def judge(task: Task, driver: Driver, episodes: int) -> dict[str, float]:
             answer[name] = played.end(name).nanmean().item()
         else:
             answer[name] = trace.nanmean().item()
-    return answer
+    return answer, watch.log()
 
 
 def better(found: dict[str, float], best: dict[str, float] | None) -> bool:

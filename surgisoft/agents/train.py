@@ -21,8 +21,11 @@ from surgisoft.agents.plan import Plan
 from surgisoft.agents.policy_network import KiloPascals
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run
 from surgisoft.agents.training import Iteration, Training
+from surgisoft.tasks.episode_file import save_episode
 from surgisoft.tasks.registry import make_task
 
+REPLAYS = "replays"
+"""Folder of a run that holds the first episode of each evaluation, for `surgisoft replay`."""
 CHECKPOINT_S = 30.0
 """Longest time between two checkpoints, s; what lies after the last is played again."""
 
@@ -134,7 +137,9 @@ def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:
         ).eval()
         for agent, ppo in training.agents.items()
     }
-    found = judge(training.task, Policies(actors), preset.evaluation_episodes)
+    found, log = judge(training.task, Policies(actors), preset.evaluation_episodes)
+    (run.path / REPLAYS).mkdir(exist_ok=True)
+    save_episode(log, run.path / REPLAYS / f"{training.steps:012d}.npz")
     if better(found, training.best):
         training.best = found
         run.save(

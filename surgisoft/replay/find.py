@@ -7,7 +7,7 @@ import pyarrow.compute as pc
 from surgisoft.errors import InputError
 from surgisoft.replay.recording import SUFFIX, TIME
 
-PLACES = (f"*{SUFFIX}", f"replays/*{SUFFIX}")
+PLACES = (f"*{SUFFIX}", f"replays/*{SUFFIX}", "replays/*.npz")
 """Where a run's folder keeps its replays."""
 MAGIC = b"RRF2"
 """First bytes of a Rerun recording, as rerun-sdk 0.41 writes it."""

@@ -11,6 +11,8 @@ import torch
 
 from surgisoft.agents.run_folder import LAST, RunFolder
 from surgisoft.cli import run as surgisoft
+from surgisoft.replay.find import find_replay
+from surgisoft.tasks.episode_file import load_episode
 
 SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]
 
@@ -32,6 +34,9 @@ def test_trains_and_says_what_stands(tmp_path, capsys):
     rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [row["steps"] for row in rows] == [192, 384, 576]
     assert [*(folder / "tensorboard").glob("events*")]
+    log = load_episode(find_replay(folder))
+    assert (log.task, log.driver) == ("track_circle", "learned")
+    assert len(log.time_s) > 100
     assert surgisoft(["train", "--resume", str(folder)]) == 0
 
 

@@ -161,7 +161,7 @@ def test_a_run_opens_from_its_folder_alone(ablation, tmp_path):
         own = again.world.arms[name].model.state_dict()
         for key, value in arm.model.state_dict().items():
             assert torch.equal(value, own[key])
-    found = judge(again, LearnedPolicy(moved, again), 1)
+    found, _ = judge(again, LearnedPolicy(moved, again), 1)
     assert found == pytest.approx(run.load(BEST)["evaluation"], nan_ok=True)
 
 
@@ -173,8 +173,9 @@ def test_the_best_checkpoint_is_the_best_by_evaluation(run):
     best = run.load(BEST)
     assert best["iteration"] == min(found, key=found.get)
     task = run.task()
-    assert judge(task, LearnedPolicy(run.path, task, "best"), 2)["error_mm"] == min(found.values())
-    assert judge(task, LearnedPolicy(run.path, task, "last"), 2)["error_mm"] == found[4]
+    best, _ = judge(task, LearnedPolicy(run.path, task, "best"), 2)
+    assert best["error_mm"] == min(found.values())
+    assert judge(task, LearnedPolicy(run.path, task, "last"), 2)[0]["error_mm"] == found[4]
 
 
 def test_success_counts_before_error():
@@ -199,7 +200,7 @@ def test_it_learns(tmp_path):
     plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=50_000)
     run = trained(tmp_path / "learns", plan)
     learned = run.load(BEST)["evaluation"]["error_mm"]
-    random = judge(run.task(), Random(), 8)["error_mm"]
+    random = judge(run.task(), Random(), 8)[0]["error_mm"]
     assert random > 10.0
     assert learned < 0.1 * random
 

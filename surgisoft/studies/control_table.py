@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from surgisoft.agents.evaluate import RATES
-from surgisoft.agents.presets import PAPER_STEPS
+from surgisoft.agents.presets import PAPER_STEPS, steps_for
 from surgisoft.studies.control import PLACES, RATE_TASK, ControlConfig, Played, Results
 
 NUMBERS = (
@@ -130,9 +130,17 @@ def _training(results: Results) -> str:
             f"{cost.cpu_s:.0f} | {cost.steps_per_s:,.0f} | {cost.steps / cost.wall_s:,.0f} | "
             f"{best} |"
         )
+    short = [
+        f"{run.task} ({run.cost.steps:,} of {steps_for(run.preset, run.task):,})"
+        for run in results.runs
+        if run.cost.steps < steps_for(run.preset, run.task)
+    ]
+    less = f" Trained for fewer steps than the preset's own: {', '.join(short)}." if short else ""
     return (
-        "\n".join(lines) + "\n\nOne process, one thread. Wall time is that of a machine which did "
-        "other work besides; processor time is what the training itself took."
+        "\n".join(lines)
+        + f"\n\nRuns as they lay in the folder.{less} One process, one thread. Wall time is "
+        "that of a machine which did other work besides; processor time is what the training "
+        "itself took, slower where others use the same caches."
     )
 
 

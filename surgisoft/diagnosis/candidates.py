@@ -8,11 +8,8 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.surrogate.effects import Context, Effect, known_effects
+from surgisoft.surrogate.effects import Context, Effect, free_name, known_effects
 from surgisoft.surrogate.model import ArmModel, context_of
-
-MORE = "_more"
-"""Ending of the name of a second instance of an effect that the model has already."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +38,9 @@ class Candidate:
         return effect
 
 
-def key_of(model: ArmModel, name: str) -> str:
-    """Key under which one more effect of a name goes into a model."""
-    key = name
-    while key in model.effects:
-        key += MORE
-    return key
-
-
 def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
     """The model with one effect more, behind those of its stage; the parts are shared."""
-    effects = {**model.effects, key_of(model, name): effect}
+    effects = {**model.effects, free_name(name, model.effects): effect}
     return ArmModel(model.spec, model.network, effects, model.rest_mm, model.validation)
 
 

@@ -8,8 +8,9 @@ from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.problem import locked_rows, pose
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.default import default_arm
-from surgisoft.surrogate.effects import EFFECTS
+from surgisoft.surrogate.effects import EFFECTS, make_effect
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +79,16 @@ def test_blocks_are_contiguous_stretches_of_one_run(problem):
     assert (np.diff(problem.block) >= 0).all()
     for block in np.unique(problem.block):
         assert len(np.unique(run[problem.block == block])) == 1
+
+
+def test_one_more_of_a_kind_can_be_saved_and_opened(problem, tmp_path):
+    """A second creep has a name that a model's folder knows."""
+    model = problem.model
+    for _ in range(2):
+        model = with_effect(model, "creep", make_effect("creep", model.facts))
+    save_model(model, tmp_path / "arm")
+    assert list(load_model(tmp_path / "arm").effects) == [
+        *problem.model.effects,
+        "creep",
+        "creep#2",
+    ]

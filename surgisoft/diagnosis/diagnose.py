@@ -270,8 +270,6 @@ def statistics(found: Findings) -> dict:
         gap = best.log_gain - runner.log_gain
         margin = float(studentised(gap[None])[0])
         share = float(first_shares(np.stack([-best.log_gain, -runner.log_gain]))[0])
-    reachable = min(found.box.losses.sum(), after.sum())
-    room = max(null.sum() - max(reachable, floor), 1e-9)
     return {
         "before_over_floor": float(np.sqrt(raw / floor)),
         "static_share": float((raw - null.sum()) / max(raw - floor, 1e-9 * raw)),
@@ -284,7 +282,6 @@ def statistics(found: Findings) -> dict:
         "margin": margin,
         "first_share": share,
         "unique": float(found.unique.get(best.effect, 0.0)) if best else 0.0,
-        "explained": float((null.sum() - after.sum()) / room) if found.named else 0.0,
         "explained_above_floor": float((null.sum() - after.sum()) / race.excess(null)),
         "box_share": float((null.sum() - found.box.losses.sum()) / race.excess(null)),
         "box_p": found.box.p_value,

@@ -89,24 +89,6 @@ class Prior:
         fit = float((weight[..., None] * field**2).sum())
         return -0.5 * (fit - field.shape[2] * float(np.log(weight).sum())) + log_size(size)
 
-    def log_gain(
-        self, field: np.ndarray, columns: np.ndarray, spread: np.ndarray, size: float
-    ) -> tuple[float, np.ndarray]:
-        """What columns (S, n, 3, K) with amplitudes of spread (K,) add to the log evidence.
-
-        And the amplitudes (K,) themselves (posterior mean).
-        """
-        weighted = columns * self.weight(size)[..., None, None]
-        count = columns.shape[-1]
-        flat, heavy = columns.reshape(-1, count), weighted.reshape(-1, count)
-        gram = (heavy.T @ flat) * spread[:, None] * spread[None]
-        pull = (heavy.T @ field.reshape(-1)) * spread
-        inner = np.eye(count) + gram
-        factor = linalg.cho_factor(inner)
-        amplitude = linalg.cho_solve(factor, pull)
-        log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
-        return 0.5 * float(pull @ amplitude) - 0.5 * log_det, amplitude * spread
-
 
 def log_size(size: float) -> float:
     """Log prior of the factor on the validated error."""

@@ -50,21 +50,3 @@ def test_evidence_is_the_normal_density(rows):
         density = multivariate_normal(cov=dense(x, d, surrogate, noise, size))
         truth.append(sum(density.logpdf(residual[..., c].reshape(-1)) for c in range(3)))
     assert ours[1] - ours[0] == pytest.approx(truth[1] - truth[0], rel=1e-6)
-
-
-def test_gain_of_columns_is_that_of_a_wider_covariance(rows):
-    """Columns with random amplitudes are a term C B C^T in the covariance of everything."""
-    x, d, rng = rows
-    surrogate, noise = np.array([0.1, 0.2, 0.4]), np.array([0.05, 0.06, 0.07])
-    residual = rng.normal(0, 0.3, (ROWS, POINTS, 3))
-    columns, spread = rng.normal(0, 0.5, (ROWS, POINTS, 3, 2)), np.array([0.7, 1.3])
-    prior = Prior.of(x, d, surrogate, noise)
-    gain, amplitude = prior.log_gain(prior.turned(residual), prior.turned(columns), spread, 1.0)
-    whole = np.kron(np.eye(3), dense(x, d, surrogate, noise, 1.0))
-    flat = residual.transpose(2, 0, 1).reshape(-1)
-    wide = columns.transpose(2, 0, 1, 3).reshape(-1, 2) * spread
-    truth = multivariate_normal(cov=whole + wide @ wide.T).logpdf(flat)
-    truth -= multivariate_normal(cov=whole).logpdf(flat)
-    assert gain == pytest.approx(truth, rel=1e-6)
-    posterior = wide.T @ np.linalg.solve(whole + wide @ wide.T, flat) * spread
-    assert amplitude == pytest.approx(posterior, rel=1e-6)

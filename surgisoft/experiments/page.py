@@ -95,6 +95,8 @@ def verdict(results: Results) -> str:
         low, high = min(shares), max(shares)
         best, least = settings[shares.index(high)].label, settings[shares.index(low)].label
         first = f"Success from {low:.0%} ({least}) to {high:.0%} ({best})"
+        if low == high:
+            first = f"Success {low:.0%} in each of {len(settings)} settings"
     last = f"{hits} of {len(results.rows)} episodes had contact."
     safe = f"was on for at most {unsafe:.2g} s" if unsafe else "was never on"
     safe = "" if faults else f" The beam {safe} while it was unsafe."

@@ -85,7 +85,7 @@ def amend(
     if json_file:
         write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
     if report:
-        from surgisoft.diagnosis.amend_page import amend_page
+        from surgisoft.diagnosis.pages.amend import amend_page
         from surgisoft.report import write_page
 
         title = f"{model.name} with {' + '.join(result.effects)}"
@@ -111,7 +111,7 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
 
 def show_parameters(parameters) -> None:
     """The fitted parameters, one a line, and which of them are implausible."""
-    from surgisoft.diagnosis.refine_intervals import values_text
+    from surgisoft.diagnosis.refinement.intervals import values_text
 
     for each in parameters:
         unit = f" {each.unit}" if each.unit else ""

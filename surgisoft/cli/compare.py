@@ -59,8 +59,8 @@ def compare(
         write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
     title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
     if report:
-        from surgisoft.diagnosis.compare_page import compare_page
-        from surgisoft.diagnosis.pictures import draw_all
+        from surgisoft.diagnosis.pages.compare import compare_page
+        from surgisoft.diagnosis.pages.pictures import draw_all
         from surgisoft.report import write_page
 
         backbone = arm.backbone() if arm.spec.key_points > 1 else None

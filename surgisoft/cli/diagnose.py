@@ -69,7 +69,7 @@ def diagnose(
         write_text(json_file, json.dumps(found.to_json(), indent=2) + "\n")
     _show(found)
     if report:
-        from surgisoft.diagnosis.diagnosis_page import write_report
+        from surgisoft.diagnosis.pages.diagnosis import write_report
 
         title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
         print(f"wrote {write_report(found, report, title)}")

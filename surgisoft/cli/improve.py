@@ -109,8 +109,8 @@ def _show(result) -> None:
 
 def _write_report(result, folder: Path, name: str) -> None:
     """The page and the waterfall."""
-    from surgisoft.diagnosis.improve_page import improve_page
-    from surgisoft.diagnosis.waterfall import write_waterfall
+    from surgisoft.diagnosis.pages.improve import improve_page
+    from surgisoft.diagnosis.pages.waterfall import write_waterfall
     from surgisoft.report import write_page
 
     added = " + ".join(step for step, _ in result.steps) or "no more effects"

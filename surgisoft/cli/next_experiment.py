@@ -39,8 +39,8 @@ def next_experiment(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing schedule.")] = False,
 ) -> None:
     """Find the experiment that best tells rival effects apart, ready for the rig."""
-    from surgisoft.diagnosis.experiments import AS_IT_STANDS, SETTINGS, schedule_text
-    from surgisoft.diagnosis.next_experiment import likely_rivals, propose, recommend
+    from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS, schedule_text
+    from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
     from surgisoft.diagnosis.problem import pose
     from surgisoft.measurement.recording import load_recordings
     from surgisoft.surrogate.checkpoint import load_model
@@ -80,7 +80,7 @@ def _turned(fitted, came) -> bool:
 
 
 def _show(answer, model: Path, recordings: list[Path], output: Path) -> None:
-    from surgisoft.diagnosis.isolability import SURE
+    from surgisoft.diagnosis.isolability.matrix import SURE
 
     print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
     print(f"why: {answer.why}")

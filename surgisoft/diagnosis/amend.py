@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from surgisoft.diagnosis.problem import Problem, pose
-from surgisoft.diagnosis.refine_effects import fit_effects
-from surgisoft.diagnosis.refine_intervals import Parameter
-from surgisoft.diagnosis.refine_network import retune
+from surgisoft.diagnosis.refinement.effects import fit_effects
+from surgisoft.diagnosis.refinement.intervals import Parameter
+from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.model import ArmModel
 

@@ -4,12 +4,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.axes import AxisShare, shares
-from surgisoft.diagnosis.bands import Band, bands
 from surgisoft.diagnosis.body_frame import COMPONENTS
 from surgisoft.diagnosis.bootstrap import block_bootstrap, block_sums, blocks
-from surgisoft.diagnosis.ceiling import Ceiling, ceiling
-from surgisoft.diagnosis.floor import Floor, hold_floor, noise_floor, repeat_floor
+from surgisoft.diagnosis.comparing.axes import AxisShare, shares
+from surgisoft.diagnosis.comparing.bands import Band, bands
+from surgisoft.diagnosis.comparing.ceiling import Ceiling, ceiling
+from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, repeat_floor
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
 from surgisoft.measurement.recording import Recording

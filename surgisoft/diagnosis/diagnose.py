@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from surgisoft.diagnosis.axes import shares
-from surgisoft.diagnosis.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.candidates import Candidate, candidates
+from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
-from surgisoft.diagnosis.gates import first_shares, studentised
 from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
-from surgisoft.diagnosis.ranking import Race, Standing
+from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
+from surgisoft.diagnosis.race.gates import first_shares, studentised
+from surgisoft.diagnosis.race.ranking import Race, Standing
+from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.residuals import residuals
-from surgisoft.diagnosis.static_error import StaticError, static_error
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.known_error import KnownError
@@ -210,7 +210,7 @@ def answer(found: Findings) -> Diagnosis:
     plan = None
     if kind == "ambiguous":
         # Imported here: it predicts every experiment of the catalogue, which takes seconds.
-        from surgisoft.diagnosis.next_experiment import recommend
+        from surgisoft.diagnosis.next_experiment.propose import recommend
 
         plan = recommend(problem, effects[:MOST_RIVALS]).experiment
     return Diagnosis(

@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass, replace
 from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refine_effects import fit_effects
-from surgisoft.diagnosis.refine_intervals import Parameter, values_text
-from surgisoft.diagnosis.refine_network import retune
+from surgisoft.diagnosis.refinement.effects import fit_effects
+from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
+from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
 from surgisoft.measurement.recording import Recording

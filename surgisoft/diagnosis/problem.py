@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.diagnosis.floor import noise_floor
+from surgisoft.diagnosis.comparing.floor import noise_floor
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recording import Recording

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.body_frame import bending, frames
-from surgisoft.diagnosis.features import Memory, features, memory_of
+from surgisoft.diagnosis.comparing.features import Memory, features, memory_of
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.arm import ArmSpec

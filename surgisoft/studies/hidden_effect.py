@@ -15,9 +15,9 @@ from pathlib import Path
 
 from surgisoft.diagnosis.amend import EVERY_ROW, amend, fall_of
 from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
-from surgisoft.diagnosis.experiments import ON_THE_RIG
 from surgisoft.diagnosis.improve import next_effects
-from surgisoft.diagnosis.next_experiment import recommend
+from surgisoft.diagnosis.next_experiment.catalogue import ON_THE_RIG
+from surgisoft.diagnosis.next_experiment.propose import recommend
 from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.diagnosis.experiments import AS_IT_STANDS, SETTINGS
+from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recording import Recording, load_recording, save_recording
 from surgisoft.measurement.rig import VirtualRig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from surgisoft.diagnosis.refine_intervals import values_text
+from surgisoft.diagnosis.refinement.intervals import values_text
 from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
 from surgisoft.studies.hidden_effect import CASES, MODELS, Outcome, StudyConfig

@@ -159,7 +159,7 @@ def run(
 
 def draw(seed: int, folder: Path, images: Path) -> None:
     """Loops of three models on an amplitude ladder, and bodies of the best, of one robot."""
-    from surgisoft.diagnosis.pictures import body, ladder_loops, save
+    from surgisoft.diagnosis.pages.pictures import body, ladder_loops, save
     from surgisoft.diagnosis.residuals import residuals
     from surgisoft.measurement.recording import load_recording
     from surgisoft.surrogate.checkpoint import load_model

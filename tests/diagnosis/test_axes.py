@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.axes import AXES, gravity_angle, known, shares
 from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.comparing.axes import AXES, gravity_angle, known, shares
 from surgisoft.diagnosis.residuals import residuals
 from tests.diagnosis.synthetic import (
     POINTS,

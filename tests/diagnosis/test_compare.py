@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.floor import noise_floor
-from surgisoft.diagnosis.pictures import draw_all
+from surgisoft.diagnosis.comparing.floor import noise_floor
+from surgisoft.diagnosis.pages.pictures import draw_all
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of, outside_range
 from surgisoft.measurement.recording import Recording

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.bands import bands
 from surgisoft.diagnosis.bootstrap import blocks
 from surgisoft.diagnosis.compare import compare, time_shift
+from surgisoft.diagnosis.comparing.bands import bands
 from surgisoft.diagnosis.residuals import residuals
 from surgisoft.measurement.recording import save_recording
 from surgisoft.surrogate.checkpoint import save_model

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis import cross_validation
-from surgisoft.diagnosis.cross_validation import PERSISTENCE, RIDGES, ROOM, CrossValidation
+from surgisoft.diagnosis.race import cross_validation
+from surgisoft.diagnosis.race.cross_validation import PERSISTENCE, RIDGES, ROOM, CrossValidation
 
 ROWS, POINTS, COLUMNS, BLOCKS = 120, 2, 3, 10
 

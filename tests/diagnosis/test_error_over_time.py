@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import matplotlib.pyplot as plt
 import numpy as np
 
-from surgisoft.diagnosis.pictures import error_over_time
+from surgisoft.diagnosis.pages.pictures import error_over_time
 
 
 def test_rows_that_lack_a_key_point_do_not_pull_the_mean_down():

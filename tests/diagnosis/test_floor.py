@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.floor import noise_floor, repeat_floor
+from surgisoft.diagnosis.comparing.floor import noise_floor, repeat_floor
 from surgisoft.diagnosis.residuals import residuals
 from tests.diagnosis.synthetic import NOISE_MM, recording, still_model, walk
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis import gates
+from surgisoft.diagnosis.race import gates
 
 
 def exact_chances(gains: np.ndarray, group: np.ndarray) -> np.ndarray:

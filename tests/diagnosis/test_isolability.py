@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from surgisoft.diagnosis.discrepancy import body_covariance, kernel
-from surgisoft.diagnosis.isolability import (
+from surgisoft.diagnosis.isolability.designs import history_of_protocol
+from surgisoft.diagnosis.isolability.matrix import (
     Draws,
     Isolability,
     ambiguous_sets,
@@ -13,8 +13,7 @@ from surgisoft.diagnosis.isolability import (
     judge,
     uncertainty_of,
 )
-from surgisoft.diagnosis.isolability_designs import history_of_protocol
-from surgisoft.diagnosis.isolability_moments import (
+from surgisoft.diagnosis.isolability.moments import (
     FORM_S,
     FORM_SHARE,
     ROOM,
@@ -23,6 +22,7 @@ from surgisoft.diagnosis.isolability_moments import (
     inducing_points,
     unimitated,
 )
+from surgisoft.diagnosis.race.discrepancy import body_covariance, kernel
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.surrogate.default import default_arm
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.experiments import (
+from surgisoft.diagnosis.isolability.matrix import isolability
+from surgisoft.diagnosis.next_experiment.catalogue import (
     AS_IT_STANDS,
     FIGURES,
     ON_THE_RIG,
@@ -20,10 +21,9 @@ from surgisoft.diagnosis.experiments import (
     schedule,
     schedule_text,
 )
-from surgisoft.diagnosis.isolability import isolability
-from surgisoft.diagnosis.next_experiment import likely_rivals, propose, recommend
-from surgisoft.diagnosis.next_experiment_plans import make_plans
-from surgisoft.diagnosis.next_experiment_question import pose_question
+from surgisoft.diagnosis.next_experiment.plans import make_plans
+from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
+from surgisoft.diagnosis.next_experiment.question import pose_question
 from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol

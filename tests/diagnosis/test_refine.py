@@ -9,10 +9,10 @@ import torch
 
 from surgisoft.diagnosis.candidates import with_effect
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refine import Predictor, free_parameters, vector
-from surgisoft.diagnosis.refine_effects import fit_effects
-from surgisoft.diagnosis.refine_forward import Forward
-from surgisoft.diagnosis.refine_network import retune
+from surgisoft.diagnosis.refinement.effects import fit_effects
+from surgisoft.diagnosis.refinement.forward import Forward
+from surgisoft.diagnosis.refinement.network import retune
+from surgisoft.diagnosis.refinement.refine import Predictor, free_parameters, vector
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recording import Recording

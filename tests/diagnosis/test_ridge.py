@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.ridge import cross_validate
+from surgisoft.diagnosis.race.ridge import cross_validate
 
 
 def data(rows=240, seed=0):

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.discrepancy import SIZES, Prior
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.ranking import Race
+from surgisoft.diagnosis.race.discrepancy import SIZES, Prior
+from surgisoft.diagnosis.race.ranking import Race
 
 ROWS = 500
 """Most rows of the Gaussian process."""

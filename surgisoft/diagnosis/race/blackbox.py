@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.cross_validation import CrossValidation, static_features
-from surgisoft.diagnosis.features import features, memory_of
-from surgisoft.diagnosis.gates import family_p_values
+from surgisoft.diagnosis.comparing.features import features, memory_of
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.race.cross_validation import CrossValidation, static_features
+from surgisoft.diagnosis.race.gates import family_p_values
 
 SIZES = (0.3, 0.05)
 """Sizes of the black box's features, beside those of the surrogate's error, that are tried."""

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from surgisoft.diagnosis.experiments import (
+from surgisoft.diagnosis.isolability.matrix import SURE, Isolability
+from surgisoft.diagnosis.next_experiment.catalogue import (
     AS_IT_STANDS,
     FIGURES,
     RUN_S,
@@ -19,15 +20,14 @@ from surgisoft.diagnosis.experiments import (
     limits_within,
     schedule,
 )
-from surgisoft.diagnosis.isolability import SURE, Isolability
-from surgisoft.diagnosis.next_experiment_plans import (
+from surgisoft.diagnosis.next_experiment.plans import (
     LEAST_RUNS,
     TARGET,
     Plan,
     make_plans,
     pairs_of,
 )
-from surgisoft.diagnosis.next_experiment_question import Question, pose_question
+from surgisoft.diagnosis.next_experiment.question import Question, pose_question
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name

@@ -6,17 +6,7 @@ import numpy as np
 import torch
 from scipy.special import log_ndtr
 
-from surgisoft.diagnosis.experiments import (
-    AS_IT_STANDS,
-    FIGURES,
-    RUN_S,
-    SETTINGS,
-    Setting,
-    bench_minutes,
-    draw_run,
-)
-from surgisoft.diagnosis.isolability import Isolability
-from surgisoft.diagnosis.isolability_designs import (
+from surgisoft.diagnosis.isolability.designs import (
     Design,
     Shape,
     columns_on,
@@ -25,8 +15,18 @@ from surgisoft.diagnosis.isolability_designs import (
     planned_history,
     under,
 )
-from surgisoft.diagnosis.isolability_moments import FORM_S, Moments
-from surgisoft.diagnosis.next_experiment_question import Question
+from surgisoft.diagnosis.isolability.matrix import Isolability
+from surgisoft.diagnosis.isolability.moments import FORM_S, Moments
+from surgisoft.diagnosis.next_experiment.catalogue import (
+    AS_IT_STANDS,
+    FIGURES,
+    RUN_S,
+    SETTINGS,
+    Setting,
+    bench_minutes,
+    draw_run,
+)
+from surgisoft.diagnosis.next_experiment.question import Question
 from surgisoft.surrogate.effects import Effect, make_effect
 
 LEAST_RUNS = 2

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from surgisoft.diagnosis.isolability_designs import (
+from surgisoft.diagnosis.isolability.designs import (
     ROWS,
     Design,
     Shape,
@@ -21,7 +21,7 @@ from surgisoft.diagnosis.isolability_designs import (
     reference_design,
     shapes_of,
 )
-from surgisoft.diagnosis.isolability_moments import (
+from surgisoft.diagnosis.isolability.moments import (
     Moments,
     Uncertainty,
     inducing_points,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.axes import Axis, arc_length, known
 from surgisoft.diagnosis.bootstrap import block_bootstrap, blocks
+from surgisoft.diagnosis.comparing.axes import Axis, arc_length, known
 from surgisoft.diagnosis.residuals import Residuals
 
 BANDS = 8

@@ -6,7 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.isolability import (
+from surgisoft.diagnosis.isolability.designs import (
+    PERIOD_S,
+    Design,
+    Shape,
+    columns_on,
+    reference_design,
+    shapes_of,
+)
+from surgisoft.diagnosis.isolability.matrix import (
     MISFIT,
     Draws,
     Isolability,
@@ -15,15 +23,7 @@ from surgisoft.diagnosis.isolability import (
     moments_of,
     uncertainty_of,
 )
-from surgisoft.diagnosis.isolability_designs import (
-    PERIOD_S,
-    Design,
-    Shape,
-    columns_on,
-    reference_design,
-    shapes_of,
-)
-from surgisoft.diagnosis.isolability_moments import Moments, Uncertainty, sample_time, unimitated
+from surgisoft.diagnosis.isolability.moments import Moments, Uncertainty, sample_time, unimitated
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel

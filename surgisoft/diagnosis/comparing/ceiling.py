@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.bootstrap import block_bootstrap, block_sums, folds
-from surgisoft.diagnosis.ridge import HeldOut, cross_validate
+from surgisoft.diagnosis.race.ridge import HeldOut, cross_validate
 
 RANDOM = 350
 """Random nonlinear features of all inputs."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.candidates import Signals, columns_of, more_of, signals
-from surgisoft.diagnosis.experiments import REFERENCE, draw_run, limits_within
-from surgisoft.diagnosis.isolability_moments import sample_time
+from surgisoft.diagnosis.isolability.moments import sample_time
+from surgisoft.diagnosis.next_experiment.catalogue import REFERENCE, draw_run, limits_within
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects import ArmFacts, Effect, known_effects, make_effect

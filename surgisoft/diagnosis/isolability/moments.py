@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg
 
-from surgisoft.diagnosis.discrepancy import body_covariance, kernel
+from surgisoft.diagnosis.race.discrepancy import body_covariance, kernel
 from surgisoft.surrogate.history import History
 
 FORM_SHARE = 0.1

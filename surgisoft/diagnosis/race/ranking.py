@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from surgisoft.diagnosis.candidates import Candidate
-from surgisoft.diagnosis.cross_validation import FITTED, CrossValidation, static_features
-from surgisoft.diagnosis.gates import family_p_values
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.race.cross_validation import FITTED, CrossValidation, static_features
+from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.surrogate.effects import Effect, Quantity
 
 KNOWN_WEIGHT = 3.0

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from surgisoft.diagnosis.axes import AXES
-from surgisoft.diagnosis.bands import NAMES, Band
 from surgisoft.diagnosis.body_frame import COMPONENTS
 from surgisoft.diagnosis.compare import Comparison
+from surgisoft.diagnosis.comparing.axes import AXES
+from surgisoft.diagnosis.comparing.bands import NAMES, Band
 from surgisoft.report import Picture
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED

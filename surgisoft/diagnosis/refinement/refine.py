@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refine_forward import Forward
-from surgisoft.diagnosis.refine_nuisance import Nuisance
+from surgisoft.diagnosis.refinement.forward import Forward
+from surgisoft.diagnosis.refinement.nuisance import Nuisance
 from surgisoft.surrogate.model import ArmModel
 
 ITERATIONS = 25

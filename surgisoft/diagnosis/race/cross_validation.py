@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from surgisoft.diagnosis.discrepancy import kernel
+from surgisoft.diagnosis.race.discrepancy import kernel
 
 INDUCING = 120
 """Features of the surrogate's error (Nystroem: Williams & Seeger 2001)."""

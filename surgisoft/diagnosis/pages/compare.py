@@ -3,10 +3,10 @@
 import math
 from pathlib import Path
 
-from surgisoft.diagnosis.axes import arc_length
 from surgisoft.diagnosis.body_frame import COMPONENTS
-from surgisoft.diagnosis.charts import axis_charts
 from surgisoft.diagnosis.compare import Comparison
+from surgisoft.diagnosis.comparing.axes import arc_length
+from surgisoft.diagnosis.pages.charts import axis_charts
 from surgisoft.diagnosis.residuals import Residuals
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
 

@@ -19,7 +19,7 @@ from scipy import stats
 from torch import Tensor
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refine_nuisance import judging_parts
+from surgisoft.diagnosis.refinement.nuisance import judging_parts
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.network import HawNN
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from surgisoft.diagnosis.cross_validation import static_features
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.race.cross_validation import static_features
 
 PERSISTENCE = 10.0
 """Rows over which what is left hangs together: so many fewer of them are independent."""

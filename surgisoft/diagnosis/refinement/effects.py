@@ -4,10 +4,10 @@ import copy
 from dataclasses import dataclass
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refine import Fit, free_parameters, refine
-from surgisoft.diagnosis.refine_intervals import Parameter, intervals
-from surgisoft.diagnosis.refine_large import refine_large
-from surgisoft.diagnosis.refine_start import starts
+from surgisoft.diagnosis.refinement.intervals import Parameter, intervals
+from surgisoft.diagnosis.refinement.large import refine_large
+from surgisoft.diagnosis.refinement.refine import Fit, free_parameters, refine
+from surgisoft.diagnosis.refinement.start import starts
 from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import Effect
 from surgisoft.surrogate.model import ArmModel

@@ -1,8 +1,8 @@
 """The page of an improvement."""
 
-from surgisoft.diagnosis.amend_page import HOW, parameter_table, track_chart
 from surgisoft.diagnosis.improve import Improvement, Round
-from surgisoft.diagnosis.waterfall import waterfall_picture
+from surgisoft.diagnosis.pages.amend import HOW, parameter_table, track_chart
+from surgisoft.diagnosis.pages.waterfall import waterfall_picture
 from surgisoft.report import Facts, Page, Section, Table, Text
 
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.bootstrap import block_bootstrap, block_sums, blocks, folds
-from surgisoft.diagnosis.features import TIMES_S
+from surgisoft.diagnosis.comparing.features import TIMES_S
+from surgisoft.diagnosis.race.ridge import cross_validate
 from surgisoft.diagnosis.residuals import Residuals
-from surgisoft.diagnosis.ridge import cross_validate
 
 LAG_S = 0.5
 """Low pass whose distance from the actuation is the axis `lag`, s; one of `TIMES_S`."""

@@ -1,0 +1,1 @@
+"""What `compare` measures: errors over axes, floors and ceilings."""

@@ -1,0 +1,1 @@
+"""Which effects a recording's design can tell apart."""

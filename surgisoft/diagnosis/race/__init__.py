@@ -1,0 +1,1 @@
+"""Effects compete to explain held-out errors."""

@@ -1,0 +1,1 @@
+"""All parameters of an amended model, fitted through the whole chain."""

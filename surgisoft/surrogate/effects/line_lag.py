@@ -1,18 +1,25 @@
 """Line lag: the chamber's pressure follows the command through a long thin tube.
 
-A chamber fills through the resistance of its tube, a first-order lag (Blackburn, Reethof & Shearer
-1960), with another time constant in emptying than in filling (choked and laminar flow, and
-the valve's own openings, differ). The tube itself spreads the command's arrival over a dead time
-(Schuder & Binder 1959), here a chain of N equal lags of the same mean ("linear chain trick",
-MacDonald 1978):
+A chamber fills through the resistance of its tube (Blackburn, Reethof & Shearer 1960), with another
+time constant in emptying than in filling (choked and laminar flow, and the valve's own openings,
+differ). Slow flow in a tube is laminar, in proportion to the difference of pressure (Hagen &
+Poiseuille); fast flow is turbulent and goes with its root (Darcy & Weisbach). Forchheimer (1901)
+adds both resistances; here they pass into each other at the difference `turn`. The tube itself
+spreads the command's arrival over a dead time (Schuder & Binder 1959), here a chain of N equal lags
+of the same mean ("linear chain trick", MacDonald 1978):
 
     c_1' = (p - c_1) N / dead,   c_k' = (c_{k-1} - c_k) N / dead
-    y'   = (c_N - y) / tau,      tau = tau_up where c_N > y, tau_down elsewhere
+    y'   = (c_N - y) / (tau s(|c_N - y| / reach)),   tau = tau_up where c_N > y, tau_down elsewhere
+    s(d) = sqrt((turn + d) / (turn + 1/10))
     p_out = p + share (y - p).
 
-The command is held between two rows, and each lag is integrated exactly. share = 1 is the lag
-itself, 0 no lag at all.
+So tau is the time constant at a difference of a tenth of the range, and turn -> infinity the linear
+lag. share = 1 is the lag itself, 0 no lag at all. The command is held between two rows; the chain
+is integrated exactly, the chamber by the exponential midpoint rule (Hochbruck & Ostermann 2010),
+which is exact where s is constant and never overshoots.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,86 +37,131 @@ from surgisoft.surrogate.scan import linear_scan
 
 CHAIN = 3
 """Lags that make up the dead time."""
+USUAL = 0.1
+"""Difference, as a share of the range, at which the time constants are stated."""
+LAMINAR = 100.0
+"""Difference, as a share of the range, up to which flow is laminar unless told otherwise."""
+TURBULENT = 0.003
+"""The same for the turbulent flow that a diagnosis tries."""
 GRID = (
-    (0.05, 0.05, 0.02),
-    (0.15, 0.15, 0.02),
-    (0.4, 0.4, 0.02),
-    (1.0, 1.0, 0.02),
-    (2.5, 2.5, 0.02),
-    (0.1, 0.3, 0.02),
-    (0.25, 0.8, 0.02),
-    (0.5, 2.0, 0.02),
-    (0.2, 0.2, 0.2),
-    (0.5, 1.0, 0.4),
-    (0.9, 3.3, 0.1),
+    (0.05, 0.05, 0.02, LAMINAR),
+    (0.15, 0.15, 0.02, LAMINAR),
+    (0.4, 0.4, 0.02, LAMINAR),
+    (1.0, 1.0, 0.02, LAMINAR),
+    (2.5, 2.5, 0.02, LAMINAR),
+    (0.1, 0.3, 0.02, LAMINAR),
+    (0.25, 0.8, 0.02, LAMINAR),
+    (0.5, 2.0, 0.02, LAMINAR),
+    (0.2, 0.2, 0.2, LAMINAR),
+    (0.5, 1.0, 0.4, LAMINAR),
+    (0.9, 3.3, 0.1, LAMINAR),
+    (0.1, 0.1, 0.02, TURBULENT),
+    (0.3, 0.3, 0.02, TURBULENT),
+    (1.0, 1.0, 0.02, TURBULENT),
+    (0.15, 0.3, 0.02, TURBULENT),
+    (0.5, 1.0, 0.02, TURBULENT),
 )
-"""(filling, emptying, dead time) that a diagnosis tries, s."""
+"""(filling, emptying, dead time) in s and the difference of the turn that a diagnosis tries."""
+TOLERANCE = 1e-6
+"""Change of a whole recording's lag, as a share of the range, at which its iteration ends."""
+
+
+class Flow(NamedTuple):
+    """How a chamber's difference to the end of its tube decays over one row each."""
+
+    up: Tensor
+    """(..., 1) time of the row over the time constant of filling."""
+    down: Tensor
+    """(..., 1) the same of emptying."""
+    turn: Tensor
+    """(1,) difference of the turn, in the signal's unit, by chamber."""
+    usual: Tensor
+    """Difference at which the time constants are stated, in the signal's unit, by chamber."""
+
+    def decayed(self, gap: Tensor) -> tuple[Tensor, Tensor]:
+        """What is left of a gap (..., m) after the row, and its derivative by the gap."""
+        times = torch.where(gap > 0, self.up, self.down)
+        size = gap.abs()
+        speed, drop = self._speed(times, size)
+        half = torch.exp(-0.5 * speed)
+        middle, slope = size * half, half * (1 + 0.5 * size * speed * drop)
+        speed, drop = self._speed(times, middle)
+        left = torch.exp(-speed)
+        return gap * left, left * (1 + size * speed * drop * slope)
+
+    def _speed(self, times: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+        """Decay (..., m) over the row, were it constant, and its relative fall with the size."""
+        sum_ = self.turn + size
+        return times * ((self.turn + self.usual) / sum_).sqrt(), 0.5 / sum_
 
 
 class LineLag(Effect):
-    """First-order lag with its own times up and down, and a dead time."""
+    """Lag of laminar or turbulent flow, with its own times up and down, and a dead time."""
 
     stage = "line"
 
     def __init__(
-        self, facts: ArmFacts, up_s: float = 0.3, down_s: float = 0.3, dead_s: float = 0.02
+        self,
+        facts: ArmFacts,
+        up_s: float = 0.3,
+        down_s: float = 0.3,
+        dead_s: float = 0.02,
+        turn: float = LAMINAR,
     ):
-        """Time constants of filling and emptying and the mean dead time, s."""
+        """Time constants of filling and emptying and the mean dead time, s.
+
+        turn: difference at which flow turns turbulent, as a share of the range.
+        """
         super().__init__(facts)
         self.share = amplitude(1)
         self.log_up = logarithm(up_s)
         self.log_down = logarithm(down_s)
         self.log_dead = logarithm(dead_s)
+        self.log_turn = logarithm(turn)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
-        return [self.log_up, self.log_down, self.log_dead]
+        return [self.log_up, self.log_down, self.log_dead, self.log_turn]
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, *times) for times in GRID]
+        return [cls(facts, *shape) for shape in GRID]
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, m, 1 + CHAIN) the chamber's pressure and the chain's, all at the command (B, m)."""
         return signal.unsqueeze(-1).expand(*signal.shape, 1 + CHAIN)
 
-    def _keeps(self, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(..., 1) share of a difference that is left after dt (...) s: chain, up, down."""
+    def _keep(self, dt: Tensor) -> Tensor:
+        """(..., 1) share of a link's difference that is left after dt (...) s."""
+        return torch.exp(-dt.unsqueeze(-1) * CHAIN * (-self.log_dead).exp())
+
+    def _flow(self, dt: Tensor) -> Flow:
+        """The flow over rows of dt (...) s."""
         dt = dt.unsqueeze(-1)
-        return tuple(
-            torch.exp(-dt * rate)
-            for rate in (
-                CHAIN * (-self.log_dead).exp(),
-                (-self.log_up).exp(),
-                (-self.log_down).exp(),
-            )
-        )
+        up, down = dt * (-self.log_up).exp(), dt * (-self.log_down).exp()
+        return Flow(up, down, self.log_turn.exp() * self.reach, USUAL * self.reach)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(B, m, 1 + CHAIN) pressures after the command (B, m)."""
-        keep, keep_up, keep_down = self._keeps(context.dt_s)
+        keep = self._keep(context.dt_s)
         chain, before = [], signal
         for link in memory[..., 1:].unbind(-1):
             before = keep * link + (1 - keep) * before
             chain.append(before)
-        chamber = memory[..., 0]
-        keep = torch.where(before > chamber, keep_up, keep_down)
-        return torch.stack([keep * chamber + (1 - keep) * before, *chain], dim=-1)
+        left, _ = self._flow(context.dt_s).decayed(before - memory[..., 0])
+        return torch.stack([before - left, *chain], dim=-1)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, m, 1 + CHAIN) pressures along the command (R, T, m)."""
-        keep, keep_up, keep_down = self._keeps(context.dt_s)
+        keep = self._keep(context.dt_s)
         chain, before = [], signal
         for link in memory[..., 1:].unbind(-1):
             before = linear_scan(keep, (1 - keep) * before, link)
             chain.append(before)
-        start = memory[..., 0]
-        with torch.no_grad():
-            up = _rising(before, start, keep_up, keep_down)
-        keep = torch.where(up, keep_up, keep_down)
-        return torch.stack([linear_scan(keep, (1 - keep) * before, start), *chain], dim=-1)
+        chamber = _follow(self._flow(context.dt_s), before, memory[..., 0], self.reach)
+        return torch.stack([chamber, *chain], dim=-1)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Chamber pressure (..., m) from the command (..., m)."""
@@ -123,31 +175,37 @@ class LineLag(Effect):
 
     def quantities(self) -> list[Quantity]:
         tube = "wide: tubes of up to some ten metres; slower is creep"
+        both = "from turbulent in every flow to laminar in every flow"
         return [
             Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the line lags"),
             Quantity("tau_up_s", value_of(self.log_up.exp()), "s", 0.005, 10.0, tube),
             Quantity("tau_down_s", value_of(self.log_down.exp()), "s", 0.005, 20.0, tube),
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),
+            Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
         ]
 
 
-def _rising(target: Tensor, start: Tensor, keep_up: Tensor, keep_down: Tensor) -> Tensor:
-    """(R, T, m) bool: whether the target (R, T, m) is above the lag's last value.
+def _follow(flow: Flow, target: Tensor, start: Tensor, reach: Tensor) -> Tensor:
+    """(R, T, m) chamber pressure that follows the target (R, T, m) from the start (R, m).
 
-    By Newton's method on the whole recording: with the sides taken from the last answer the lag is
-    linear and one scan; the next answer gives the next sides. It ends at the sides of stepping,
-    because after k passes the first k rows are right; a handful of passes are enough. Where target
-    and lag are equal but for rounding, either side gives the same and the last one is kept.
+    By Newton's method on the whole recording (Lim et al. 2024, "Parallelizing non-linear sequential
+    models over the sequence length"): around the last answer a row's map of the row before is
+    affine, and one scan solves all of them. After k passes the first k rows are those of stepping;
+    a handful of passes are enough. The last pass, at the answer, carries the gradients.
     """
-    before = torch.cat([start.unsqueeze(1), target[:, :-1]], dim=1)
-    up = target > before
-    level = 1e-6 * target.abs().amax(dim=1, keepdim=True)
-    for _ in range(target.shape[1]):
-        keep = torch.where(up, keep_up, keep_down)
-        lagged = linear_scan(keep, (1 - keep) * target, start)
-        above = target - torch.cat([start.unsqueeze(1), lagged[:, :-1]], dim=1)
-        now = torch.where(above.abs() > level, above > 0, up)
-        if torch.equal(now, up):
-            break
-        up = now
-    return up
+
+    def solve(lagged: Tensor) -> Tensor:
+        before = torch.cat([start.detach().unsqueeze(1), lagged[:, :-1]], dim=1)
+        left, slope = flow.decayed(target - before)
+        slope = slope.detach()
+        return linear_scan(slope, target - left - slope * before, start)
+
+    with torch.no_grad():
+        lagged, settled = target, torch.zeros_like(target[:, :1, :1], dtype=torch.bool)
+        for _ in range(target.shape[1]):
+            last, lagged = lagged, torch.where(settled, lagged, solve(lagged))
+            moved = ((lagged - last).abs() > TOLERANCE * reach).flatten(1).any(1)
+            settled = settled | ~moved.view(-1, 1, 1)
+            if bool(settled.all()):
+                break
+    return solve(lagged.detach())

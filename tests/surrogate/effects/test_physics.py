@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
@@ -59,6 +60,31 @@ def test_line_lag_delays_by_dead_time_and_time_constant():
     answer = run(lag, torch.ones(8000), dt_s=0.001)[:, 0]
     assert float((1 - answer).sum() * 0.001) == pytest.approx(0.8, abs=2e-3)
     assert float(answer[100]) < 0.03
+
+
+def test_turbulent_line_empties_in_finite_time():
+    """Flow with the root of the difference: the root falls evenly, by root(1/10) / (2 tau)."""
+    lag = make_effect("line_lag", RANGE, up_s=0.4, down_s=0.4, dead_s=1e-4, turn=1e-6)
+    answer = run(with_strength(lag, share=1), torch.ones(4000), dt_s=0.001)[:, 0]
+    t = 0.001 * np.arange(1, 4001)
+    wanted = 1 - np.clip(1 - t * math.sqrt(0.1) / 0.8, 0, None) ** 2
+    assert np.allclose(answer, wanted, atol=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.01, 0.3, 1e4])
+def test_line_between_laminar_and_turbulent_against_a_solver(turn):
+    lag = make_effect("line_lag", RANGE, up_s=0.3, down_s=0.9, dead_s=1e-4, turn=turn)
+    command = torch.cat([torch.full((50,), 0.8), torch.full((50,), 0.1), torch.full((50,), 0.5)])
+    answer = run(with_strength(lag, share=1), command, dt_s=0.02)[:, 0]
+
+    def slope(t, y):
+        gap = float(command[min(int(t / 0.02), 149)]) - y[0]
+        slower = math.sqrt((turn + abs(gap)) / (turn + 0.1))
+        return [gap / ((0.3 if gap > 0 else 0.9) * slower)]
+
+    t = 0.02 * np.arange(1, 151)
+    truth = solve_ivp(slope, (0, 3), [0.0], t_eval=t, max_step=0.005, rtol=1e-6).y[0]
+    assert np.abs(answer.numpy() - truth).max() < 3e-3
 
 
 def test_creep_after_a_step_is_its_spectrum_in_closed_form():

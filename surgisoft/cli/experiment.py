@@ -1,8 +1,5 @@
 """`surgisoft experiment`: scripted experiments on a scene, from a TOML file to a report."""
 
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +8,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, write_text
+from surgisoft.cli.options import ExperimentFile
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
@@ -22,7 +20,7 @@ app.add_typer(commands, name="experiment")
 
 @commands.command("run")
 def run(
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The experiment.")],
+    file: ExperimentFile,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="DIR", help="Results; default: results/NAME."),
@@ -37,7 +35,7 @@ def run(
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="RUN", help="A training run's folder: plays every scripted case as well."
+            metavar="RUN...", help="Training runs' folders: play every scripted case as well."
         ),
     ] = None,
     repeats: Annotated[
@@ -63,14 +61,14 @@ def run(
     check_folder(output)
     open_results(spec, output, resume, force)
     with progress(f"experiment {spec.name}") as report:
-        rows = run_experiment(spec, output, processes, _with_time_left(report))
+        rows = run_experiment(spec, output, processes, report)
     for path in _written(spec, output, rows, replays, f"surgisoft experiment run {file.name}"):
         print(f"wrote {path}")
 
 
 @commands.command("check")
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The experiment.")],
+    file: ExperimentFile,
 ) -> None:
     """Say what an experiment would play; a bad file is one line with its line and field."""
     from surgisoft.experiments.plan import settings
@@ -141,24 +139,6 @@ def _with_policy(spec, folder: str):
     if len(set(names)) < len(names):
         raise InputError(f"{folder}: a case of that name is there already; rename the folder")
     return replace(spec, cases=(*spec.cases, *twins))
-
-
-def _with_time_left(report: Callable) -> Callable[[float, float, str], None]:
-    """Where there is no bar, the note says how long it still takes."""
-    if sys.stderr.isatty():
-        return report
-    began, first = time.monotonic(), None
-
-    def told(done: float, total: float, note: str = "") -> None:
-        nonlocal first
-        first = done if first is None else first
-        if done > first:
-            left = (time.monotonic() - began) / (done - first) * (total - done)
-            text = f"about {left / 60.0:.0f} min" if left > 90.0 else f"{left:.0f} s"
-            note = f"{note}, {text} left"
-        report(done, total, note)
-
-    return told
 
 
 def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:

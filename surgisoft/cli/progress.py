@@ -13,8 +13,13 @@ LINE_EVERY_S = 30.0
 def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
     """A bar with the time left; the answer is called with (done, total, note)."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from rich.progress import TimeRemainingColumn as TimeLeft
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
     columns = (
@@ -23,21 +28,44 @@ def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
         TextColumn("left"),
-        TimeLeft(),
+        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
         task = bar.add_task(title, total=None, note="")
-        last = time.monotonic()
+        last, left = time.monotonic(), TimeLeft()
 
         def report(done: float, total: float, note: str = "") -> None:
             nonlocal last
             bar.update(task, completed=done, total=total, note=note)
+            foreseen = left(done, total)
             if not console.is_terminal and time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
-                print(f"surgisoft: {title} {share} {note}", file=sys.stderr, flush=True)
+                parts = ", ".join(part for part in (note, foreseen) if part)
+                print(f"surgisoft: {title} {share} {parts}", file=sys.stderr, flush=True)
 
         yield report
+
+
+class TimeLeft:
+    """How long work still takes at its mean pace since it was first heard of.
+
+    Begins anew where less is done than before: another part of the work.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        self._clock = clock
+        self._began, self._first, self._last = 0.0, 0.0, float("inf")
+
+    def __call__(self, done: float, total: float) -> str:
+        """`3 min left`, or nothing where that cannot be told yet."""
+        if done < self._last:
+            self._began, self._first = self._clock(), done
+        self._last = done
+        if not self._first < done < total:
+            return ""
+        seconds = (self._clock() - self._began) / (done - self._first) * (total - done)
+        return f"{seconds / 60.0:.0f} min left" if seconds > 90.0 else f"{seconds:.0f} s left"

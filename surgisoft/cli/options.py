@@ -1,0 +1,79 @@
+"""Arguments and options that several commands take: one name, one metavar, one text for each."""
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+SEED_MAX = 2**31
+"""Largest seed."""
+
+Model = Annotated[
+    Path,
+    Argument(metavar="MODEL", help="Folder of an arm model, or default: the arm of the package."),
+]
+Recordings = Annotated[
+    list[Path], Argument(metavar="REC", help="Recordings (.csv, .parquet) or folders of them.")
+]
+NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder of the new model.")]
+NewRecording = Annotated[
+    Path, Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv.")
+]
+EffectFiles = Annotated[
+    list[Path] | None,
+    Option(
+        "--effect-file",
+        metavar="FILE.py...",
+        help="Also try effects of your own (docs/effects.md).",
+    ),
+]
+Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
+ExperimentFile = Annotated[Path, Argument(metavar="FILE.toml", help="The experiment.")]
+
+JsonFile = Annotated[
+    Path | None, Option("--json", metavar="FILE.json", help="Write all numbers here.")
+]
+Report = Annotated[
+    Path | None,
+    Option("--report", metavar="DIR", help="Write an HTML report with its pictures here."),
+]
+Replay = Annotated[
+    Path | None,
+    Option("--replay", metavar="FILE.rrd", help="Write what `surgisoft replay` shows here."),
+]
+Force = Annotated[bool, Option("--force", help="Replace what an earlier call wrote there.")]
+
+Hidden = Annotated[
+    list[str] | None,
+    Option(
+        "--hidden",
+        metavar="NAME[:X]...",
+        help="Effects that are hidden in the rig, each with its strength; without a number 1.",
+    ),
+]
+Arm = Annotated[
+    str | None,
+    Option("--arm", metavar="MODEL", help="Arm model of all arms; without it the task's own."),
+]
+SceneFolder = Annotated[
+    Path | None,
+    Option("--scene", metavar="DIR", help="Scene; without it the liver phantom."),
+]
+TaskConfig = Annotated[
+    Path | None,
+    Option("--config", metavar="FILE.toml", help="Fields of the task's configuration."),
+]
+Threads = Annotated[
+    int,
+    Option("--threads", min=1, max=256, help="Threads; more than one only pays on idle cores."),
+]
+
+Web = Annotated[bool, Option("--web", help="Serve it to a browser on this machine only.")]
+Screenshot = Annotated[
+    Path | None,
+    Option("--screenshot", metavar="FILE.png", help="Write a picture without a display and leave."),
+]
+SaveReplay = Annotated[
+    Path | None,
+    Option("--save", metavar="FILE.rrd", help="Write what the viewer would show and leave."),
+]

@@ -16,7 +16,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-MANY = {"--valid", "--effects", "--hidden", "--between", "--effect", "--data"}
+MANY = {
+    *("--between", "--data", "--effect", "--effect-file", "--effects", "--hidden", "--policy"),
+    *("--reference", "--strength", "--valid"),
+}
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 

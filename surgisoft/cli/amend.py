@@ -1,38 +1,33 @@
 """`surgisoft amend`: a model with one physical effect more."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
+from surgisoft.cli.files import check_folder, check_free, write_json
+from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.options import Force, JsonFile, Model, NewModel, Report
 from surgisoft.cli.progress import progress
-from surgisoft.errors import InputError
-
-NOT_CLAIMED = 1
-"""Exit code where the error did not fall beyond chance."""
 
 
 @app.command()
 def amend(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
+    model: Model,
     effects: Annotated[
         list[str],
-        typer.Option("--effect", metavar="NAME|FILE.py", help="Effect to add, or to fit anew."),
+        typer.Option("--effect", metavar="NAME|FILE.py...", help="Effects to add, or to fit anew."),
     ],
-    data: Annotated[list[Path], typer.Option(metavar="REC", help="Recordings or folders of them.")],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="NEW", help="Folder of the new model.")
+    data: Annotated[
+        list[Path],
+        typer.Option(metavar="REC...", help="Recordings (.csv, .parquet) or folders of them."),
     ],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write report.html here.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older NEW.")] = False,
+    output: NewModel,
+    json_file: JsonFile = None,
+    report: Report = None,
+    force: Force = False,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write NEW even where no fall can be claimed.")
     ] = False,
@@ -51,9 +46,7 @@ def amend(
     import torch
 
     from surgisoft.diagnosis.amend import amend as amend_model
-    from surgisoft.measurement.histories import outside_range
-    from surgisoft.measurement.recording import load_recordings
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model, save_model
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model
     from surgisoft.surrogate.effects import named_effect
 
     claim_other_folder(output, model, force)
@@ -61,13 +54,12 @@ def amend(
     check_folder(report)
     arm, known = load_model(model), load_known_error(model)
     names = [named_effect(given) for given in effects]
-    measured = load_recordings(data, on_warning=_warn)
+    measured = read_recordings(data)
     torch.set_num_threads(1)
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(arm, measured, names, retune, lambda text: tell(next(stages), 4, text))
-    for note in outside_range(arm.spec, measured):
-        _warn(note)
+    warn_outside(arm, measured)
     for name in result.refitted:
         print(f"{name}: the model has it; its parameters were fitted anew")
     show_parameters(result.parameters)
@@ -75,15 +67,9 @@ def amend(
         print("the network's last layer was re-tuned: held-out motion rewards it")
     claimed = result.locked.claimed
     if claimed or anyway:
-        account = result.to_json() | {
-            "amended_from": model.name,
-            "recordings": [recording.name for recording in measured],
-        }
-        # A network that was re-tuned is off elsewhere.
-        kept = None if account["network_retuned"] else known
-        save_model(result.model, output, account, force, kept)
+        save_amended(result, output, model, measured, force, known)
     if json_file:
-        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+        write_json(json_file, result.to_json())
     if report:
         from surgisoft.diagnosis.pages.amend import amend_page
         from surgisoft.report import write_page
@@ -98,34 +84,3 @@ def amend(
         print(f"{output} was not written; --anyway writes it", flush=True)
     if not claimed:
         raise typer.Exit(NOT_CLAIMED)
-
-
-def claim_other_folder(output: Path, model: Path, force: bool) -> None:
-    """Raise unless a new model may be written there, which must not be the one that is read."""
-    from surgisoft.surrogate.checkpoint import claim_folder
-
-    if output.resolve() == model.resolve():
-        raise InputError(f"{output}: is the model that is read; choose another folder")
-    claim_folder(output, force)
-
-
-def show_parameters(parameters) -> None:
-    """The fitted parameters, one a line, and which of them are implausible."""
-    from surgisoft.diagnosis.refinement.intervals import values_text
-
-    for each in parameters:
-        unit = f" {each.unit}" if each.unit else ""
-        interval = f" ({each.interval_text})" if each.interval_text else ""
-        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit}{interval}")
-    for each in parameters:
-        if not each.plausible:
-            low, high = each.plausible_range
-            unit = f" {each.unit}" if each.unit else ""
-            print(
-                f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
-                f"{low:.3g} to {high:.3g}{unit} ({each.source})"
-            )
-
-
-def _warn(message: str) -> None:
-    typer.echo(f"surgisoft: warning: {message}", err=True)

@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.inputs import hidden_effects
+from surgisoft.cli.options import SEED_MAX, Force, Hidden
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
@@ -35,13 +37,17 @@ def _list_protocols(value: bool) -> None:
 @app.command()
 def collect(
     protocol: Annotated[
-        str, typer.Argument(metavar="PROTOCOL", help="A protocol's name, or a schedule's CSV file.")
+        str, typer.Argument(metavar="PROTOCOL", help="A protocol's name, or SCHEDULE.csv.")
     ],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="New recording, .parquet or .csv.")
+        Path,
+        typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
     ],
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31, help="Which specimen of the arm was cast.")
+        int,
+        typer.Option(
+            "--seed", "--specimen", min=0, max=SEED_MAX, help="Which specimen of the arm was cast."
+        ),
     ] = 0,
     take: Annotated[
         int, typer.Option(min=0, help="Another take: same arm, other noise and random schedule.")
@@ -49,31 +55,32 @@ def collect(
     points: Annotated[
         int | None, typer.Option(help="Settled points, or frames at 20 Hz; default: protocol's.")
     ] = None,
-    hidden: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Switch on a hidden effect; may be repeated."),
-    ] = None,
+    hidden: Hidden = None,
     strength: Annotated[
         list[float] | None,
-        typer.Option(metavar="X", help="Strength of each hidden effect in turn; default 1."),
+        typer.Option(metavar="X...", help="The strengths of the hidden effects in turn."),
     ] = None,
     payload_g: Annotated[
-        float, typer.Option("--payload-g", help="Known mass at the tip, in g.")
+        float, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
     ] = 0.0,
     gravity: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Direction of weight in the arm base frame."),
+        typer.Option(metavar="X Y Z", help="Direction of weight in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
         float,
         typer.Option(
-            "--roll-deg", min=-360, max=360, help="Turn of the base about its axis, in degrees."
+            "--roll-deg",
+            min=-360,
+            max=360,
+            metavar="DEG",
+            help="Turn of the base about its axis, degrees.",
         ),
     ] = 0.0,
     noise_scale: Annotated[
         float, typer.Option(help="Factor on all sensor and camera noise.")
     ] = 1.0,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing recording.")] = False,
+    force: Force = False,
     list_hidden: Annotated[
         bool,
         typer.Option(
@@ -118,13 +125,18 @@ def collect(
     )
 
 
-def _pairs(names: list[str], strengths: list[float]) -> list[tuple[str, float]]:
+def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
     """Each hidden effect with its strength, 1 where none is given."""
-    if len(strengths) not in (0, len(names)):
+    if len(strengths) not in (0, len(given)):
         raise InputError(
-            f"{len(names)} --hidden and {len(strengths)} --strength, expected a strength for each"
+            f"{len(given)} --hidden and {len(strengths)} --strength, expected a strength for each"
         )
-    return list(zip(names, strengths or [1.0] * len(names), strict=True))
+    if strengths and any(":" in text for text in given):
+        raise InputError("--hidden NAME:X and --strength both give strengths; expected one of them")
+    pairs = hidden_effects(given)
+    return (
+        [(name, x) for (name, _), x in zip(pairs, strengths, strict=True)] if strengths else pairs
+    )
 
 
 def _check_output(path: Path, force: bool) -> None:

@@ -1,15 +1,11 @@
 """`surgisoft compare`: a model against recordings."""
 
-import json
 import math
-from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_text
-from surgisoft.errors import InputError
+from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
+from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.options import JsonFile, Model, Recordings, Replay, Report
 
 AXES_SHOWN = 5
 """Axes that the terminal lists; the page and the JSON file have all of them."""
@@ -19,44 +15,29 @@ LEAST_SHOWN = 0.02
 
 @app.command()
 def compare(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
-    ],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Write report.html and its pictures here."),
-    ] = None,
-    replay: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.rrd", help="Write both bodies for the Rerun viewer here."),
-    ] = None,
+    model: Model,
+    recordings: Recordings,
+    json_file: JsonFile = None,
+    report: Report = None,
+    replay: Replay = None,
 ) -> None:
     """Compare an arm model with measurements: the error, and what it depends on."""
     check_free(json_file, "rmse_mm")
     check_folder(report)
-    _check_replay(replay)
+    check_replay(replay)
 
     from surgisoft.diagnosis.compare import compare as compare_model
-    from surgisoft.measurement.histories import outside_range
-    from surgisoft.measurement.recording import load_recordings
     from surgisoft.surrogate.checkpoint import load_model
 
     arm = load_model(model)
-    measured = load_recordings(
-        recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
-    )
+    measured = read_recordings(recordings)
     result, rest = compare_model(arm, measured)
-    for note in outside_range(arm.spec, measured):
-        typer.echo(f"surgisoft: warning: {note}", err=True)
+    warn_outside(arm, measured)
     print(result.sentence)
     print(arm.summary())
     _show(result)
     if json_file:
-        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+        write_json(json_file, result.to_json())
     title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
     if report:
         from surgisoft.diagnosis.pages.compare import compare_page
@@ -74,17 +55,6 @@ def compare(
         points = (rest.measured_mm, rest.predicted_mm)
         write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
         print(f"wrote {replay}")
-
-
-def _check_replay(path: Path | None) -> None:
-    """Say before the work what would stop it after."""
-    if path is None:
-        return
-    if path.suffix != ".rrd":
-        raise InputError(f"{path}: suffix '{path.suffix}', expected .rrd")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, expected a file to write")
-    check_folder(path.parent)
 
 
 def _show(result) -> None:

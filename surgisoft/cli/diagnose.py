@@ -1,40 +1,32 @@
 """`surgisoft diagnose`: which physical effect is the model missing?"""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.files import check_folder, check_free, write_json
+from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
 from surgisoft.cli.progress import progress
 
 
 @app.command()
 def diagnose(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
-    ],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the whole diagnosis here.")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write an HTML report with pictures here.")
-    ] = None,
+    model: Model,
+    recordings: Recordings,
+    json_file: JsonFile = None,
+    report: Report = None,
     reference: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="REC",
+            metavar="REC...",
             help="Recordings from before something changed, to tell what has changed since from "
             "what the network never learned; without them what the model keeps of its fit.",
         ),
     ] = None,
-    effect_files: Annotated[
-        list[Path] | None,
-        typer.Option("--effect-file", metavar="FILE.py", help="Also try an effect of your own."),
-    ] = None,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Diagnose a model: name the physical effect that it is missing, or say why not.
 
@@ -43,8 +35,6 @@ def diagnose(
     import torch
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
-    from surgisoft.measurement.histories import outside_range
-    from surgisoft.measurement.recording import load_recordings
     from surgisoft.surrogate.checkpoint import load_known_error, load_model
     from surgisoft.surrogate.effects import register_effect_file
 
@@ -53,20 +43,15 @@ def diagnose(
     for path in effect_files or []:
         register_effect_file(path)
     arm = load_model(model)
-
-    def warn(text: str) -> None:
-        typer.echo(f"surgisoft: warning: {text}", err=True)
-
-    measured = load_recordings(recordings, on_warning=warn)
-    before = load_recordings(reference, on_warning=warn) if reference else load_known_error(model)
+    measured = read_recordings(recordings)
+    before = read_recordings(reference) if reference else load_known_error(model)
     torch.set_num_threads(1)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(arm, measured, lambda text: tell(next(stages), 5, text), before)
-    for note in outside_range(arm.spec, measured):
-        warn(note)
+    warn_outside(arm, measured)
     if json_file:
-        write_text(json_file, json.dumps(found.to_json(), indent=2) + "\n")
+        write_json(json_file, found.to_json())
     _show(found)
     if report:
         from surgisoft.diagnosis.pages.diagnosis import write_report

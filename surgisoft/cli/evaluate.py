@@ -1,6 +1,5 @@
 """`surgisoft evaluate`: how well drivers do a task, in simulation or on the virtual rig."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,18 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
+from surgisoft.cli.inputs import hidden_effects, warn
+from surgisoft.cli.options import (
+    SEED_MAX,
+    Arm,
+    Hidden,
+    JsonFile,
+    Replay,
+    Report,
+    SceneFolder,
+    TaskConfig,
+)
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError, unknown_name
 
@@ -21,7 +31,7 @@ def evaluate(
     drivers: Annotated[
         list[str],
         typer.Argument(
-            metavar="DRIVER...", help="scripted, random, or a training run's folder; side by side."
+            metavar="DRIVER", help="scripted, random, or a training run's folder; side by side."
         ),
     ],
     task: Annotated[
@@ -29,21 +39,18 @@ def evaluate(
     ] = None,
     episodes: Annotated[int, typer.Option(min=1, max=100_000, help="Episodes to play.")] = 20,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31, help="Seed of the episodes, the same for each driver.")
+        int, typer.Option(min=0, max=SEED_MAX, help="Seed of the episodes, the same for each.")
     ] = 0,
-    on: Annotated[str, typer.Option(help="simulation, or rig: arms on the virtual rig.")] = PLACES[
-        0
-    ],
+    on: Annotated[
+        str, typer.Option(metavar="|".join(PLACES), help="rig: the arms are on the virtual rig.")
+    ] = PLACES[0],
     referee: Annotated[
         bool, typer.Option(help="Contact, clearance and beam by FCL, where there is a scene.")
     ] = True,
     specimen: Annotated[
-        int | None, typer.Option(min=0, max=2**31, help="On the rig: which arm was cast; 0.")
+        int | None, typer.Option(min=0, max=SEED_MAX, help="On the rig: which arm was cast; 0.")
     ] = None,
-    hidden: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME[:X]", help="On the rig: a hidden effect and its strength."),
-    ] = None,
+    hidden: Hidden = None,
     cameras: Annotated[
         bool, typer.Option(help="On the rig: key points are measured; else foreseen by the model.")
     ] = True,
@@ -56,30 +63,16 @@ def evaluate(
             "once; 1: they are believed as they are. Default 0.3.",
         ),
     ] = None,
-    arm: Annotated[
-        str | None, typer.Option(metavar="MODEL", help="Arm model of all arms; default: the own.")
-    ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Scene; default: the liver phantom.")
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="TOML with fields of the task's configuration."),
-    ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
-    ] = None,
-    replay: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Replay (.rrd) of the first driver's first episode."),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Write report.html here: one file, nothing beside it."),
-    ] = None,
+    arm: Arm = None,
+    scene: SceneFolder = None,
+    config: TaskConfig = None,
+    json_file: JsonFile = None,
+    replay: Replay = None,
+    report: Report = None,
 ) -> None:
     """Play episodes with each driver and say how well they went, with 95 % intervals."""
-    _check_files(json_file, replay)
+    check_free(json_file, "drivers")
+    check_replay(replay)
     check_folder(report)
     rig = _rig_config(on, specimen, hidden, cameras, trust)
     own, table = _task(drivers, task, config, arm, scene)
@@ -106,7 +99,7 @@ def evaluate(
             "confidence": 0.95,
         }
         about["drivers"] = {result.driver: result.to_json() for result in results}
-        write_text(json_file, json.dumps(about, indent=2) + "\n")
+        write_json(json_file, about)
         print(f"wrote {json_file}")
     if replay:
         from surgisoft.replay.episode_view import write_replay
@@ -121,14 +114,6 @@ def evaluate(
         about = f"{episodes} episodes of seed {seed}"
         page = evaluation_page(own.name, on, results, logs, about)
         print(f"wrote {write_page(page, report / 'report.html')}")
-
-
-def _check_files(json_file: Path | None, replay: Path | None) -> None:
-    check_free(json_file, "drivers")
-    for path in (json_file, replay):
-        check_folder(path and path.absolute().parent)
-    if replay is not None and replay.suffix != ".rrd":
-        raise InputError(f"{replay}: suffix '{replay.suffix}', expected .rrd")
 
 
 def _rig_config(
@@ -147,18 +132,8 @@ def _rig_config(
         return None
     from surgisoft.agents.on_rig import RigConfig
 
-    pairs = tuple(_hidden(text) for text in hidden or ())
-    own = RigConfig(seed=specimen or 0, hidden=pairs, cameras=cameras)
+    own = RigConfig(seed=specimen or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
     return own if trust is None else replace(own, trust=trust)
-
-
-def _hidden(text: str) -> tuple[str, float]:
-    """`creep:0.5` as name and strength; without a number 1."""
-    name, colon, strength = text.partition(":")
-    try:
-        return name, float(strength) if colon else 1.0
-    except ValueError:
-        raise InputError(f"--hidden {text}: expected NAME or NAME:STRENGTH") from None
 
 
 def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | None, scene):
@@ -178,7 +153,7 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
     for run in runs:
         if run not in brought:
             trained = run.config["task"]
-            typer.echo(f"surgisoft: warning: {run.path} was trained on {trained}", err=True)
+            warn(f"{run.path} was trained on {trained}")
     if config is not None:
         own = read_config(task, config)
     else:

@@ -13,7 +13,10 @@ def check_free(path: Path | None, field: str) -> None:
 
     An older one has the named field.
     """
-    if path is None or not path.exists():
+    if path is None:
+        return
+    check_folder(path.absolute().parent)
+    if not path.exists():
         return
     try:
         old = json.loads(path.read_text())
@@ -31,6 +34,22 @@ def check_folder(path: Path | None) -> None:
     above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
         raise InputError(f"{path}: cannot be written, {above} is no writable folder")
+
+
+def check_replay(path: Path | None) -> None:
+    """Raise unless a replay may be written there; an older one is replaced."""
+    if path is None:
+        return
+    if path.suffix != ".rrd":
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .rrd")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a file to write")
+    check_folder(path.absolute().parent)
+
+
+def write_json(path: Path, table: dict) -> None:
+    """Write numbers and texts as JSON."""
+    write_text(path, json.dumps(table, indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -6,19 +6,21 @@ from typing import Annotated, Literal
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.inputs import read_recordings
+from surgisoft.cli.options import SEED_MAX, Force, Recordings, Threads
 from surgisoft.cli.progress import progress
 
 
 @app.command()
 def fit(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
+    recordings: Recordings,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="MODEL", help="Folder of the new model.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the new model.")],
     valid: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="REC",
+            metavar="REC...",
             help="Held-out recordings that choose the model; without them whole runs, or blocks "
             "of time, of the training recordings are held out.",
         ),
@@ -30,9 +32,10 @@ def fit(
     effects: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME...",
-            help="Physical effects of the line or the material to add, such as hysteresis, or a "
-            "file with one of your own (docs/effects.md).",
+            "--effects",
+            metavar="NAME|FILE.py...",
+            help="Physical effects of the line or the material to add, such as hysteresis, or "
+            "files with effects of your own (docs/effects.md).",
         ),
     ] = None,
     network: Annotated[
@@ -40,19 +43,17 @@ def fit(
         typer.Option(help="HAW-NN, or a baseline."),
     ] = "haw_nn",
     widths: Annotated[
-        str, typer.Option(help="Widths of HAW-NN's hidden layers.")
+        str, typer.Option(metavar="N,N...", help="Widths of HAW-NN's hidden layers.")
     ] = "128,128,128,128",
     actuation: Annotated[
         Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
     ] = "measured",
     epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 200,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31, help="Seed of weights and order of rows.")
+        int, typer.Option(min=0, max=SEED_MAX, help="Seed of weights and order of rows.")
     ] = 0,
-    threads: Annotated[
-        int, typer.Option(min=1, max=256, help="Threads; more than one only pays on idle cores.")
-    ] = 1,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing model.")] = False,
+    threads: Threads = 1,
+    force: Force = False,
 ) -> None:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings.
 
@@ -62,7 +63,7 @@ def fit(
     import torch
 
     from surgisoft.measurement.histories import arm_spec, check_fits, history_of
-    from surgisoft.measurement.recording import check_same_arm, load_recordings
+    from surgisoft.measurement.recording import check_same_arm
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
     from surgisoft.surrogate.effects import named_effect
     from surgisoft.surrogate.fit import FitConfig
@@ -71,8 +72,8 @@ def fit(
 
     claim_folder(output, force)
     torch.set_num_threads(threads)
-    train = load_recordings(recordings, on_warning=_warn)
-    held = load_recordings(valid, on_warning=_warn) if valid else None
+    train = read_recordings(recordings)
+    held = read_recordings(valid) if valid else None
     check_same_arm(train)
     spec = arm_spec(train, actuation)
     if held:
@@ -97,7 +98,3 @@ def fit(
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")
-
-
-def _warn(message: str) -> None:
-    typer.echo(f"surgisoft: warning: {message}", err=True)

@@ -6,11 +6,9 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.inputs import read_recordings, warn
+from surgisoft.cli.options import Force, Recordings
 from surgisoft.errors import InputError
-
-
-def _warn(text: str) -> None:
-    typer.echo(f"surgisoft: warning: {text}", err=True)
 
 
 @app.command("import")
@@ -19,17 +17,18 @@ def import_(
         list[Path], typer.Argument(metavar="RAW", help="Raw files, or folders of them.")
     ],
     map_name: Annotated[
-        str, typer.Option("--map", metavar="MAP", help="Map file, or a ready map: motive.")
+        str, typer.Option("--map", metavar="MAP.toml", help="Map file, or a ready map: motive.")
     ],
     output: Annotated[
         Path,
         typer.Option(
             "-o",
             "--output",
+            metavar="REC",
             help="New recording (.csv or .parquet), or a folder: one recording a raw file.",
         ),
     ],
-    force: Annotated[bool, typer.Option("--force", help="Replace existing recordings.")] = False,
+    force: Force = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be written, write nothing.")
     ] = False,
@@ -52,7 +51,7 @@ def import_(
         for note in part.notes:
             print(f"note: {note}")
         for oddity in find_oddities(part.recording):
-            _warn(f"{target}, row {oddity.sample + 1}: {oddity.text}")
+            warn(f"{target}, row {oddity.sample + 1}: {oddity.text}")
         if not dry_run:
             save_recording(part.recording, target, force)
         first, *rest = summary(part.recording)
@@ -62,13 +61,10 @@ def import_(
 
 @app.command("recording")
 def recording_(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
-    ],
+    recordings: Recordings,
 ) -> None:
     """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings."""
-    from surgisoft.measurement.recording import load_recordings
     from surgisoft.measurement.recording_summary import summary
 
-    for recording in load_recordings(recordings, on_warning=_warn):
+    for recording in read_recordings(recordings):
         print(*summary(recording), sep="\n")

@@ -1,41 +1,38 @@
 """`surgisoft improve`: diagnose and amend, until the error stands at its floor."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.amend import NOT_CLAIMED, claim_other_folder, show_parameters
-from surgisoft.cli.files import check_folder, check_free, write_text
+from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
+from surgisoft.cli.files import check_folder, check_free, write_json
+from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.options import (
+    EffectFiles,
+    Force,
+    JsonFile,
+    Model,
+    NewModel,
+    Recordings,
+    Report,
+)
 from surgisoft.cli.progress import progress
 
 
 @app.command()
 def improve(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC", help="Recordings or folders of them.")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="NEW", help="Folder of the new model.")
-    ],
+    model: Model,
+    recordings: Recordings,
+    output: NewModel,
     most: Annotated[
         int, typer.Option("--max-effects", min=1, help="Most effects that are added.")
     ] = 6,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write all rounds here.")
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Write report.html and waterfall.png here."),
-    ] = None,
-    effect_files: Annotated[
-        list[Path] | None,
-        typer.Option("--effect-file", metavar="FILE.py", help="Also try an effect of your own."),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an older NEW.")] = False,
+    json_file: JsonFile = None,
+    report: Report = None,
+    effect_files: EffectFiles = None,
+    force: Force = False,
 ) -> None:
     """Improve a model: diagnose, amend, and again, until nothing more is missing.
 
@@ -45,9 +42,7 @@ def improve(
     import torch
 
     from surgisoft.diagnosis.improve import improve as improve_model
-    from surgisoft.measurement.histories import outside_range
-    from surgisoft.measurement.recording import load_recordings
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model, save_model
+    from surgisoft.surrogate.checkpoint import load_known_error, load_model
     from surgisoft.surrogate.effects import register_effect_file
 
     claim_other_folder(output, model, force)
@@ -56,11 +51,8 @@ def improve(
     for path in effect_files or []:
         register_effect_file(path)
     arm, known = load_model(model), load_known_error(model)
-    measured = load_recordings(
-        recordings, on_warning=lambda text: typer.echo(f"surgisoft: warning: {text}", err=True)
-    )
-    for note in outside_range(arm.spec, measured):
-        typer.echo(f"surgisoft: warning: {note}", err=True)
+    measured = read_recordings(recordings)
+    warn_outside(arm, measured)
     torch.set_num_threads(1)
     with progress("improve") as tell:
         done = []
@@ -72,15 +64,9 @@ def improve(
         result = improve_model(arm, measured, most, after, known)
     _show(result)
     if result.claimed:
-        account = result.to_json() | {
-            "amended_from": model.name,
-            "recordings": [recording.name for recording in measured],
-        }
-        # A network that was re-tuned is off elsewhere.
-        kept = None if account["network_retuned"] else known
-        save_model(result.model, output, account, force, kept)
+        save_amended(result, output, model, measured, force, known)
     if json_file:
-        write_text(json_file, json.dumps(result.to_json(), indent=2) + "\n")
+        write_json(json_file, result.to_json())
     if report:
         _write_report(result, report, model.name)
     print(result.sentence)

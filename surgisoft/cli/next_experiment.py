@@ -1,19 +1,20 @@
 """`surgisoft next-experiment`: the schedule that best tells rival effects apart."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_free, write_text
+from surgisoft.cli.files import check_folder, check_free, write_json, write_text
+from surgisoft.cli.inputs import read_recordings, warn
+from surgisoft.cli.options import Force, JsonFile, Model
 from surgisoft.errors import InputError
 
 
 @app.command("next-experiment")
 def next_experiment(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of an arm model.")],
+    model: Model,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC", help="What was recorded so far; may be left out."),
@@ -29,20 +30,19 @@ def next_experiment(
             "without recordings all known ones.",
         ),
     ] = None,
-    minutes: Annotated[float, typer.Option(help="Longest time on the bench, minutes.")] = 15.0,
+    minutes: Annotated[
+        float, typer.Option(metavar="MIN", help="Longest time on the bench, minutes.")
+    ] = 15.0,
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Ask for no change of the bench itself.")
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers here.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing schedule.")] = False,
+    json_file: JsonFile = None,
+    force: Force = False,
 ) -> None:
     """Find the experiment that best tells rival effects apart, ready for the rig."""
     from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS, schedule_text
     from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
     from surgisoft.diagnosis.problem import pose
-    from surgisoft.measurement.recording import load_recordings
     from surgisoft.surrogate.checkpoint import load_model
 
     if output.suffix != ".csv":
@@ -51,25 +51,22 @@ def next_experiment(
         )
     if output.exists() and not force:
         raise InputError(f"{output}: exists already; choose another name or use --force")
+    check_folder(output.absolute().parent)
     check_free(json_file, "separates")
     arm = load_model(model)
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
     if recordings:
-        measured = load_recordings(recordings, on_warning=_warn)
+        measured = read_recordings(recordings)
         for name in {r.label for r in measured if _turned(arm.spec.gravity, r.gravity)}:
-            _warn(f"{name}: the weight pulls along another direction than where MODEL was fitted")
+            warn(f"{name}: the weight pulls along another direction than where MODEL was fitted")
         problem = pose(arm, measured)
         answer = recommend(problem, between or likely_rivals(problem), minutes, settings)
     else:
         answer = propose(arm, between, minutes, settings)
     write_text(output, schedule_text(answer.protocol))
     if json_file:
-        write_text(json_file, json.dumps(answer.to_json(), indent=2) + "\n")
+        write_json(json_file, answer.to_json())
     _show(answer, model, recordings or [], output)
-
-
-def _warn(text: str) -> None:
-    typer.echo(f"surgisoft: warning: {text}", err=True)
 
 
 def _turned(fitted, came) -> bool:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.options import SaveReplay, Screenshot, Web
 
 
 @app.command("replay")
@@ -19,25 +20,20 @@ def replay(
             help="A replay (.rrd), an episode's log (.npz), or a folder: its newest replay.",
         ),
     ],
-    web: Annotated[
-        bool, typer.Option("--web", help="Serve it to a browser on this machine only.")
-    ] = False,
-    screenshot: Annotated[
-        Path | None, typer.Option(help="Write a picture (.png) without a display and leave.")
-    ] = None,
+    web: Web = False,
+    screenshot: Screenshot = None,
     size: Annotated[
         str, typer.Option(metavar="WxH", help="Size of the picture's window, in points.")
     ] = "1600x1000",
     time: Annotated[
         float | None,
-        typer.Option(help="Moment of the picture, in s; default: two thirds through."),
+        typer.Option(metavar="S", help="Moment of the picture, in s; default: two thirds through."),
     ] = None,
     view: Annotated[
-        str | None, typer.Option(help="Only this view in the picture, such as Scene.")
+        str | None,
+        typer.Option(metavar="NAME", help="Only this view in the picture, such as Scene."),
     ] = None,
-    save: Annotated[
-        Path | None, typer.Option(help="Write the replay of a log to this .rrd file and leave.")
-    ] = None,
+    save: SaveReplay = None,
 ) -> None:
     """Look at an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events."""
     from surgisoft.errors import InputError

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.options import Force, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
@@ -20,27 +21,32 @@ def new(
     meshes: Annotated[
         list[str],
         typer.Argument(
-            metavar="MESH...",
+            metavar="MESH",
             help="Mesh files (stl, obj, ply, off, glb), the organ first. FILE:keep-out or "
             "FILE:support gives a role; further files are keep-out by themselves.",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="New scene folder.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="New scene folder.")
+    ],
     unit: Annotated[
-        str | None, typer.Option(help="Unit of the files: mm, cm or m; default: recognised.")
+        str | None, typer.Option(metavar="mm|cm|m", help="Unit of the files; default: recognised.")
     ] = None,
     lesion: Annotated[
         Vector | None,
-        typer.Option(help="Lesion near this point, in the first file's frame and unit."),
+        typer.Option(
+            metavar="X Y Z", help="Lesion near this point, in the first file's frame and unit."
+        ),
     ] = None,
     lesion_direction: Annotated[
-        Vector | None, typer.Option(help="Lesion on this side of the organ.")
+        Vector | None, typer.Option(metavar="X Y Z", help="Lesion on this side of the organ.")
     ] = None,
-    diameter: Annotated[float, typer.Option(help="Diameter of the ring, in mm.")] = 20.0,
+    diameter: Annotated[float, typer.Option(metavar="MM", help="Diameter of the ring, mm.")] = 20.0,
     clearance: Annotated[
-        float, typer.Option(help="Least distance between an arm and anything else, in mm.")
+        float,
+        typer.Option(metavar="MM", help="Least distance between an arm and anything else, mm."),
     ] = 1.0,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing scene.")] = False,
+    force: Force = False,
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
     from surgisoft.cli.arms import reach_of
@@ -72,7 +78,7 @@ def check(
     folder: Folder,
     picture: Annotated[
         Path | None,
-        typer.Option("--map", help="Reachability map to write, .png."),
+        typer.Option("--map", metavar="FILE.png", help="Write a picture of the reachability here."),
     ] = None,
 ) -> int:
     """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
@@ -96,13 +102,9 @@ def check(
 @commands.command("show")
 def show(
     folder: Folder,
-    web: Annotated[
-        bool, typer.Option("--web", help="Serve it to a browser on this machine only.")
-    ] = False,
-    screenshot: Annotated[
-        Path | None, typer.Option(help="Write a picture (.png) without a display and leave.")
-    ] = None,
-    save: Annotated[Path | None, typer.Option(help="Write a recording (.rrd) and leave.")] = None,
+    web: Web = False,
+    screenshot: Screenshot = None,
+    save: SaveReplay = None,
 ) -> None:
     """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
     from surgisoft.cli.arms import reaches_of

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli.options import SEED_MAX, Arm, Run, SceneFolder, TaskConfig, Threads
 from surgisoft.cli.progress import progress
 
 
@@ -15,17 +16,21 @@ def train(
         str | None, typer.Option(metavar="TASK", help="Task to learn; not with --resume.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="fast (default), or paper: the paper's hyper-parameters.")
+        str | None,
+        typer.Option(
+            metavar="fast|paper", help="fast (default), or paper: the paper's hyper-parameters."
+        ),
     ] = None,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps over all episodes; default the task's own.")
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option(help="Time to train, minutes, in place of --steps.")
+        float | None,
+        typer.Option(metavar="MIN", help="Time to train, minutes, instead of --steps."),
     ] = None,
     envs: Annotated[int | None, typer.Option(min=1, help="Episodes side by side.")] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31, help="Seed of weights, noise and episodes.")
+        int | None, typer.Option(min=0, max=SEED_MAX, help="Seed of weights, noise and episodes.")
     ] = None,
     target_error: Annotated[
         float | None,
@@ -40,20 +45,13 @@ def train(
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")
     ] = None,
-    arm: Annotated[
-        str | None, typer.Option(metavar="MODEL", help="Arm model of all arms; default: the own.")
-    ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Scene; default: the liver phantom.")
-    ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="TOML with fields of the task's configuration."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    threads: Annotated[
-        int, typer.Option(min=1, max=256, help="Threads; more than one only pays on idle cores.")
-    ] = 1,
+    arm: Arm = None,
+    scene: SceneFolder = None,
+    config: TaskConfig = None,
+    device: Annotated[
+        str, typer.Option(metavar="cpu|cuda", help="Where to simulate and to learn.")
+    ] = "cpu",
+    threads: Threads = 1,
 ) -> None:
     """Train the agents of a task with PPO; every agent learns at once.
 
@@ -161,9 +159,9 @@ def _summary(folder: Path, result) -> str:
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a training run.")],
+    run: Run,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
-    which: Annotated[str, typer.Option(help="Checkpoint: best or last.")] = "best",
+    which: Annotated[str, typer.Option(metavar="best|last", help="Checkpoint.")] = "best",
 ) -> None:
     """Write a run's policies as ONNX and TorchScript, one of each for an agent."""
     from surgisoft.agents.export import export as export_policy

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from surgisoft.cli import run, spread
+from surgisoft.cli import MANY, run, spread
 
 
 @pytest.fixture(scope="module")
@@ -114,3 +114,39 @@ def test_options_of_many_values_are_spread():
     assert spread(["--hidden", "creep", "--strength", "-1.5"]) == [
         "--hidden", "creep", "--strength", "-1.5",
     ]  # fmt: skip
+
+
+def _options():
+    """(command, option) of every command but the long studies."""
+    from typer.main import get_command
+
+    from surgisoft.cli import app, commands  # noqa: F401
+
+    def walk(path, command):
+        if hasattr(command, "commands"):
+            for name, inner in command.commands.items():
+                yield from walk((*path, name), inner)
+        else:
+            for option in command.params:
+                if option.opts[0].startswith("-"):
+                    yield " ".join(path), option
+
+    return [pair for pair in walk((), get_command(app)) if not pair[0].startswith("benchmark")]
+
+
+def test_one_name_means_one_thing_in_every_command():
+    told = {}
+    for command, option in _options():
+        kind = (option.metavar, option.multiple, "-o" in option.opts)
+        if "--output" in option.opts:
+            assert kind == (option.metavar or "a metavar", False, True), command
+            continue
+        for name in set(option.opts) - {"--map", "--resume"}:  # a file here, a choice there
+            assert told.setdefault(name, kind) == kind, f"{name} of {command}"
+
+
+def test_every_option_of_many_values_says_so():
+    several = [(command, option) for command, option in _options() if option.multiple]
+    assert {name for _, option in several for name in option.opts} == MANY
+    for command, option in several:
+        assert option.metavar.endswith("..."), f"{option.opts} of {command}"

@@ -1,0 +1,48 @@
+"""What `amend` and `improve` share: where the new model goes and what is said of it."""
+
+from pathlib import Path
+
+from surgisoft.errors import InputError
+
+NOT_CLAIMED = 1
+"""Exit code where the error did not fall beyond chance."""
+
+
+def claim_other_folder(output: Path, model: Path, force: bool) -> None:
+    """Raise unless a new model may be written there, which must not be the one that is read."""
+    from surgisoft.surrogate.checkpoint import claim_folder
+
+    if output.resolve() == model.resolve():
+        raise InputError(f"{output}: is the model that is read; choose another folder")
+    claim_folder(output, force)
+
+
+def save_amended(result, output: Path, model: Path, recordings, force: bool, known) -> None:
+    """Write the new model with the account of how it came about."""
+    from surgisoft.surrogate.checkpoint import save_model
+
+    account = result.to_json() | {
+        "amended_from": model.name,
+        "recordings": [recording.name for recording in recordings],
+    }
+    # A network that was re-tuned is off elsewhere.
+    kept = None if account["network_retuned"] else known
+    save_model(result.model, output, account, force, kept)
+
+
+def show_parameters(parameters) -> None:
+    """The fitted parameters, one a line, and which of them are implausible."""
+    from surgisoft.diagnosis.refinement.intervals import values_text
+
+    for each in parameters:
+        unit = f" {each.unit}" if each.unit else ""
+        interval = f" ({each.interval_text})" if each.interval_text else ""
+        print(f"  {each.effect}: {each.name} = {values_text(each.value)}{unit}{interval}")
+    for each in parameters:
+        if not each.plausible:
+            low, high = each.plausible_range
+            unit = f" {each.unit}" if each.unit else ""
+            print(
+                f"implausible: {each.effect} {each.name} = {values_text(each.value)}, expected "
+                f"{low:.3g} to {high:.3g}{unit} ({each.source})"
+            )

@@ -189,7 +189,10 @@ def test_any_rig_can_be_driven():
         (lambda: VirtualRig(1, gravity=[0, 0, 0]), "gravity is"),
         (lambda: VirtualRig(1, payload_g=500), "payload is 500 g, expected 0 to 20 g"),
         (lambda: VirtualRig(1, noise=-1), "noise scale is -1"),
-        (lambda: VirtualRig(1, hidden=[("crep", 1)]), "unknown hidden effect 'crep': known are co"),
+        (
+            lambda: VirtualRig(1, hidden=[("crep", 1)]),
+            "unknown hidden effect 'crep': known are breathing, co",
+        ),
         (lambda: VirtualRig(1, hidden=[("creep", -1)]), "strength of 'creep' is -1"),
         (lambda: VirtualRig(1, hidden=[("creep", 1), ("creep", 2)]), "'creep' is given twice"),
         (lambda: VirtualRig(1).command([1.0, 2.0]), "expected 3 finite pressures"),

@@ -161,3 +161,41 @@ def test_two_effects_at_once():
     both = truth_of(protocol, hidden=[("drift", 0.3), ("gain_mismatch", 0.3)]).noise_free_mm[:, -1]
     np.testing.assert_allclose(both - plain, (one - plain) + (other - plain), atol=0.05)
     assert np.linalg.norm(both - plain, axis=1).max() > 0.1
+
+
+def test_a_breathing_mount_shifts_the_whole_arm_as_one_and_comes_back():
+    """No command explains it; a breath lasts 3.5 to 4.5 s and mostly rests (Lujan et al. 1999)."""
+    still = Protocol("p", "continuous", [[20.0, 0, 0]] * 2, [0, 0], [0.0, 40.0])
+    plain, moved = truth_of(still), truth_of(still, hidden=[("breathing", 1.0)])
+    shift = moved.noise_free_mm - plain.noise_free_mm
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[:, :1], shift.shape), atol=1e-9)
+    np.testing.assert_allclose(moved.centres_mm - plain.centres_mm, shift, atol=1e-9)
+    np.testing.assert_array_equal(moved.pressures_kPa, plain.pressures_kPa)
+    size = np.linalg.norm(shift[:, 0], axis=1)
+    assert size.max() == pytest.approx(2.0, abs=0.02)
+    assert np.mean(size) == pytest.approx(2.0 * 5 / 16, rel=0.1)  # the mean of cos^6
+    spectrum = np.abs(np.fft.rfft(size - size.mean()))
+    assert 1 / 4.6 < np.fft.rfftfreq(len(size), 0.05)[spectrum.argmax()] < 1 / 3.4
+
+
+def test_a_jammed_valve_keeps_the_air_of_its_chamber_and_lets_it_go_again():
+    times = np.arange(0.0, 121.0, 3.0)
+    commands = np.zeros((len(times), 3)) + np.where(np.arange(len(times)) % 2, 45.0, 5.0)[:, None]
+    sweeps = Protocol("p", "continuous", commands, np.zeros(len(times)), times)
+    plain, jammed = truth_of(sweeps), truth_of(sweeps, hidden=[("valve_jam", 1.0)])
+    off = np.abs(jammed.pressures_kPa - plain.pressures_kPa)
+    assert (off.max(axis=0) > 5.0).sum() == 1
+    bad = off[:, off.max(axis=0).argmax()]
+    assert 0.05 < np.mean(bad > 1.0) < 0.5
+    assert np.mean(bad < 0.3) > 0.3  # open again, the chamber is at its pressure
+
+
+def test_a_fibre_breaks_once_and_no_rest_mends_it():
+    path = np.tile([[50.0, 50, 50], [10.0, 10, 10]], (30, 1))
+    plain, broken = tips(path, "fibre_break", settle_s=5.0)
+    shift = np.linalg.norm(broken - plain, axis=1)[::2]
+    late = int(np.argmax(shift > 0.1))
+    assert (shift[:late] == 0).all()
+    assert 90.0 < 30.0 + 12.0 * late < 185.0
+    np.testing.assert_allclose(shift[late + 1 :], shift[-1], rtol=0.1)
+    assert shift[-1] > 1.0

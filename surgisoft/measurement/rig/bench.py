@@ -24,6 +24,7 @@ from surgisoft.measurement.rig.effects import (
     History,
     add_effect_forces,
     add_twist,
+    carry_mount,
     drifted_base,
     effective_pressures,
     follow_lines,
@@ -33,6 +34,7 @@ from surgisoft.measurement.rig.effects import (
     room_temperature,
     shown_pressure,
     slip_marker,
+    valve_shut,
 )
 from surgisoft.measurement.rig.motion_capture import (
     Cameras,
@@ -52,6 +54,7 @@ from surgisoft.measurement.rig.pneumatics import (
     drive_piston,
     fill,
     fill_through_line,
+    fill_through_valve,
     read_sensor,
     vent,
     vented,
@@ -191,6 +194,7 @@ def advance(plant, state, steps, tape, at):
     pumps, effects = plant.pumps, plant.effects
     wall = plant.specimen.rod.wall
     for _ in range(steps):
+        time = state.steps[0] * pumps.step
         for i in range(state.gas.shape[0]):
             row = state.gas[i]
             shown = shown_pressure(effects, state.gas, PRESSURE, i)
@@ -198,12 +202,20 @@ def advance(plant, state, steps, tape, at):
             at += 1
             drive_piston(pumps, row, state.target[i], reading)
             stretch = line_strain(state.memory.free, wall.chambers[i, 0], wall.chambers[i, 1])
+            shut = effects.jam.shape[0] > 0 and valve_shut(effects, time, i)
             if effects.line[0] > 0.0:
-                fill_through_line(pumps, row, i, stretch, effects.line[0], effects.line[1])
+                way = 0.0 if shut else 1.0
+                fill_through_line(
+                    pumps, row, i, stretch, way * effects.line[0], way * effects.line[1]
+                )
+            elif effects.jam.shape[0] > 0:
+                fill_through_valve(pumps, row, i, stretch, shut)
             else:
                 fill(pumps, row, i, stretch)
             state.chamber[i] = row[CHAMBER]
-        effective_pressures(effects, pumps.step, state.chamber, state.history, state.effective)
+        effective_pressures(
+            effects, time, pumps.step, state.chamber, state.history, state.effective
+        )
         if not remember(plant.specimen, state.effective, state.scratch, state.memory):
             return -1
         follow_lines(effects, pumps.step, state.memory.last, state.history)
@@ -238,12 +250,14 @@ def look_at(plant, state, tape, at, frames, index):
         at += 1
     mark(plant.cameras, tracking, shape.centres, shape.frames, state.chamber)
     slip_marker(effects, time, shape.frames, state.history, tracking.clean)
+    carry_mount(effects, time, tracking.clean)
     misalign(effects, tracking.clean)
     at = look(plant.cameras, tracking, tape, at)
     for p in range(shape.centres.shape[0]):
         circle_centre(tracking.seen[p], frames.points[index, p])
         circle_centre(tracking.clean[p], frames.clean[index, p])
     frames.centres[index] = shape.centres
+    carry_mount(effects, time, frames.centres[index : index + 1])
     frames.chamber[index] = state.chamber
     frames.temperature[index] = math.floor(10.0 * room_temperature(effects, time) + 0.5) / 10.0
     return at

@@ -19,6 +19,9 @@ RATE_FILTER_S = 0.03
 """Time constant of the strain rate [s]."""
 REFERENCE_KPA = 54.0
 """Pressure by which amplitudes are scaled [kPa]."""
+BREATH_POWER = 6
+"""Power of the cosine of a breath: long at rest, short at full breath (Lujan et al. 1999,
+cos^2n with n = 3)."""
 
 
 class Effects(NamedTuple):
@@ -58,6 +61,16 @@ class Effects(NamedTuple):
     """(7,) rotation [rad] and shift [mm] of the cameras' frame, and its radial warp [1/mm]."""
     slip: np.ndarray
     """(4,) key plane, marker, largest slip along the arm [mm], bending that moves it [rad]."""
+    breath: np.ndarray
+    """(5,) largest shift of the mount, arm base frame [mm], period and delay of the breath [s]."""
+    jam: np.ndarray
+    """(K, 2) begin and end of each spell in which a valve stays shut [s], in order."""
+    jammed: int
+    """Chamber behind that valve."""
+    broken: np.ndarray
+    """(m,) pressure at 54 kPa that a chamber with a snapped fibre loses [kPa]."""
+    break_s: float
+    """Moment at which the fibre snaps [s]."""
     modulus: float
     """Young's modulus of the wall times a line's share of its area [N]."""
 
@@ -99,6 +112,11 @@ def no_effects(chambers: int, line_stiffness: float) -> Effects:
         warmth=0.0,
         misalignment=np.zeros(7),
         slip=np.zeros(4),
+        breath=np.zeros(5),
+        jam=np.zeros((0, 2)),
+        jammed=0,
+        broken=np.zeros(chambers),
+        break_s=0.0,
         modulus=line_stiffness,
     )
 
@@ -134,13 +152,14 @@ def shown_pressure(effects, gas, column, i):
 
 
 @compiled
-def effective_pressures(effects, step, chamber, history, effective):
+def effective_pressures(effects, time, step, chamber, history, effective):
     """Pressures (m,) [kPa] that push on the wall, from those in the chambers (m,) [kPa].
 
-    Leak: a crack that opens above 5 kPa, so that the flow along the tube takes pressure away.
-    Gain: wears off towards high pressure. Coupling: a neighbour's wall bulges with its pressure
-    squared. Dead zone: folds that open smoothly. Creep: a ladder of retarded loads, nonlinear in
-    the load.
+    time, step: [s]. Leak: a crack that opens above 5 kPa, so that the flow along the tube takes
+    pressure away. Gain: wears off towards high pressure. Coupling: a neighbour's wall bulges with
+    its pressure squared. Broken fibre: from one moment on the chamber bulges outwards with its pressure squared
+    (without fibres that is where the pressure goes: Polygerinos et al. 2015). Dead zone: folds that
+    open smoothly. Creep: a ladder of retarded loads, nonlinear in the load.
     """
     m = chamber.shape[0]
     for i in range(m):
@@ -153,6 +172,8 @@ def effective_pressures(effects, step, chamber, history, effective):
         for j in range(m):
             if effects.coupling[i, j] != 0.0:
                 push -= effects.coupling[i, j] * chamber[j] * abs(chamber[j]) / REFERENCE_KPA**2
+        if effects.broken[i] != 0.0 and time >= effects.break_s:
+            push -= effects.broken[i] * p * abs(p) / REFERENCE_KPA**2
         if effects.dead_zone != 0.0:
             push -= effects.dead_zone * math.tanh(push / effects.dead_zone)
         if effects.creep != 0.0:
@@ -244,6 +265,29 @@ def drifted_base(effects, time, base, out):
     out[1] = w * b + x * a + y * d - z * c
     out[2] = w * c - x * d + y * a + z * b
     out[3] = w * d + x * c - y * b + z * a
+
+
+@compiled
+def valve_shut(effects, time, i):
+    """Whether the valve of chamber i is stuck shut at a time [s]."""
+    if i != effects.jammed:
+        return False
+    k = np.searchsorted(effects.jam[:, 0], time, side="right") - 1
+    return k >= 0 and time < effects.jam[k, 1]
+
+
+@compiled
+def carry_mount(effects, time, points):
+    """Shift points (n, k, 3) [mm] with a mount that lies on a breathing body; in place. time: [s].
+
+    The waveform of organ motion of Lujan et al. (1999); zero is the end of exhaling.
+    """
+    if effects.breath[3] == 0.0:
+        return
+    phase = math.pi * (time - effects.breath[4]) / effects.breath[3]
+    share = math.cos(phase) ** BREATH_POWER
+    for d in range(3):
+        points[:, :, d] += share * effects.breath[d]
 
 
 @compiled

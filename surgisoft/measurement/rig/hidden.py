@@ -183,6 +183,28 @@ def _marker_slip(bench: Bench, strength: float, rng: np.random.Generator) -> Non
     _set(bench, slip=slip)
 
 
+def _breathing(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    """About 15 breaths a minute."""
+    shift = 2.0 * strength * _direction(rng)
+    period = rng.uniform(3.5, 4.5)
+    _set(bench, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
+
+
+def _valve_jam(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    """Every 8 s on average one valve sticks (the clogged valve of Bartys et al. 2006)."""
+    gaps = rng.exponential(8.0, 2000)
+    lasts = strength * rng.uniform(0.5, 1.5, len(gaps))
+    begins = np.cumsum(gaps) + np.concatenate([[0.0], np.cumsum(lasts)[:-1]])
+    spells = np.stack([begins, begins + lasts], axis=1)
+    _set(bench, jam=spells, jammed=int(rng.integers(len(bench.effects.gain))))
+
+
+def _fibre_break(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    broken = np.zeros(len(bench.effects.broken))
+    broken[rng.integers(len(broken))] = 5.0 * strength
+    _set(bench, broken=broken, break_s=float(rng.uniform(90.0, 170.0)))
+
+
 HIDDEN: dict[str, Hidden] = {
     "hysteresis": Hidden("material", "more friction of the fibres (Preisach)", _hysteresis),
     "rate_dependence": Hidden(
@@ -215,6 +237,11 @@ HIDDEN: dict[str, Hidden] = {
         "sensor", "pressure channels mix in the multiplexer", _sensor_crosstalk
     ),
     "marker_slip": Hidden("sensor", "a tip marker that slips while the arm is bent", _marker_slip),
+    "breathing": Hidden("body", "the mount lies on a breathing body", _breathing),
+    "valve_jam": Hidden("line", "a valve that sticks shut now and then", _valve_jam),
+    "fibre_break": Hidden(
+        "material", "a fibre snaps at one moment; its chamber bulges from then on", _fibre_break
+    ),
 }
 
 

@@ -184,6 +184,20 @@ def fill(pumps, row, i, stretch):
 
 
 @compiled
+def fill_through_valve(pumps, row, i, stretch, shut):
+    """The same with a valve at the arm: where it is shut, chamber and pump keep their own air."""
+    near = row[X] * pumps.bore + pumps.tube[i]
+    if shut:
+        row[PRESSURE] = pressure_of(row[AIR], near, 0.0)
+        row[CHAMBER] = pressure_of(row[FAR_AIR], pumps.chamber[i] * (1.0 + stretch), pumps.bulge)
+        return
+    fill(pumps, row, i, stretch)
+    air = row[AIR] + row[FAR_AIR]
+    row[AIR] = (row[PRESSURE] + AMBIENT_KPA) * near
+    row[FAR_AIR] = air - row[AIR]
+
+
+@compiled
 def fill_through_line(pumps, row, i, stretch, filling, emptying):
     """The same with a long thin tube between the sensor and the chamber, over one period.
 

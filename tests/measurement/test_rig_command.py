@@ -58,7 +58,7 @@ def test_lists(capsys):
     ("args", "says"),
     [
         (["gird"], "unknown protocol 'gird'"),
-        (["mixed", "--hidden", "crep"], "unknown hidden effect 'crep': known are contact,"),
+        (["mixed", "--hidden", "crep"], "unknown hidden effect 'crep': known are breathing,"),
         (["mixed", "--hidden", "creep", "--strength", "-1"], "strength of 'creep' is -1.0"),
         (
             ["mixed", "--hidden", "creep", "--hidden", "drift", "--strength", "1"],

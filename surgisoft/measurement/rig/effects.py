@@ -157,9 +157,9 @@ def effective_pressures(effects, time, step, chamber, history, effective):
 
     time, step: [s]. Leak: a crack that opens above 5 kPa, so that the flow along the tube takes
     pressure away. Gain: wears off towards high pressure. Coupling: a neighbour's wall bulges with
-    its pressure squared. Broken fibre: from one moment on the chamber bulges outwards with its pressure squared
-    (without fibres that is where the pressure goes: Polygerinos et al. 2015). Dead zone: folds that
-    open smoothly. Creep: a ladder of retarded loads, nonlinear in the load.
+    its pressure squared. Broken fibre: from one moment on the chamber bulges outwards with its
+    pressure squared (without fibres that is where the pressure goes: Polygerinos et al. 2015). Dead
+    zone: folds that open smoothly. Creep: a ladder of retarded loads, nonlinear in the load.
     """
     m = chamber.shape[0]
     for i in range(m):

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refinement.effects import fit_effects
+from surgisoft.diagnosis.refinement.effects import fit_effects, fit_plausible
 from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
 from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
@@ -24,6 +24,9 @@ from surgisoft.surrogate.model import ArmModel
 
 MOST_EFFECTS = 6
 """Most effects that are added."""
+PLAUSIBLE_GAIN = 0.95
+"""Least share of the fall of the squared error that an effect must keep at its plausible end: what
+goes beyond it is then not worth having."""
 NETWORK = "network"
 """Name of the step that re-tunes the network."""
 
@@ -135,6 +138,12 @@ def improve(
             fitted = fit_effects(before, [*added, name])
             fall = fall_of(before, problem.with_model(fitted.model))
             doubt = _doubt(name, fall, fitted.parameters)
+            if doubt and fall.claimed:
+                tried = fit_plausible(before, fitted, [*added, name], name)
+                if tried is not None:
+                    less = fall_of(before, problem.with_model(tried.model))
+                    if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
+                        fitted, fall, doubt = tried, less, ""
             if doubt:
                 said = replace(said, sentence=f"{said.sentence}; but {doubt}")
                 continue
@@ -174,6 +183,12 @@ def next_effects(found: Diagnosis) -> tuple[str, ...]:
     """
     effects = found.verdict.effects
     return effects[:1] if found.verdict.kind == "ambiguous" else effects
+
+
+def _as_good(held: Fall, free: Fall) -> bool:
+    """Whether an effect held at its plausible end does nearly all that it does beyond it."""
+    gains = [one.before**2 - one.after**2 for one in (held, free)]
+    return gains[0] >= PLAUSIBLE_GAIN * gains[1]
 
 
 def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:

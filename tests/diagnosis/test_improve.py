@@ -1,6 +1,7 @@
 """`improve`: effect after effect until the gates are silent, and the waterfall of it."""
 
 import json
+import math
 
 import pytest
 
@@ -78,6 +79,18 @@ def test_an_effect_that_helps_only_beyond_all_plausibility_is_not_added(recited)
     result = improve(bare_arm(), [measured_on(truth, rows=200)])
     assert [name for name, _ in result.steps if name != NETWORK] == []
     assert "only with an implausible gain_share" in result.rounds[0].sentence
+
+
+def test_an_effect_a_little_beyond_plausibility_is_held_at_its_end(recited):
+    """A share of 1.3 of the line, where 1.2 is the most: what 1.2 does is nearly all of it."""
+    truth = with_truth("line_lag", {"share": 1.3, "log_up": math.log(0.5), "log_down": 0.0})
+    recited(said("identified", "line_lag"), said("nothing_missing"))
+    result = improve(bare_arm(), [measured_on(truth, rows=600)])
+    assert [name for name, _ in result.steps if name != NETWORK] == ["line_lag"]
+    share = next(p for p in result.parameters if p.name == "share")
+    assert share.value == pytest.approx(1.2, abs=1e-3)
+    assert share.plausible
+    assert result.claimed
 
 
 def test_the_loop_ends_when_an_effect_is_named_again_or_enough_were_added(recited):

@@ -3,6 +3,8 @@
 import copy
 from dataclasses import dataclass
 
+import torch
+
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.refinement.intervals import Parameter, intervals
 from surgisoft.diagnosis.refinement.large import refine_large
@@ -16,6 +18,8 @@ LARGE = 24
 """Most free values of an effect that are all fitted; of more, the strengths are."""
 FIRST_ITERATIONS = 4
 """Steps from each start before the best of them goes on."""
+BISECTIONS = 20
+"""Halvings in the search for the largest plausible strengths."""
 ROUNDS = 2
 """Rounds in turns where effects with few and with many values are fitted together."""
 
@@ -62,6 +66,51 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     order = {name: position for position, name in enumerate(names)}
     parameters.sort(key=lambda parameter: order[parameter.effect])
     return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted)
+
+
+def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str) -> Fitted | None:
+    """The fit again with the strengths of one effect at the plausible end, all else free.
+
+    A network that was fitted without an effect has learned some of it, and what is left may then
+    ask for more of the effect than there can be. Strengths are shrunk all together, no further
+    than it takes. None where that does not make it plausible, or where nothing else is free.
+    """
+    model = copy.deepcopy(fitted.model)
+    small = [each for each in dict.fromkeys(names) if not is_large(model.effects[each])]
+    if name not in small or not free_parameters(model, small, held=name):
+        return None
+    if not _shrink(model.effects[name]):
+        return None
+    fit = refine(model, problem.with_model(model), small, held=name)
+    if not model.effects[name].plausible():
+        return None
+    effects = {key: model.effects[key] for key in small}
+    free = free_parameters(model, small, held=name)
+    found = intervals(effects, free, fit, problem.block)
+    rest = [p for p in fitted.parameters if p.effect not in small]
+    order = {each: position for position, each in enumerate(names)}
+    parameters = sorted([*found, *rest], key=lambda parameter: order[parameter.effect])
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), fitted.refitted)
+
+
+@torch.no_grad()
+def _shrink(effect: Effect) -> bool:
+    """Scale an effect's strengths by the largest factor that makes it plausible, if there is one.
+
+    By bisection between nothing, of which a share must be plausible, and the present strengths.
+    """
+    strengths = {name: p.detach().clone() for name, p in effect.strengths().items()}
+
+    def scale(factor: float) -> bool:
+        for name, parameter in effect.strengths().items():
+            parameter.copy_(factor * strengths[name])
+        return effect.plausible()
+
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if scale(middle) else (low, middle)
+    return scale(low) and low > 0
 
 
 def is_large(effect: Effect) -> bool:

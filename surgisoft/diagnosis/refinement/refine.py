@@ -56,12 +56,18 @@ class Fit:
     """Sum of squares that is left, the static error taken out, and what the hold costs, mm^2."""
 
 
-def free_parameters(model: ArmModel, keys: Iterable[str]) -> dict[str, nn.Parameter]:
-    """Strengths, then shapes, of each named effect, by their names in the model's effects."""
+def free_parameters(
+    model: ArmModel, keys: Iterable[str], held: str | None = None
+) -> dict[str, nn.Parameter]:
+    """Strengths, then shapes, of each named effect, by their names in the model's effects.
+
+    held: effect whose strengths stay as they are.
+    """
     answer = {}
     for key in keys:
         effect = model.effects[key]
-        for name, parameter in (effect.strengths() | effect.shapes()).items():
+        strengths = {} if key == held else effect.strengths()
+        for name, parameter in (strengths | effect.shapes()).items():
             answer[f"{key}.{name}"] = parameter
     return answer
 
@@ -80,12 +86,13 @@ def set_vector(parameters: dict[str, Tensor], values: np.ndarray) -> None:
         begin += parameter.numel()
 
 
-def _are_shapes(model: ArmModel, keys: Iterable[str]) -> np.ndarray:
+def _are_shapes(model: ArmModel, keys: Iterable[str], held: str | None = None) -> np.ndarray:
     """(P,) bool: which free values are shapes."""
     answer = []
     for key in keys:
         effect = model.effects[key]
-        for kind, values in ((False, effect.strengths()), (True, effect.shapes())):
+        strengths = {} if key == held else effect.strengths()
+        for kind, values in ((False, strengths), (True, effect.shapes())):
             answer += [kind] * sum(p.numel() for p in values.values())
     return np.array(answer, bool)
 
@@ -145,11 +152,20 @@ def block_slopes(fit: Fit, block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return grams, slopes
 
 
-def refine(model: ArmModel, problem: Problem, keys: list[str], iterations: int = ITERATIONS) -> Fit:
-    """Fit the named effects of a model, in place, to a problem's rows; others stay as they are."""
-    parameters = free_parameters(model, keys)
+def refine(
+    model: ArmModel,
+    problem: Problem,
+    keys: list[str],
+    iterations: int = ITERATIONS,
+    held: str | None = None,
+) -> Fit:
+    """Fit the named effects of a model, in place, to a problem's rows; others stay as they are.
+
+    held: effect among them whose strengths stay as they are too.
+    """
+    parameters = free_parameters(model, keys, held)
     predict = Predictor(Forward(model, problem, keys), parameters)
-    shape = _are_shapes(model, keys)
+    shape = _are_shapes(model, keys, held)
     values = start = vector(parameters)
     predicted = predict(values)
     residual = problem.measured - predicted

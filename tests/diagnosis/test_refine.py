@@ -12,6 +12,7 @@ from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.refinement.effects import fit_effects
 from surgisoft.diagnosis.refinement.forward import Forward
 from surgisoft.diagnosis.refinement.network import retune
+from surgisoft.diagnosis.refinement.nuisance import kinds
 from surgisoft.diagnosis.refinement.refine import Predictor, free_parameters, vector
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
@@ -203,3 +204,12 @@ def test_a_recurrent_baseline_takes_no_effects():
     problem = pose(recurrent, [measured_on(arm, rows=100)], part="open")
     with pytest.raises(InputError, match="recurrent baseline takes none"):
         fit_effects(problem, ["creep"])
+
+
+def test_runs_that_repeat_each_other_are_left_out_together():
+    """Three runs of one schedule with noise, then one at other chambers, one at half the height."""
+    rng = np.random.default_rng(0)
+    saw = np.abs(np.linspace(-1, 1, 50))[:, None]
+    shapes = [saw * [1, 0, 0]] * 3 + [saw * [0, 1, 0], saw * [0.5, 0, 0]]
+    pressure = np.concatenate([s + rng.normal(0, 0.01, s.shape) for s in shapes])
+    assert kinds(pressure, np.repeat(np.arange(5), 50)).tolist() == [0, 0, 0, 1, 2]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
+from scipy.sparse import csgraph
 
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.race.cross_validation import static_features
@@ -23,6 +24,8 @@ PERSISTENCE = 10.0
 """Rows over which what is left hangs together: so many fewer of them are independent."""
 LEAST_RUNS = 3
 """Fewest runs that are left out as runs; of fewer, blocks of time are."""
+ALIKE = 0.1
+"""Largest difference of the actuation's mean and spread, in half ranges, of runs of one kind."""
 MOST_PARTS = 5
 """Most parts that take turns in being left out."""
 
@@ -73,11 +76,25 @@ class Nuisance:
 
 
 def judging_parts(problem: Problem) -> np.ndarray:
-    """(S,) part of the rows that each row is left out with: runs where there are a few.
+    """(S,) part of the rows that each row is left out with: kinds of runs where there are a few.
 
-    What a fit must foresee is motion of another kind, and kinds of motion come in runs.
+    What a fit must foresee is motion of another kind, and kinds of motion come in runs. A run that
+    was repeated is no other kind.
     """
     _, run = np.unique(problem.history.run_of_row[problem.index].numpy(), return_inverse=True)
     if run.max() + 1 < LEAST_RUNS:
         return problem.fold[problem.block]
-    return run % MOST_PARTS
+    kind = kinds(problem.pressure, run)
+    return (kind[run] if kind.max() + 1 >= LEAST_RUNS else run) % MOST_PARTS
+
+
+def kinds(pressure: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """(R,) number of the kind of each run, from the actuation (S, m) in -1 to 1 and runs (S,).
+
+    Runs whose actuation has nearly the same mean and spread in every chamber are of one kind, and
+    so are those that a chain of such runs joins.
+    """
+    rows = [pressure[run == number] for number in range(run.max() + 1)]
+    looks = np.array([np.concatenate([part.mean(0), part.std(0)]) for part in rows])
+    apart = np.abs(looks[:, None] - looks[None]).max(-1)
+    return csgraph.connected_components(apart <= ALIKE)[1]

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.workers import begin_worker
+
 ARCHITECTURES = ("64,64", "128,128", "64,64,64", "128,128,128", "64,64,64,64", "128,128,128,128")
 """Six HAW-NN architectures of 2 to 4 hidden layers (the paper does not list its own)."""
 PAPER = {"pressure": 0.3947, "pressure+direction": 0.0693}
@@ -148,7 +150,7 @@ def run(
         tasks = [(seed, case, folder) for seed in seeds for case in reversed(tasks_of)]
         outcomes = []
         context = multiprocessing.get_context("spawn")
-        with context.Pool(processes) as pool:
+        with context.Pool(processes, begin_worker) as pool:
             for outcome in pool.imap_unordered(fit_one, tasks):
                 outcomes.append(outcome)
                 report(len(outcomes), len(tasks), f"robot {outcome.seed}: {outcome.case.name}")

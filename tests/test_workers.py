@@ -1,0 +1,74 @@
+"""Workers end with the process that asked, however that ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from surgisoft.workers import ONE_THREAD, workers
+
+ASKS = """
+import os, sys, time
+from surgisoft.workers import workers
+if __name__ == "__main__":
+    with workers(2) as pool:
+        print(pool.submit(os.getppid).result(), flush=True)
+        jobs = [pool.submit(time.sleep, 60) for _ in range(4)]
+        time.sleep(1.0)
+        print(*pool._processes, flush=True)
+        jobs[0].result()
+"""
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that ended and waits for its parent does not."""
+    status = Path(f"/proc/{pid}/stat")
+    if status.parent.parent.joinpath("self").exists():
+        return status.exists() and status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_killed_process_leaves_no_worker_behind(tmp_path):
+    script = tmp_path / "asks.py"
+    script.write_text(ASKS)
+    asker = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    assert int(asker.stdout.readline()) == asker.pid
+    pids = [int(word) for word in asker.stdout.readline().split()]
+    assert len(pids) == 2
+    assert all(alive(pid) for pid in pids)
+    asker.send_signal(signal.SIGKILL)
+    asker.wait()
+    until = time.monotonic() + 10.0
+    while any(alive(pid) for pid in pids) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in pids)
+
+
+def interrupted() -> None:
+    with workers(1) as pool:
+        pool.submit(time.sleep, 60)
+        raise RuntimeError("enough")
+
+
+def test_an_error_gives_up_what_is_waiting():
+    begin = time.monotonic()
+    with pytest.raises(RuntimeError, match="enough"):
+        interrupted()
+    assert time.monotonic() - begin < 30.0
+
+
+def test_workers_compute_on_one_thread(monkeypatch):
+    monkeypatch.setenv(ONE_THREAD[0], "7")
+    monkeypatch.delenv(ONE_THREAD[1], raising=False)
+    with workers(1) as pool:
+        assert [pool.submit(os.getenv, name).result() for name in ONE_THREAD] == ["1"] * 3
+    assert os.environ[ONE_THREAD[0]] == "7"
+    assert ONE_THREAD[1] not in os.environ

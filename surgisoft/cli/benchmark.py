@@ -60,6 +60,10 @@ def diagnosis(
     work: Annotated[
         Path, typer.Option(metavar="DIR", help="Keeps base models and what was said of each robot.")
     ] = Path("runs/benchmark-diagnosis"),
+    amend: Annotated[
+        int,
+        typer.Option(min=0, help="Cases with one effect of the list whose model is amended too."),
+    ] = 45,
     images: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw the reliability diagram here.")
     ] = None,
@@ -69,7 +73,8 @@ def diagnosis(
 ) -> None:
     """The benchmark of `diagnose`: virtual robots with hidden effects, clean ones, unknown ones."""
     from surgisoft.errors import InputError
-    from surgisoft.studies.diagnosis import cases, run
+    from surgisoft.studies.diagnosis import run
+    from surgisoft.studies.diagnosis_cases import cases
     from surgisoft.studies.diagnosis_table import draw, markdown
 
     try:
@@ -78,8 +83,9 @@ def diagnosis(
         raise InputError(f"--robots '{robots}': expected whole numbers such as 4,5,6") from None
     some = cases(numbers, count, seed)
     with progress("diagnosis") as report:
-        outcomes = run(some, work, processes, report)
+        outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
+    command += f" --amend {amend}"
     today = datetime.date.today().isoformat()
     text = f"# Diagnosis results\n\nPrinted by `{command}` on {today}.\n\n{markdown(outcomes)}"
     if images:

@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from surgisoft.studies.diagnosis import MEMORY, Outcome
+from surgisoft.studies.diagnosis import Outcome
+from surgisoft.studies.diagnosis_after_table import (
+    after_rows,
+    amendments,
+    experiments,
+    outside,
+    rate,
+)
+from surgisoft.studies.diagnosis_cases import MEMORY
 
 SURE = 0.95
 """Confidence from which a statement counts as sure."""
@@ -21,22 +29,20 @@ NAMING = ("identified", "several", "ambiguous")
 
 def markdown(outcomes: list[Outcome]) -> str:
     """All tables as Markdown."""
-    parts = [_goals(outcomes), _confusion(outcomes), _reliability(outcomes)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _rate(hits: list[bool]) -> str:
-    """Share with its Wilson interval and the count."""
-    if not hits:
-        return "none tried"
-    low, high = stats.binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
-    share = 100 * sum(hits) / len(hits)
-    return f"{share:.1f} % ({sum(hits)} of {len(hits)}; {100 * low:.0f} to {100 * high:.0f} %)"
+    parts = [
+        _goals(outcomes),
+        _confusion(outcomes),
+        outside(outcomes),
+        experiments(outcomes),
+        amendments(outcomes),
+        _reliability(outcomes),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def single(outcomes: list[Outcome]) -> list[Outcome]:
     """One effect of the list is hidden, and the surrogate was trained."""
-    return [o for o in outcomes if len(o.case.hidden) == 1 and o.case.truth[0] != "unknown"]
+    return [o for o in outcomes if o.case.single]
 
 
 def first_right(outcome: Outcome, among: int = 1) -> bool:
@@ -66,7 +72,7 @@ def _goals(outcomes: list[Outcome]) -> str:
     lines = ["| measure | goal | measured |", "|---|---|---|"]
 
     def row(what: str, goal: str, some: list[Outcome], hit: Callable[[Outcome], bool]) -> None:
-        lines.append(f"| {what} | {goal} | {_rate([hit(o) for o in some])} |")
+        lines.append(f"| {what} | {goal} | {rate([hit(o) for o in some])} |")
 
     def split(some: list[Outcome], memory: bool) -> list[Outcome]:
         return [o for o in some if (o.case.truth[0] in MEMORY) == memory]
@@ -91,9 +97,11 @@ def _goals(outcomes: list[Outcome]) -> str:
     if seconds:
         middle, most = np.median(seconds), np.max(seconds)
         lines.append(
-            f"| time for ten minutes at 20 Hz, one thread | 5 s | median {middle:.1f} s, "
+            f"| processor time for ten minutes at 20 Hz | 5 s | median {middle:.1f} s, "
             f"longest {most:.1f} s |"
         )
+    static = split(at_least, False)
+    lines += [f"| {what} | {goal} | {said} |" for what, goal, said in after_rows(some, static)]
     return "## Goals\n\n" + "\n".join(lines)
 
 

@@ -1,0 +1,113 @@
+"""The cases of the diagnosis benchmark: which robot, what is hidden in it, and how it is looked at.
+
+The hidden effects of the rig have other forms than the model's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+KNOWN = {
+    "hysteresis": "hysteresis",
+    "rate_dependence": "rate_dependence",
+    "line_lag": "line_lag",
+    "creep": "creep",
+    "softening": "softening",
+    "stiffening": "stiffening",
+    "dead_zone": "dead_zone",
+    "gain_mismatch": "gain_mismatch",
+    "coupling": "coupling",
+    "payload": "payload",
+    "contact": "contact",
+    "misalignment": "misalignment",
+    "drift": "drift",
+    "thermal_drift": "drift",
+    "twist": "twist",
+}
+"""The rig's hidden effects and the effects of the model's list that they are."""
+MEMORY = {"hysteresis", "rate_dependence", "line_lag", "creep", "softening", "drift"}
+"""Effects that a static surrogate cannot imitate."""
+UNKNOWN = (
+    "stick_slip",
+    "leak",
+    "sensor_crosstalk",
+    "marker_slip",
+    "breathing",
+    "valve_jam",
+    "fibre_break",
+)
+"""Hidden effects that are not in the model's list."""
+PAIRS = (
+    ("creep", "payload"),
+    ("line_lag", "misalignment"),
+    ("hysteresis", "creep"),
+    ("softening", "gain_mismatch"),
+    ("drift", "dead_zone"),
+    ("rate_dependence", "payload"),
+    ("line_lag", "creep"),
+    ("misalignment", "gain_mismatch"),
+)
+"""Pairs that are hidden at once."""
+EXCITATIONS = {"poor": ("ramps", 3000), "medium": ("mixed", 6000), "rich": ("mixed", 12000)}
+"""Name -> protocol and samples at 20 Hz."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One robot and what is hidden in it."""
+
+    robot: int
+    """Seed of the specimen."""
+    hidden: tuple[tuple[str, float], ...]
+    """Hidden effects and strengths."""
+    surrogate_mm: float
+    """Validated error that the surrogate is bent to, mm; 0: as it was fitted."""
+    noise: str
+    """`white`, `loud` or `correlated`."""
+    excitation: str
+    """A name of EXCITATIONS."""
+    take: int
+    """Draws schedule and noise."""
+    undertrained: bool = False
+    """Whether the surrogate was fitted for a few epochs only."""
+
+    @property
+    def truth(self) -> tuple[str, ...]:
+        """The effects that should be named; `unknown` for those outside the list."""
+        return tuple(KNOWN.get(name, "unknown") for name, _ in self.hidden)
+
+    @property
+    def single(self) -> bool:
+        """Whether one effect of the list is hidden, and the surrogate was trained."""
+        return len(self.hidden) == 1 and self.truth[0] != "unknown" and not self.undertrained
+
+
+def cases(robots: list[int], count: int, seed: int) -> list[Case]:
+    """About `count` robots: half with one hidden effect, and clean, unknown, two, undertrained."""
+    rng = np.random.default_rng(seed)
+    single = [((name, float(strength)),) for strength in (1.0, 2.0, 0.6) for name in KNOWN]
+    plan: list[tuple[tuple, bool]] = []
+    shares = {"single": 0.5, "clean": 0.25, "unknown": 0.1, "pair": 0.1, "undertrained": 0.05}
+    for i in range(round(shares["single"] * count)):
+        plan.append((single[i % len(single)], False))
+    plan += [((), False)] * round(shares["clean"] * count)
+    for i in range(round(shares["unknown"] * count)):
+        plan.append((((UNKNOWN[i % len(UNKNOWN)], float(rng.choice([1.0, 2.0]))),), False))
+    for i in range(round(shares["pair"] * count)):
+        pair = PAIRS[i % len(PAIRS)]
+        plan.append((tuple((name, 1.2) for name in pair), False))
+    plan += [((), True)] * round(shares["undertrained"] * count)
+    answer = []
+    for take, (hidden, undertrained) in enumerate(plan):
+        answer.append(
+            Case(
+                robot=int(rng.choice(robots)),
+                hidden=hidden,
+                surrogate_mm=float(rng.choice([0.0, 0.0, 0.25])),
+                noise=str(rng.choice(["white", "white", "loud", "correlated"])),
+                excitation=str(rng.choice(["poor", "medium", "rich", "rich"])),
+                take=1000 * seed + take,
+                undertrained=undertrained,
+            )
+        )
+    return answer

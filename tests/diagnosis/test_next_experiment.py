@@ -178,6 +178,23 @@ def test_where_gravity_is_not_known_no_bench_is_turned(arm):
     assert {plan.setting for plan in plans} == {AS_IT_STANDS, "bare_tip"}
 
 
+def test_no_chamber_leaves_what_was_recorded_of_it(arm, lagging):
+    """Chamber 2 stood at 3 kPa and chamber 3 moved by 2 kPa, whatever the model's scale is."""
+    from surgisoft.surrogate.model import ArmModel
+
+    spec = replace(arm.spec, idle=(None, 3.0, None))
+    shy = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    measured = lagging.measured.copy()
+    measured[:, 2] = 5.0 + 2.0 * (measured[:, 2] - measured[:, 2].min()) / np.ptp(measured[:, 2])
+    still = replace(lagging, measured=measured)
+    answer = recommend(pose(shy, [still]), ["creep", "line_lag"], minutes=5.0)
+    rows = answer.protocol.commands
+    assert np.ptp(rows[:, 0]) > 10.0
+    np.testing.assert_allclose(rows[:, 1], 3.0)
+    assert rows[:, 2].min() >= 5.0 - 1e-5
+    assert rows[:, 2].max() <= 7.0 + 1e-5
+
+
 @pytest.mark.parametrize(
     ("rivals", "minutes", "said"),
     [

@@ -31,6 +31,7 @@ from surgisoft.diagnosis.next_experiment.question import Question, pose_question
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.model import ArmModel
@@ -161,7 +162,7 @@ def _recommend(model, problem, rivals, minutes, settings) -> Recommendation:
     rivals = None if rivals is None else list(dict.fromkeys(rivals))
     _check(model, rivals, minutes)
     question = pose_question(model, problem, rivals)
-    limits = limits_within(model.spec.low, model.spec.high)
+    limits = _limits(model, problem)
     for name in settings:
         if name not in SETTINGS:
             raise unknown_name("change of the bench", name, SETTINGS)
@@ -169,6 +170,27 @@ def _recommend(model, problem, rivals, minutes, settings) -> Recommendation:
     good = [plan for plan in plans if plan.worst >= TARGET]
     plan = min(good, key=lambda p: p.minutes) if good else max(plans, key=lambda p: p.worst)
     return _worded(question, plan, limits)
+
+
+def _limits(model: ArmModel, problem: Problem | None) -> np.ndarray:
+    """(m, 2) range of commands: no chamber leaves what was recorded of the arm.
+
+    A chamber that stood still stays where it was. The range of one that hardly moved is widened
+    in the model's scale only: it keeps to what the recordings show.
+    """
+    spec = model.spec
+    limits = limits_within(spec.low, spec.high)
+    widest = max(spec.span)
+    for chamber, idle in enumerate(spec.idle):
+        if idle is not None:
+            limits[chamber] = idle
+        elif problem is not None:
+            history = problem.history
+            seen = history.rows(history.pressure)[:, chamber]
+            low, high = float(seen.min()), float(seen.max())
+            if high - low < STILL_SHARE * widest:
+                limits[chamber] = np.clip(limits[chamber], low, high)
+    return limits
 
 
 def _check(model: ArmModel, rivals: list[str] | None, minutes: float) -> None:

@@ -26,11 +26,13 @@ import trimesh
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene, refined
 from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee, surface_model
 from surgisoft.scene.field import build_field
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import EmbreeSurface
+from surgisoft.scene.render import Renderer
 from surgisoft.scene.torch_bvh import TorchTree
 
 RADIUS_MM = 7.5
@@ -144,6 +146,16 @@ def ray_rates(mesh: Mesh, cache: Path) -> dict[str, float]:
             lambda: tree.first_hit(o.double(), d.double(), reach), 4096, 1
         ),
     }
+
+
+def picture_rate(mesh: Mesh) -> dict[str, float]:
+    """Endoscope pictures a second, an arm and the beam in view."""
+    renderer = Renderer([Body("organ", "organ", mesh)], Camera())
+    pose = frames.look_at(np.array([0.0, 0.0, 110.0]), np.zeros(3))
+    shapes = {"laser": ArmShape(arms(1, 5.0, 15.0)[0], RADIUS_MM)}
+    beam = np.array([[20.0, 0.0, 70.0], [0.0, 0.0, 50.0]])
+    name = f"picture of {renderer.width} x {renderer.height}"
+    return {name: rate(lambda: renderer.image(pose, shapes, beam_mm=beam), 1, 8)}
 
 
 def raw_fcl_ray(referee: Referee, origin, aim) -> int:
@@ -283,6 +295,8 @@ def main(argv: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         rays = ray_rates(mesh, Path(folder))
         show("rays", rays, baselines)
+        pictures = picture_rate(mesh)
+        show("the endoscope", pictures, {})
         bodies = body_rates(mesh, Path(folder))
     for title, rates in bodies.items():
         show(f"whole arms: {title}", rates, baselines)
@@ -294,7 +308,7 @@ def main(argv: list[str]) -> None:
     for row in rows:
         print("".join(f"{value:>18,.4g}" for value in row.values()))
     if options.json:
-        found = {"rays": rays, **bodies, "scaling": rows}
+        found = {"rays": rays, "endoscope": pictures, **bodies, "scaling": rows}
         options.json.write_text(json.dumps(found, indent=1))
 
 

@@ -44,8 +44,8 @@ def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
             if not console.is_terminal and time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
-                parts = ", ".join(part for part in (note, foreseen) if part)
-                print(f"surgisoft: {title} {share} {parts}", file=sys.stderr, flush=True)
+                parts = ", ".join(part for part in (share, note, foreseen) if part)
+                print(f"surgisoft: {title}: {parts}", file=sys.stderr, flush=True)
 
         yield report
 

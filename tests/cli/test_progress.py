@@ -51,6 +51,6 @@ def test_without_a_terminal_now_and_then_a_line_says_what_is_left(capsys, monkey
         for done in range(4):
             report(done, 3, "playing")
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "surgisoft: evaluate scripted 0% playing"
-    assert re.fullmatch(r"surgisoft: evaluate scripted 67% playing, \d+ s left", lines[2])
-    assert lines[3] == "surgisoft: evaluate scripted 100% playing"
+    assert lines[0] == "surgisoft: evaluate scripted: 0%, playing"
+    assert re.fullmatch(r"surgisoft: evaluate scripted: 67%, playing, \d+ s left", lines[2])
+    assert lines[3] == "surgisoft: evaluate scripted: 100%, playing"

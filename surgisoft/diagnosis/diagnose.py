@@ -19,6 +19,7 @@ from surgisoft.diagnosis.confidence import confidence
 from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
 from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.race.gates import first_shares, studentised
+from surgisoft.diagnosis.race.naming import CHANCE, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.residuals import residuals
@@ -27,22 +28,6 @@ from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
-CHANCE = 0.02
-"""Largest chance, over all effects together, at which an effect is named."""
-LARGE = (0.2, 0.5, 0.07)
-"""Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
-in some of them only), the share that makes it large, and its least log gain."""
-LEAST_GAIN = 0.25
-"""Least share of the squared error above the floor that the first effect explains."""
-NEXT_GAIN = 0.15
-"""Least share of the first such error that a further effect explains."""
-BESIDE = (0.3, 0.15, 0.75)
-"""Or: least share of what the effects before it left, least log gain, and the most that it explains
-alone beside what the first one does alone, for it must not be that one's shadow."""
-LEAST_LOG_GAIN = 0.08
-"""Least mean fall of the log error of a block."""
-MOST_EFFECTS = 3
-"""Most effects that one diagnosis names."""
 MOST_RIVALS = 3
 """Most rivals that an experiment is sought for."""
 RIVAL_SHARE = 0.9
@@ -128,52 +113,21 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     """Run the race and the gates."""
     report("held-out errors")
     race = Race.of(problem, some)
-    first = standings = race.standings()
-    named: list[Standing] = []
-    base: tuple[int, ...] = ()
-    start = race.excess(race.losses())
-    while standings and len(named) < MOST_EFFECTS:
-        passed = [s for s in standings if _passes(race, base, s, start, first, named)]
-        if not passed:
-            break
-        named.append(passed[0])
-        base += passed[0].option.picked
-        standings = race.standings(base, tuple(s.effect for s in named))
+    first = race.standings()
+    named, following = name_effects(race, first)
+    base = sum((standing.option.picked for standing in named), ())
     report("black box")
     return Findings(
         problem=problem,
         race=race,
         first=first,
         named=named,
-        next=standings,
+        next=following,
         rivals=_rivals(race, first, named),
         unique=race.unique_gains(first),
         box=black_box(problem),
         static=static_error(problem, race, base),
     )
-
-
-def _passes(
-    race: Race,
-    base: tuple[int, ...],
-    s: Standing,
-    start: float,
-    first: list[Standing],
-    named: list[Standing],
-) -> bool:
-    """Whether one effect on top of a base is beyond chance and large enough."""
-    share = (race.losses(base).sum() - s.losses.sum()) / start
-    log_gain = s.log_gain.mean()
-    if not named:
-        chance, large, least = LARGE
-        sure = s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN
-        return bool(sure or (s.p_value <= chance and share >= large and log_gain >= least))
-    if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
-        return False
-    least_gain, least_log, most = BESIDE
-    alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
-    beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
-    return bool(share >= NEXT_GAIN or beside)
 
 
 def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[str]:

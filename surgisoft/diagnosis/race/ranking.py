@@ -91,7 +91,7 @@ class Race:
         columns = [c.columns for c in candidates]
         residual = problem.residual
         columns = np.concatenate([np.zeros((*residual.shape, 0)), *columns], axis=3)
-        validation = _validation(problem, columns)
+        validation = validation_of(problem, columns)
         options: dict[str, list[Option]] = {}
         first = 0
         for number, candidate in enumerate(candidates):
@@ -186,7 +186,7 @@ class Race:
         return {} if effect is None else {q.name: q.value for q in effect.quantities()}
 
 
-def _validation(problem: Problem, columns: np.ndarray) -> CrossValidation:
+def validation_of(problem: Problem, columns: np.ndarray) -> CrossValidation:
     """Held-out errors with columns (S, n, 3, K).
 
     Rows of a reference are fitted and never judged; no effect acts on them.

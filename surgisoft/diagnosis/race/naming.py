@@ -1,0 +1,129 @@
+"""Which effects the gates let through: forward, exchanged where another fits better, and back."""
+
+from surgisoft.diagnosis.race.form import beside_loose
+from surgisoft.diagnosis.race.ranking import Race, Standing
+
+CHANCE = 0.02
+"""Largest chance, over all effects together, at which an effect is named."""
+LARGE = (0.2, 0.5, 0.07)
+"""Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
+in some of them only), the share that makes it large, and its least log gain."""
+LEAST_GAIN = 0.25
+"""Least share of the squared error above the floor that the first effect explains."""
+NEXT_GAIN = 0.15
+"""Least share of the first such error that a further effect explains."""
+BESIDE = (0.3, 0.15, 0.75)
+"""Or: least share of what the effects before it left, least log gain, and the most that it explains
+alone beside what the first one does alone, for it must not be that one's shadow."""
+LEAST_LOG_GAIN = 0.08
+"""Least mean fall of the log error of a block."""
+MOST_EFFECTS = 3
+"""Most effects that one diagnosis names."""
+OWN = (0.06, 0.3, 0.08)
+"""What a further effect must explain beside those before it let loose (`form.beside_loose`): least
+share of the first error above the floor, of what they leave, and least log gain."""
+EXCHANGES = 4
+"""Most rounds of exchanges."""
+
+
+def name_effects(race: Race, first: list[Standing]) -> tuple[list[Standing], list[Standing]]:
+    """(the effects that passed, in order, each on top of those before; the others beside them).
+
+    Forward selection takes the single effect that explains most, which beside a second one may be
+    the wrong one: after every step each named effect gives way to the one that does best beside the
+    others (stepwise exchange: Miller 2002, "Subset selection in regression", sec. 3.5), and to
+    nothing where the others explain its share.
+    """
+    named: list[Standing] = []
+    following = first
+    while following and len(named) < MOST_EFFECTS:
+        passed = next((s for s in following if _joins(race, first, named, s)), None)
+        if passed is None:
+            break
+        before = {standing.effect for standing in named}
+        named = _without_idle(race, first, _exchanged(race, [*named, passed]))
+        following = race.standings(_picked(named), tuple(s.effect for s in named))
+        if {standing.effect for standing in named} == before:
+            break
+    return named, following
+
+
+def _picked(named: list[Standing]) -> tuple[int, ...]:
+    return sum((standing.option.picked for standing in named), ())
+
+
+def _joins(race: Race, first: list[Standing], named: list[Standing], s: Standing) -> bool:
+    """Whether one effect on top of the named ones is beyond chance, large enough, and its own."""
+    start = race.excess(race.losses())
+    if not passes(race, first, named, s):
+        return False
+    if not named:
+        return True
+    left, own = beside_loose(race, named, s)
+    least_share, least_gain, least_log = OWN
+    share = (left - own.losses.sum()) / start
+    large = share >= least_share and own.gain >= least_gain
+    return bool(large and own.p_value <= CHANCE and own.log_gain.mean() >= least_log)
+
+
+def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing) -> bool:
+    """Whether one effect on top of the named ones is beyond chance and large enough."""
+    start = race.excess(race.losses())
+    share = (race.losses(_picked(named)).sum() - s.losses.sum()) / start
+    log_gain = s.log_gain.mean()
+    if not named:
+        chance, large, least = LARGE
+        sure = s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN
+        return bool(sure or (s.p_value <= chance and share >= large and log_gain >= least))
+    if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
+        return False
+    least_gain, least_log, most = BESIDE
+    alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
+    beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
+    return bool(share >= NEXT_GAIN or beside)
+
+
+def _exchanged(race: Race, named: list[Standing]) -> list[Standing]:
+    """The named effects after exchanges, the one that would be missed most first."""
+    for _ in range(EXCHANGES):
+        changed = False
+        for place in range(len(named)):
+            others = named[:place] + named[place + 1 :]
+            if not others:
+                break
+            best = race.standings(_picked(others), tuple(s.effect for s in others))[0]
+            changed = changed or best.effect != named[place].effect
+            named = [*named[:place], best, *named[place + 1 :]]
+        if not changed:
+            break
+    return _in_order(race, named)
+
+
+def _in_order(race: Race, named: list[Standing]) -> list[Standing]:
+    """The same effects, the one that would be missed most first, each on top of those before."""
+
+    def missed(standing: Standing) -> float:
+        rest = [other for other in named if other is not standing]
+        return -float(race.losses(_picked(rest)).sum())
+
+    answer: list[Standing] = []
+    for standing in sorted(named, key=missed):
+        found = race.standings(_picked(answer), tuple(s.effect for s in answer))
+        again = next((s for s in found if s.effect == standing.effect), standing)
+        answer.append(again)
+    return answer
+
+
+def _without_idle(race: Race, first: list[Standing], named: list[Standing]) -> list[Standing]:
+    """The named effects without those whose share the others explain."""
+    while len(named) > 1:
+        for standing in reversed(named):
+            others = [other for other in named if other is not standing]
+            found = race.standings(_picked(others), tuple(s.effect for s in others))
+            again = next((s for s in found if s.effect == standing.effect), None)
+            if again is None or not passes(race, first, others, again):
+                named = _in_order(race, others)
+                break
+        else:
+            break
+    return named

@@ -37,6 +37,8 @@ RIVAL_GAIN = 0.8
 EXPLAINED, LEFT_SIZE = 0.6, 5.0
 """Share of the error above the floor that named effects must explain where what they leave is still
 so many times the surrogate's validated error; else something that is not known is missing."""
+MISSED_SHARE = 0.2
+"""The same where they explain so much less, of the error above the floor, than a black box does."""
 UNKNOWN_SHARE = 0.35
 """Share of the error above the floor that a black box must explain where no effect does."""
 OFF_SIZE = 2.2
@@ -194,7 +196,9 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     names = tuple(standing.effect for standing in found.named)
     if names:
         left = numbers["static_size_after"]
-        if numbers["explained_above_floor"] < EXPLAINED and left >= LEFT_SIZE:
+        explained = numbers["explained_above_floor"]
+        missed = numbers["box_share"] - explained >= MISSED_SHARE and numbers["box_p"] <= CHANCE
+        if explained < EXPLAINED and (left >= LEFT_SIZE or missed):
             return "unknown_effect", ()
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)

@@ -100,7 +100,7 @@ class Race:
             options.setdefault(candidate.name, []).append(Option(candidate.name, picked, number))
             first += count
         for name, ways in options.items():
-            if len(ways) > 1:
+            if len(ways) > 1 and candidates[ways[0].shape].effect.side_by_side:
                 ways.append(Option(name, sum((way.picked for way in ways), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(problem, candidates, validation, options, columns, validation.counts * noise)

@@ -97,6 +97,8 @@ class Effect(nn.Module, ABC):
     """
 
     stage: Stage
+    side_by_side = True
+    """Whether several of its shapes at once make sense, as in a spectrum of times."""
     needs_reversals = False
     """Whether it can only be learned from data with inner reversals."""
 

@@ -58,8 +58,10 @@ GRID = (
     (0.1, 0.1, 0.02, TURBULENT),
     (0.3, 0.3, 0.02, TURBULENT),
     (1.0, 1.0, 0.02, TURBULENT),
-    (0.15, 0.3, 0.02, TURBULENT),
-    (0.5, 1.0, 0.02, TURBULENT),
+    (0.1, 0.2, 0.02, TURBULENT),
+    (0.2, 0.4, 0.02, TURBULENT),
+    (0.35, 0.7, 0.02, TURBULENT),
+    (0.6, 1.2, 0.02, TURBULENT),
 )
 """(filling, emptying, dead time) in s and the difference of the turn that a diagnosis tries."""
 TOLERANCE = 1e-6
@@ -99,6 +101,7 @@ class LineLag(Effect):
     """Lag of laminar or turbulent flow, with its own times up and down, and a dead time."""
 
     stage = "line"
+    side_by_side = False  # a chamber has one line; lags of both signs would be a lead
 
     def __init__(
         self,

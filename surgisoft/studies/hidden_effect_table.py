@@ -11,9 +11,9 @@ from surgisoft.studies.hidden_effect import CASES, MODELS, Outcome, StudyConfig
 from surgisoft.studies.hidden_effect_drivers import SIGHTS, TASK
 
 FORMS = {
-    "line_lag": "The rig's tube has quadratic flow, whose lag grows with the rate; the model's lag "
-    "is of first order, the same at every rate, and fitted best where the error is largest: in "
-    "quick motion. The circle is slow motion, where it is too long."
+    "line_lag": "The rig's tube and the model's line follow other laws of flow, and the model's "
+    "fitted best where the error is largest: in quick motion. The circle is slow motion, where "
+    "its lag is another one than the rig's."
 }
 """What is known of the two forms of an effect, the rig's and the model's."""
 COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.importing_clock import Between
 from surgisoft.measurement.importing_spec import Column, FileRole, ImportMap
 from surgisoft.measurement.importing_table import RawTable
 from surgisoft.measurement.importing_units import SECONDS_PER
-
-SAME_TIME_S = 1e-6
-"""Times of two files that differ by no more are the same [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,24 +128,10 @@ def _by_time(
         )
     if role.clock == "from_start":
         own, t_s = own - own[0], t_s - t_s[0]
-    before = np.searchsorted(own, t_s + SAME_TIME_S, side="right") - 1
-    before = np.clip(before, 0, max(len(own) - 2, 0))
-    after = np.minimum(before + 1, len(own) - 1)
-    gap = own[after] - own[before]
-    share = np.clip((t_s - own[before]) / np.where(gap > 0, gap, 1.0), 0, 1)
-    share[np.abs(t_s - own[before]) <= SAME_TIME_S] = 0
-    share[np.abs(t_s - own[after]) <= SAME_TIME_S] = 1
-    on_a_row = (share == 0) | (share == 1)
-    share = share[:, None]
-    first, second = values[before], values[after]
-    linear = np.where(
-        share == 0, first, np.where(share == 1, second, first + share * (second - first))
-    )
-    stay = np.where(share == 1, second, first)
+    at = Between.of(own, t_s)
     use_held = np.array(held) | (role.interpolate == "previous")
-    inside = (t_s >= own[0] - SAME_TIME_S) & (t_s <= own[-1] + SAME_TIME_S)
-    inside &= (gap <= role.max_gap_s) | on_a_row
-    return np.where(use_held, stay, linear), inside
+    found = np.where(use_held, at.held(values), at.linear(values))
+    return found, at.inside & (at.gap_s <= role.max_gap_s)
 
 
 def _note_time_join(

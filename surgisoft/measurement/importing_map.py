@@ -147,8 +147,12 @@ def _actuation(top: Section, name: str, files: tuple[FileRole, ...]) -> Actuatio
         to=section.text("to", ""),
         scale=section.take("scale", (), "a number or a number a channel", read.as_numbers),
         offset=section.take("offset", (), "a number or a number a channel", read.as_numbers),
+        delay_s=section.number("delay_s", 0.0),
+        repeated=section.choice("repeated", "keep", ("keep", "interpolate")),
     )
     section.close()
+    if name == "commanded" and parsed.repeated != "keep":
+        raise section.error("repeated", '"keep": a command is held until the next one')
     if columns and not parsed.unit:
         raise section.error("unit", 'the columns\' unit such as "kPa"')
     if parsed.unit and not re.fullmatch(r"[A-Za-z%][A-Za-z0-9%]*", parsed.unit):

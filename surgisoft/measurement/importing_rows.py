@@ -7,6 +7,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.importing_clock import (
+    LARGEST_GAP_S,
+    Between,
+    renewal_s,
+    renewed_rows,
+    without_holds,
+)
 from surgisoft.measurement.importing_spec import ImportMap
 from surgisoft.measurement.recording import Recording
 from surgisoft.measurement.recording_warnings import frozen_channels, spikes
@@ -46,6 +53,9 @@ def tidy(draft: Draft, spec: ImportMap, place: Callable[[int], str]) -> tuple[Dr
     if spec.rows.duplicates == "drop":
         draft = _without_duplicates(draft, notes)
     draft = _with_increasing_time(draft, spec, notes, place)
+    if spec.measured.repeated == "interpolate":
+        draft = _without_holds(draft, notes)
+    draft = _in_time(draft, spec, notes, place)
     if spec.rows.average is not None:
         draft = _averaged(draft, notes)
     return draft.take(np.arange(0, len(draft.t_s), spec.rows.every)), notes
@@ -116,6 +126,58 @@ def _with_increasing_time(
         )
     notes.append(f"{int(late.sum())} rows whose time does not increase left out")
     return draft.take(~late)
+
+
+def _without_holds(draft: Draft, notes: list[str]) -> Draft:
+    """Readings that a slow sensor held, on a line between them, run by run."""
+    runs = [np.flatnonzero(draft.run == run) for run in np.unique(draft.run)]
+    parts = [(draft.t_s[rows], draft.measured[rows]) for rows in runs]
+    period = renewal_s(parts)
+    measured = draft.measured.copy()
+    for rows, (t_s, values) in zip(runs, parts, strict=True):
+        measured[rows] = without_holds(t_s, values, period)
+    repeats = sum(len(values) - len(renewed_rows(values)) for _, values in parts)
+    notes.append(
+        f"measured actuation is renewed every {period:.4g} s and held in between: "
+        f"{repeats} of {len(draft.t_s)} rows interpolated"
+    )
+    return replace(draft, measured=measured)
+
+
+def _in_time(draft: Draft, spec: ImportMap, notes: list[str], place: Callable[[int], str]) -> Draft:
+    """The actuation as it was at each row, where its log is late, run by run.
+
+    A measurement is linear between the rows of its log, a command is held. Rows that the log does
+    not reach are left out.
+    """
+    late = spec.measured.delay_s
+    command_late = spec.commanded.delay_s if spec.commanded else 0.0
+    if late == 0 and command_late == 0:
+        return draft
+    measured = draft.measured.copy()
+    commanded = None if draft.commanded is None else draft.commanded.copy()
+    keep = np.ones(len(draft.t_s), bool)
+    for run in np.unique(draft.run):
+        rows = np.flatnonzero(draft.run == run)
+        t_s = draft.t_s[rows]
+        at = Between.of(t_s, t_s + late)
+        measured[rows] = at.linear(draft.measured[rows])
+        keep[rows] &= at.inside & (at.gap_s <= LARGEST_GAP_S)
+        if commanded is not None:
+            at = Between.of(t_s, t_s + command_late)
+            commanded[rows] = at.held(draft.commanded[rows])
+            keep[rows] &= at.inside
+    for name, delay in (("measured", late), ("commanded", command_late)):
+        if delay:
+            notes.append(f"{name} actuation read {delay:+g} s from each row (delay_s)")
+    if not keep.any():
+        raise InputError(
+            f"{place(int(draft.row[0]))}: delay_s {late:g} (commanded {command_late:g}) is longer "
+            "than every run, expected a short time; check the map"
+        )
+    if not keep.all():
+        notes.append(f"{int((~keep).sum())} rows that the late log does not reach left out")
+    return replace(draft, measured=measured, commanded=commanded).take(keep)
 
 
 def _averaged(draft: Draft, notes: list[str]) -> Draft:

@@ -80,6 +80,12 @@ class ActuationMap:
     scale: tuple[float, ...] = ()
     """Value = scale * cell + offset, one for all channels or one each."""
     offset: tuple[float, ...] = ()
+    delay_s: float = 0.0
+    """By how much this log is late: what stands at t was true at t - delay_s [s]. Positive where
+    the body seems to move before its actuation."""
+    repeated: str = "keep"
+    """Readings of a sensor that is slower than the log: "keep" them held until the next one, or
+    "interpolate" between readings."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,14 @@
 """Softening: the wall is softer below the largest load that it has seen (Mullins 1969).
 
-As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ x^2 of the load and its
+As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall line's load, its
 largest value so far W_max, and an exponential instead of the error function:
 
-    x_eff_i = x_i (1 + own d(W_i, W_max,i) + common d(V, V_max)),
-    d(W, W_max) = 1 - exp(-(W_max - W) / width),   W_i = x_i^2,   V = sum_i x_i^2 / m.
+    x_eff = x + own A' (u d(W, W_max)) + common x d(V, V_max),   u = A x,
+    d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
+    W_i = u_i^2,   V = sum_i x_i^2 / m.
 
-On a first loading W = W_max and nothing changes.
+A has ones on its diagonal and the share of the other chambers beside them: a chamber that bends the
+arm shortens the wall on the other side. On a first loading W = W_max and nothing changes.
 """
 
 import torch
@@ -19,11 +21,14 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
+    mixed,
     value_of,
 )
 
-GRID = (0.05, 0.2, 0.8)
-"""Widths that a diagnosis tries, in units of the energy at full load."""
+GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
+"""Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
+OTHERS = (0.0, -0.35)
+"""Shares of the other chambers in a wall line's load that a diagnosis tries."""
 
 
 class Softening(Effect):
@@ -31,24 +36,37 @@ class Softening(Effect):
 
     stage = "material"
 
-    def __init__(self, facts: ArmFacts, width: float = 0.2):
-        """Fall of the energy over which the wall turns soft, in units of that at full load."""
+    def __init__(
+        self, facts: ArmFacts, width: float = 0.2, growth: float = 0.02, others: float = 0.0
+    ):
+        """width: fall of the energy over which the wall turns soft, in units of that at full load.
+
+        growth: what that grows by, as a share of the largest energy; others: share of the other
+        chambers in a wall line's load.
+        """
         super().__init__(facts)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
+        self.log_growth = logarithm(growth)
+        self.others = nn.Parameter(torch.tensor([float(others)]))
 
     def strengths(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "common": self.common}
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, width) for width in GRID]
+        others = OTHERS if len(facts.low) > 1 else OTHERS[:1]
+        return [cls(facts, *widths, share) for widths in GRID for share in others]
+
+    def memory_parameters(self) -> list[nn.Parameter]:
+        return [self.others]
 
     def energy(self, signal: Tensor) -> Tensor:
-        """(..., m + 1) energy of each chamber and the mean of all, from actuation (..., m)."""
-        own = self.load(signal).square()
-        return torch.cat([own, own.mean(-1, keepdim=True)], dim=-1)
+        """(..., m + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
+        load = self.load(signal)
+        own, mean = mixed(load, self.others).square(), load.square().mean(-1, keepdim=True)
+        return torch.cat([own, mean], dim=-1)
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, m + 1) largest energies of an arm that has only seen the actuation (B, m)."""
@@ -65,9 +83,10 @@ class Softening(Effect):
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at strength one: own and common."""
         below = (memory - self.energy(signal)).clamp(min=0)
-        damage = -torch.expm1(-below / self.log_width.exp())
-        moved = signal - self.origin
-        return moved * damage[..., :-1], moved * damage[..., -1:]
+        damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
+        load = self.load(signal)
+        own = mixed(mixed(load, self.others) * damage[..., :-1], self.others)
+        return self.reach * own, self.reach * load * damage[..., -1:]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m) and largest energies."""
@@ -87,5 +106,7 @@ class Softening(Effect):
             Quantity("own_share", value_of(self.own), "", -0.5, 1.0, rubber),
             Quantity("common_share", value_of(self.common), "", -0.5, 1.0, rubber),
             Quantity("total_share", total, "", 0.0, 1.0, rubber),
-            Quantity("width_share", value_of(self.log_width.exp()), "", 0.005, 5.0, rubber),
+            Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber),
+            Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
+            Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]

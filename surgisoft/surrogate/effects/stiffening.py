@@ -1,12 +1,14 @@
 """Stiffening: the wall resists more, the farther it is strained.
 
-The share of push that is lost grows with a chamber's own load and with the bending of the arm,
-after Fung's exponential (Fung 1967), whose first term is the cubic spring:
+The share of push that is lost grows with the load u of each wall line and with the bending of the
+arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
-    x_eff_i = x_i (1 - own h(x_i^2) - bend h(B^2)),   h(q) = (exp(k q) - 1) / (exp(k) - 1),
+    x_eff = x - own A' (u h(u^2)) - bend x h(B^2),   u = A x,
+    h(q) = (exp(k q) - 1) / (exp(k) - 1),
     B^2 = sum_i (x_i - mean x)^2 m / (m - 1),
 
-with B = 1 where one chamber alone is fully loaded.
+with B = 1 where one chamber alone is fully loaded. A has ones on its diagonal and the share of the
+other chambers beside them: a chamber that bends the arm shortens the wall on the other side.
 """
 
 import torch
@@ -18,11 +20,14 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
+    mixed,
     value_of,
 )
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
+OTHERS = (0.0, -0.35)
+"""Shares of the other chambers in a wall line's load that a diagnosis tries."""
 
 
 class Stiffening(Memoryless):
@@ -30,31 +35,38 @@ class Stiffening(Memoryless):
 
     stage = "material"
 
-    def __init__(self, facts: ArmFacts, steepness: float = 1.0):
-        """Steepness k of the exponential; towards 0 a cubic spring."""
+    def __init__(self, facts: ArmFacts, steepness: float = 1.0, others: float = 0.0):
+        """steepness: k of the exponential; towards 0 a cubic spring.
+
+        others: share of the other chambers in a wall line's load.
+        """
         super().__init__(facts)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
+        self.others = nn.Parameter(torch.tensor([float(others)]))
 
     def strengths(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "bend": self.bend}
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        return [cls(facts, steepness) for steepness in GRID]
+        others = OTHERS if len(facts.low) > 1 else OTHERS[:1]
+        return [cls(facts, steepness, share) for steepness in GRID for share in others]
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at strength one: own and bending."""
         x, k = self.load(signal), self.log_steepness.exp()
         m = x.shape[-1]
         bend = (x - x.mean(-1, keepdim=True)).square().sum(-1, keepdim=True) * m / max(m - 1, 1)
-        moved = signal - self.origin
-        return tuple(
+
+        def lost(load: Tensor, q: Tensor) -> Tensor:
             # A recording beyond the fitted range must not blow up.
-            -moved * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
-            for q in (x.square(), bend)
-        )
+            return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
+
+        line = mixed(x, self.others)
+        own = mixed(lost(line, line.square()), self.others)
+        return self.reach * own, self.reach * lost(x, bend)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m)."""
@@ -82,4 +94,5 @@ class Stiffening(Memoryless):
                 "a wall that stiffens takes push and leaves some",
             ),
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
+            Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]

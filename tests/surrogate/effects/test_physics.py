@@ -107,7 +107,7 @@ def test_rate_dependence_holds_back_a_ramp_by_its_rate():
 
 
 def test_softening_leaves_the_first_loading_and_softens_the_second():
-    soft = with_strength(make_effect("softening", RANGE, width=0.3), own=0.2)
+    soft = with_strength(make_effect("softening", RANGE, width=0.2, growth=0.1), own=0.2)
     sweep = torch.cat(
         [torch.linspace(0, 1, 11), torch.linspace(1, 0, 11), torch.linspace(0, 1, 11)]
     )
@@ -115,6 +115,24 @@ def test_softening_leaves_the_first_loading_and_softens_the_second():
     assert torch.equal(answer[:11], sweep[:11])
     assert float(answer[-6]) == pytest.approx(0.5 * (1 + 0.2 * (1 - math.exp(-0.75 / 0.3))), 1e-4)
     assert float(answer[-1]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_softening_of_wall_lines_that_the_other_chambers_shorten():
+    soft = make_effect("softening", RANGE, width=0.2, growth=0.1, others=-0.5)
+    answer = run(with_strength(soft, own=0.2), [[1.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    # Lines see (1, -0.5, -0.5), then half of that.
+    near = 1 - math.exp(-0.75 / (0.2 + 0.1))
+    far = 1 - math.exp(-0.1875 / (0.2 + 0.025))
+    assert torch.allclose(answer[0], torch.tensor([1.0, 0.0, 0.0]), atol=1e-6)
+    pushed = torch.tensor([0.5 * near + 0.25 * far, *2 * [-0.25 * near - 0.125 * far]])
+    assert torch.allclose(answer[1], torch.tensor([0.5, 0.0, 0.0]) + 0.2 * pushed, atol=1e-5)
+
+
+def test_stiffening_of_wall_lines_that_the_other_chambers_shorten():
+    stiff = make_effect("stiffening", RANGE, steepness=0.001, others=-0.5)
+    answer = run(with_strength(stiff, own=0.1), [[1.0, 1.0, 0.0]])
+    # Lines see (0.5, 0.5, -1) and resist by their cubes.
+    assert torch.allclose(answer[0], torch.tensor([0.94375, 0.94375, 0.1125]), atol=1e-3)
 
 
 def test_stiffening_takes_its_share_at_full_load_and_starts_as_a_cubic():

@@ -31,10 +31,12 @@ def amend(
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write NEW even where no fall can be claimed.")
     ] = False,
-    retune: Annotated[
+    keep_network: Annotated[
         bool,
         typer.Option(
-            "--retune-network", help="Also re-tune the network, where held-out data rewards it."
+            "--keep-network",
+            help="Leave the network as it is; else its last layer is re-tuned behind the effects "
+            "where held-out data rewards that.",
         ),
     ] = False,
 ) -> None:
@@ -58,14 +60,16 @@ def amend(
     torch.set_num_threads(1)
     with progress("amend") as tell:
         stages = iter(range(100))
-        result = amend_model(arm, measured, names, retune, lambda text: tell(next(stages), 4, text))
+        result = amend_model(
+            arm, measured, names, not keep_network, lambda text: tell(next(stages), 4, text)
+        )
     warn_outside(arm, measured)
     for name in result.refitted:
         print(f"{name}: the model has it; its parameters were fitted anew")
     show_parameters(result.parameters)
     if result.retuned:
         print("the network's last layer was re-tuned: held-out motion rewards it")
-    claimed = result.locked.claimed
+    claimed = result.claimed
     if claimed or anyway:
         save_amended(result, output, model, measured, force, known)
     if json_file:

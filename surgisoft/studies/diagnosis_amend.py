@@ -1,7 +1,8 @@
 """Amendments in the diagnosis benchmark: how far the error falls beside what could be reached.
 
 The oracle knows the effect's own form and size: the base model's error on the same robot, schedule
-and noise with nothing hidden. All errors are of the locked quarter, as `amend` judges.
+and noise with nothing hidden, its network re-tuned to that where `amend` would. All errors are of
+the locked quarter, as `amend` judges.
 """
 
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import numpy as np
 
 from surgisoft.diagnosis.amend import EVERY_ROW, amend
 from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.measurement.recording import Recording
 from surgisoft.studies.diagnosis_robots import Recorded
 from surgisoft.surrogate.model import ArmModel
@@ -26,7 +28,7 @@ class Amended:
     after: float
     """Of the model that `amend` leaves: the old one where no fall is claimed, mm."""
     oracle: float
-    """Of the model as it was on a robot with nothing hidden, mm."""
+    """Of the model on a robot with nothing hidden, its network re-tuned where that pays, mm."""
 
     @property
     def share(self) -> float:
@@ -38,9 +40,12 @@ def amended(model: ArmModel, recorded: Recorded, effects: tuple[str, ...]) -> Am
     """Amend a model by effects and compare with the oracle."""
     before = after = locked_error(model, recorded.recording)
     if effects:
-        fall = amend(model, [recorded.recording], list(effects)).locked
-        before, after = fall.before, fall.after if fall.claimed else fall.before
-    return Amended(effects, before, after, locked_error(model, recorded.plain))
+        found = amend(model, [recorded.recording], list(effects))
+        fall = found.locked
+        before, after = fall.before, fall.after if found.claimed else fall.before
+    plain = recorded.plain
+    oracle = retune(model, pose(model, [plain], part="open")).model
+    return Amended(effects, before, after, locked_error(oracle, plain))
 
 
 def locked_error(model: ArmModel, recording: Recording) -> float:

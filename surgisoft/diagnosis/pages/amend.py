@@ -26,6 +26,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
         [
             ("before", f"{fall.before:.3f} mm"),
             ("after", f"{fall.after:.3f} mm"),
+            ("after, effects alone", f"{result.alone.after:.3f} mm"),
             ("noise floor", f"{fall.floor:.3f} mm"),
             ("fall, 95 %", f"{fall.ci95[0]:.3f} .. {fall.ci95[1]:.3f} mm"),
             ("rows that judged", f"{fall.rows}"),
@@ -36,7 +37,7 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
         title=title,
         verdict=result.sentence,
         about=about,
-        tone="good" if fall.claimed else "warn",
+        tone="good" if result.claimed else "warn",
         parts=[
             facts,
             Section("Parameters", [parameter_table(result.parameters)]),

@@ -37,6 +37,7 @@ from surgisoft.measurement.importing_table import RawTable, parquet_table
 from surgisoft.measurement.importing_text import text_table
 from surgisoft.measurement.importing_units import factor
 from surgisoft.measurement.recording import Recording
+from surgisoft.measurement.recording_timing import timing_notes
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 
@@ -384,4 +385,4 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     if spec.key_points.spikes == "missing":
         recording, marked = without_spikes(recording)
         notes = [*notes, *marked]
-    return Imported(recording, notes)
+    return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])

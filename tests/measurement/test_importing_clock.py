@@ -125,3 +125,44 @@ def test_a_long_rest_stays_a_rest_until_the_last_reading_before_the_step(tmp_pat
 def test_a_command_is_never_interpolated(tmp_path):
     with pytest.raises(InputError, match="repeated"):
         imported(tmp_path, late(np.arange(9) / 10, 0), commanded='repeated = "interpolate"')
+
+
+def wandering(t_s, seed):
+    """(T, 2) smooth random actuation at any time, the sum of 40 sines below 0.8 Hz."""
+    rng = np.random.default_rng(seed)
+    rate, phase = rng.uniform(0.05, 0.8, 40), rng.uniform(0, 6.28, (2, 40))
+    waves = np.sin(2 * np.pi * rate * t_s[:, None, None] + phase)
+    return 30 + 3 * waves.sum(axis=2)
+
+
+def test_the_number_in_the_note_puts_the_log_right(tmp_path):
+    t_s = np.arange(6000) / 100
+    table = late(t_s, 0.0)
+    now, before = wandering(t_s, 0), wandering(t_s - 0.04, 0)
+    noise = np.random.default_rng(0).normal(size=(6000, 3))
+    table[:, 1:3] = table[:, 3:5] = before
+    table[:, 5:] = np.stack([now[:, 0], now[:, 1], 70 - 0.01 * now[:, 0] ** 2], axis=1) + noise / 20
+    _, notes = imported(tmp_path, table)
+    (note,) = [note for note in notes if "delay_s" in note]
+    value = float(note.split("delay_s = ")[1].split()[0])
+    assert value == pytest.approx(0.04, abs=0.002)
+    recording, notes = imported(tmp_path, table, f"delay_s = {value}")
+    assert not any("before its measured" in note for note in notes)
+    kept = t_s[: recording.samples]
+    np.testing.assert_allclose(recording.measured, wandering(kept, 0), atol=0.4)
+
+
+def test_held_readings_are_noted_until_the_map_interpolates_them(tmp_path):
+    t_s = np.arange(6000) / 100
+    table = late(t_s, 0.0)
+    now = wandering(t_s, 1)
+    table[:, 1:3] = np.repeat(now[::5], 5, axis=0)
+    table[:, 3:5] = now
+    table[:, 5:] = np.stack([now[:, 0], now[:, 1], 70 - 0.01 * now[:, 0] ** 2], axis=1)
+    _, notes = imported(tmp_path, table)
+    assert sum("renewed every 0.05 s only" in note for note in notes) == 1
+    assert not any("delay_s" in note for note in notes)
+    recording, notes = imported(tmp_path, table, 'repeated = "interpolate"')
+    assert "held in between: 4800 of 6000 rows interpolated" in notes[0]
+    assert not any("[measured]" in note for note in notes)
+    np.testing.assert_allclose(recording.measured[:5990], now[:5990], atol=0.1)

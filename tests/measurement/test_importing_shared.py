@@ -12,6 +12,7 @@ import pytest
 from surgisoft.measurement.importing import import_files
 from surgisoft.measurement.importing_map import load_map
 from surgisoft.measurement.recording import load_recording, save_recording
+from surgisoft.measurement.recording_timing import body_lead, held_period_s
 from surgisoft.measurement.recording_warnings import find_oddities
 
 MAPS = Path(__file__).resolve().parents[2] / "docs" / "examples" / "maps"
@@ -149,3 +150,40 @@ def test_imported_recording_survives_both_forms(trunk, tmp_path):
         read = load_recording(tmp_path / f"trunk{suffix}", on_warning=lambda _: None)
         for name in ("t_s", "measured", "commanded", "key_points_mm", "payload_g"):
             np.testing.assert_array_equal(getattr(read, name), getattr(recording, name))
+
+
+def test_trunk_motors_are_read_at_20_hz_and_then_follow_in_time(trunk):
+    """Held readings put the body 0.01 to 0.02 s ahead; on a line between them it is not.
+
+    The static quadratic map of angles to positions fits the moves of 0.05 s better so.
+    """
+    folder, (recording, _) = trunk
+    raw = np.genfromtxt(
+        folder / "observations_controlled_1.csv",
+        delimiter=",",
+        skip_header=1,
+        usecols=range(10, 16),
+    )[1:]
+    changed = (np.diff(raw, axis=0) != 0).any(axis=1)
+    assert np.median(np.diff(np.flatnonzero(changed))) == 5
+    assert held_period_s(recording) is None
+    assert body_lead(recording) is None
+    points = recording.key_points_mm[:, 2]
+    shares = []
+    for angles in (raw, recording.measured):
+        scaled = angles / 80
+        pairs = [scaled[:, i] * scaled[:, j] for i in range(6) for j in range(i, 6)]
+        features = np.column_stack([scaled, *pairs])
+        moves, motion = features[5:] - features[:-5], points[5:] - points[:-5]
+        known = ~np.isnan(motion).any(axis=1)
+        fit = np.linalg.lstsq(moves[known], motion[known], rcond=None)[0]
+        left = motion[known] - moves[known] @ fit
+        shares.append(np.square(left).sum() / np.square(motion[known]).sum())
+    assert shares[1] < 0.8 * shares[0]
+
+
+def test_no_arm_here_leads_its_actuation(shared):
+    folder = folder_of(shared, "asu_two_segment")
+    for name in ("asu_two_segment.toml", "asu_two_segment_commanded.toml"):
+        (part,) = import_files([folder], load_map(str(MAPS / name)), "asu")
+        assert not any("[measured]" in note for note in part.notes)

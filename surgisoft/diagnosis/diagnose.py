@@ -7,6 +7,7 @@
 5. One effect after another, until the gates are silent; rivals and leftovers decide the answer.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
 from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
 from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
+from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.gates import first_shares, studentised
 from surgisoft.diagnosis.race.naming import CHANCE, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing
@@ -34,15 +36,22 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
-EXPLAINED, LEFT_SIZE = 0.6, 5.0
+EXPLAINED, LEFT_SIZE, STATIC_SIZE = 0.6, 2.5, 5.0
 """Share of the error above the floor that named effects must explain where what they leave is still
-so many times the surrogate's validated error; else something that is not known is missing."""
+so many times the surrogate's validated error, or the static part of it is so many times; else
+something that is not known is missing."""
 MISSED_SHARE = 0.2
 """The same where they explain so much less, of the error above the floor, than a black box does."""
+BETTER_BOX = (0.05, 0.25)
+"""From when on a black box does so much better than the named effects that they are not what is
+missing: share of the error above the floor that it explains besides, and mean fall of a block's log
+error."""
 UNKNOWN_SHARE = 0.35
 """Share of the error above the floor that a black box must explain where no effect does."""
 OFF_SIZE = 2.2
 """Factor on the validated error from which a static error is more than the surrogate's own."""
+NEAREST = 0.25
+"""Most confidence in the effect that comes nearest to an unknown one."""
 TRAINED = 2.0
 """Factor on the floor from which an error of the surrogate's own is too much."""
 
@@ -67,6 +76,8 @@ class Findings:
     box: BlackBox
     static: StaticError
     """The surrogate's own error before and after the named effects."""
+    loose: Loosened | None
+    """What the named effects, or the one and its rivals, do beyond that with forms let loose."""
 
     @property
     def picked(self) -> tuple[int, ...]:
@@ -118,6 +129,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     first = race.standings()
     named, following = name_effects(race, first)
     base = sum((standing.option.picked for standing in named), ())
+    rivals = _rivals(race, first, named)
     report("black box")
     return Findings(
         problem=problem,
@@ -125,11 +137,22 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
         first=first,
         named=named,
         next=following,
-        rivals=_rivals(race, first, named),
+        rivals=rivals,
         unique=race.unique_gains(first),
         box=black_box(problem),
         static=static_error(problem, race, base),
+        loose=_loose(race, first, named, rivals),
     )
+
+
+def _loose(
+    race: Race, first: list[Standing], named: list[Standing], rivals: list[str]
+) -> Loosened | None:
+    """The named effects, or the one and its rivals, let loose."""
+    if not named:
+        return None
+    others = [s for s in first if s.effect in rivals[:MOST_RIVALS]] if len(named) == 1 else []
+    return loosened(race, [named, *([s] for s in others)])
 
 
 def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[str]:
@@ -155,8 +178,10 @@ def answer(found: Findings) -> Diagnosis:
     floor = float(np.sqrt(np.mean(problem.noise_mm**2)))
     reached = race.rmse_mm(race.losses(found.picked))
     numbers = statistics(found)
-    sure = confidence(numbers)
     kind, effects = _kind(found, numbers)
+    sure = confidence(numbers)
+    if kind == "unknown_effect":
+        sure = min(sure, NEAREST)
     levels = ErrorLevels(before, floor, min(reached, found.box.rmse_mm, before))
     ranking = tuple(
         _ranked(found, standing, sure if place == 0 else min(sure, 1.0 - sure))
@@ -195,10 +220,7 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     """The kind of the answer and the effects that it names."""
     names = tuple(standing.effect for standing in found.named)
     if names:
-        left = numbers["static_size_after"]
-        explained = numbers["explained_above_floor"]
-        missed = numbers["box_share"] - explained >= MISSED_SHARE and numbers["box_p"] <= CHANCE
-        if explained < EXPLAINED and (left >= LEFT_SIZE or missed):
+        if _imitated(found, numbers):
             return "unknown_effect", ()
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
@@ -213,6 +235,23 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     return "nothing_missing", ()
 
 
+def _imitated(found: Findings, numbers: dict) -> bool:
+    """Whether the named effects only stand for something else.
+
+    They explain too little and leave much, or a black box explains more, or other forms of them do.
+    """
+    explained = numbers["explained_above_floor"]
+    beaten = numbers["box_share"] - explained
+    sure = numbers["box_p"] <= CHANCE
+    much = numbers["static_size_after"] >= STATIC_SIZE or numbers["left_size"] >= LEFT_SIZE
+    if explained < EXPLAINED and (much or (sure and beaten >= MISSED_SHARE)):
+        return True
+    share, log_gain = BETTER_BOX
+    if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:
+        return True
+    return found.loose is not None and found.loose.wrong
+
+
 def statistics(found: Findings) -> dict:
     """The numbers that the answer and its confidence are made from."""
     race, problem = found.race, found.problem
@@ -220,6 +259,8 @@ def statistics(found: Findings) -> dict:
     raw = float(np.nansum(np.square(problem.residual)))
     null = race.losses()
     after = race.losses(found.picked)
+    seen = np.isfinite(problem.residual).all(2).sum(0)
+    allowed = np.square(problem.surrogate_mm)
     best = found.named[0] if found.named else (found.first[0] if found.first else None)
     others = [s for s in found.first if best is not None and s.effect != best.effect]
     runner = others[0] if others else None
@@ -243,6 +284,11 @@ def statistics(found: Findings) -> dict:
         "explained_above_floor": float((null.sum() - after.sum()) / race.excess(null)),
         "box_share": float((null.sum() - found.box.losses.sum()) / race.excess(null)),
         "box_p": found.box.p_value,
+        "box_log_gain": float(race.log_ratio(after, found.box.losses).mean()),
+        "left_size": math.sqrt(race.excess(after) / float(seen @ allowed)),
+        "loose_share": found.loose.share if found.loose else 0.0,
+        "loose_log_gain": found.loose.log_gain if found.loose else 0.0,
+        "loose_p": found.loose.p_value if found.loose else 1.0,
         "named": len(found.named),
         "rivals": len(found.rivals),
         "steps": [

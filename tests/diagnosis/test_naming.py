@@ -22,6 +22,8 @@ LOSS = {"": 100, "0": 40, "1": 55, "2": 50, "01": 20, "02": 18, "12": 2, "012": 
 class Table:
     """A race whose losses are those of LOSS, spread over blocks."""
 
+    floor = np.full(40, 1.0 / 40)
+
     def losses(self, picked=()):
         rng = np.random.default_rng(0)
         share = rng.uniform(0.9, 1.1, 40)
@@ -84,3 +86,14 @@ def test_two_effects_of_a_robot_are_both_named():
     found = diagnose(model, [recording], reference=known)
     assert found.verdict.kind == "several"
     assert set(found.verdict.effects) == {"creep", "payload"}
+
+
+@pytest.mark.parametrize("name", ["leak", "breathing"])
+def test_what_is_outside_the_list_is_not_called_by_its_nearest_relative(name):
+    """A leak has nearly the form of a gain; breathing shifts the mount only now and then."""
+    rig = VirtualRig(0, take=5, hidden=((name, 2.0),))
+    recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=5))
+    model, known = load_model("default"), load_known_error("default")
+    found = diagnose(model, [recording], reference=known)
+    assert found.verdict.kind == "unknown_effect"
+    assert found.ranking[0].confidence <= 0.25

@@ -7,10 +7,69 @@ directions and of the place along the body. Only what a further effect explains 
 own. (The discrepancy term of Kennedy & O'Hagan 2001, here for the form of an effect.)
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Race, Standing, validation_of
+
+WRONG, ALL_WRONG = 0.009, 0.03
+"""Least product of what goes when a form is let loose, as a share of the error above the floor, and
+the mean fall of a block's log error, from which that form is wrong; the same where it stands for
+all of several rivals, which an experiment may tell apart."""
+CHANCE = 0.02
+"""Largest chance of such a fall."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loosened:
+    """What named effects explain more where their forms are let loose."""
+
+    losses: np.ndarray
+    """(B,) held-out sum of squared distances by block, mm^2."""
+    share: float
+    """Share of the error above the floor that goes besides."""
+    log_gain: float
+    """Mean fall of a block's log error."""
+    p_value: float
+    """Chance of such a fall without a cause."""
+    ways: int
+    """How many ways to explain the error it was compared with."""
+
+    @property
+    def worth(self) -> float:
+        """Share that goes times the mean fall of the log error; 0 where either rises."""
+        return max(self.share, 0.0) * max(self.log_gain, 0.0)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the forms are not those of what is missing."""
+        least = WRONG if self.ways == 1 else ALL_WRONG
+        return self.worth >= least and self.p_value <= CHANCE
+
+
+def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
+    """What the best of several ways to explain the error, let loose, does beyond all of them.
+
+    ways: sets of effects that explain the error about as well; one set where nothing rivals it.
+    """
+    tried = []
+    for named in ways:
+        columns = _loose_columns(race, named)
+        tried.append(validation_of(race.problem, columns).losses(range(columns.shape[3])))
+    best = min(tried, key=np.sum)
+    beyond = [_beyond(race, _picked(named), best, len(ways)) for named in ways]
+    return min(beyond, key=lambda one: one.worth)
+
+
+def _beyond(race: Race, picked: tuple[int, ...], after: np.ndarray, ways: int) -> Loosened:
+    before = race.losses(picked)
+    log_gain = race.log_ratio(before, after)
+    chance = float(family_p_values(log_gain[None])[0]) if log_gain.any() else 1.0
+    share = (before.sum() - after.sum()) / race.excess(race.losses())
+    return Loosened(after, float(share), float(log_gain.mean()), chance, ways)
 
 
 def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[float, Standing]:
@@ -18,16 +77,7 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
 
     The chance counts this one effect alone: the others have been corrected for before.
     """
-    base = sum((standing.option.picked for standing in named), ())
-    amplitudes = race.validation.amplitudes(base)
-    columns, first = [race.columns[..., list(base)]], 0
-    for standing in named:
-        count = len(standing.option.picked)
-        picked = list(standing.option.picked)
-        part = race.columns[..., picked] @ amplitudes[first : first + count]
-        columns.append(_loose(race, part))
-        first += count
-    columns.append(race.columns[..., list(further.option.picked)])
+    columns = [_loose_columns(race, named), race.columns[..., list(further.option.picked)]]
     together = np.concatenate(columns, axis=3)
     validation = validation_of(race.problem, together)
     total = together.shape[3]
@@ -39,6 +89,23 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     gain = (before.sum() - after.sum()) / excess
     answer = Standing(further.effect, further.option, after, log_gain, chance, float(gain))
     return float(before.sum()), answer
+
+
+def _picked(named: Sequence[Standing]) -> tuple[int, ...]:
+    return sum((standing.option.picked for standing in named), ())
+
+
+def _loose_columns(race: Race, named: Sequence[Standing]) -> np.ndarray:
+    """(S, n, 3, K) the named effects' columns, and what each of them explains, scaled."""
+    base = _picked(named)
+    amplitudes = race.validation.amplitudes(base)
+    columns, first = [race.columns[..., list(base)]], 0
+    for standing in named:
+        picked = list(standing.option.picked)
+        part = race.columns[..., picked] @ amplitudes[first : first + len(picked)]
+        columns.append(_loose(race, part))
+        first += len(picked)
+    return np.concatenate(columns, axis=3)
 
 
 def _loose(race: Race, part: np.ndarray) -> np.ndarray:

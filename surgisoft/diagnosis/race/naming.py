@@ -15,6 +15,8 @@ NEXT_GAIN = 0.15
 BESIDE = (0.3, 0.15, 0.75)
 """Or: least share of what the effects before it left, least log gain, and the most that it explains
 alone beside what the first one does alone, for it must not be that one's shadow."""
+NEARLY_ALL = 0.8
+"""Or: share of what the effects before it left that no shadow explains."""
 LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""
 MOST_EFFECTS = 3
@@ -22,6 +24,8 @@ MOST_EFFECTS = 3
 OWN = (0.06, 0.3, 0.08)
 """What a further effect must explain beside those before it let loose (`form.beside_loose`): least
 share of the first error above the floor, of what they leave, and least log gain."""
+HALF = 0.5
+"""Or it leaves at most this share of what those before it leave that are let loose."""
 EXCHANGES = 4
 """Most rounds of exchanges."""
 
@@ -63,7 +67,9 @@ def _joins(race: Race, first: list[Standing], named: list[Standing], s: Standing
     least_share, least_gain, least_log = OWN
     share = (left - own.losses.sum()) / start
     large = share >= least_share and own.gain >= least_gain
-    return bool(large and own.p_value <= CHANCE and own.log_gain.mean() >= least_log)
+    if large and own.p_value <= CHANCE and own.log_gain.mean() >= least_log:
+        return True
+    return bool(race.excess(s.losses) <= HALF * (left - race.floor.sum()))
 
 
 def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing) -> bool:
@@ -80,7 +86,7 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     least_gain, least_log, most = BESIDE
     alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
     beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
-    return bool(share >= NEXT_GAIN or beside)
+    return bool(share >= NEXT_GAIN or beside or s.gain >= NEARLY_ALL)
 
 
 def _exchanged(race: Race, named: list[Standing]) -> list[Standing]:

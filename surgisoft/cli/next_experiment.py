@@ -11,6 +11,9 @@ from surgisoft.cli.inputs import read_recordings, warn
 from surgisoft.cli.options import Force, JsonFile, Model
 from surgisoft.errors import InputError
 
+ON_RIG = (3, "kPa")
+"""Chambers and unit of the arm that the virtual rig has."""
+
 
 @app.command("next-experiment")
 def next_experiment(
@@ -26,8 +29,8 @@ def next_experiment(
         list[str] | None,
         typer.Option(
             metavar="NAME...",
-            help="The rival effects; default: those that explain the recordings best, "
-            "without recordings all known ones.",
+            help="The rival effects, one after another or with commas; default: those that explain "
+            "the recordings best, without recordings all known ones.",
         ),
     ] = None,
     minutes: Annotated[
@@ -54,19 +57,20 @@ def next_experiment(
     check_folder(output.absolute().parent)
     check_free(json_file, "separates")
     arm = load_model(model)
+    rivals = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
     if recordings:
         measured = read_recordings(recordings)
         for name in {r.label for r in measured if _turned(arm.spec.gravity, r.gravity)}:
             warn(f"{name}: the weight pulls along another direction than where MODEL was fitted")
         problem = pose(arm, measured)
-        answer = recommend(problem, between or likely_rivals(problem), minutes, settings)
+        answer = recommend(problem, rivals or likely_rivals(problem), minutes, settings)
     else:
-        answer = propose(arm, between, minutes, settings)
+        answer = propose(arm, rivals, minutes, settings)
     write_text(output, schedule_text(answer.protocol))
     if json_file:
         write_json(json_file, answer.to_json())
-    _show(answer, model, recordings or [], output)
+    _show(answer, arm.spec, model, recordings or [], output)
 
 
 def _turned(fitted, came) -> bool:
@@ -76,21 +80,22 @@ def _turned(fitted, came) -> bool:
     return sum(a * b for a, b in zip(fitted, came, strict=True)) < 0.9962
 
 
-def _show(answer, model: Path, recordings: list[Path], output: Path) -> None:
+def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> None:
     from surgisoft.diagnosis.isolability.matrix import SURE
 
     print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
     print(f"why: {answer.why}")
     for number, step in enumerate(answer.steps, 1):
         print(f"  {number}. {step}")
-    if answer.by_hand:
-        print(f"  then: surgisoft compare {model} NEW.parquet")
+    on_rig = (spec.chambers, spec.unit) == ON_RIG
+    if answer.by_hand and on_rig:
         print("  the virtual rig has no option for that change: --as-it-stands asks for none")
-    else:
+    elif on_rig:
         options = f" {answer.options}" if answer.options else ""
-        old = "".join(f" {path}" for path in recordings)
         print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
-        print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
+    # A change that takes something away speaks by the new recording alone.
+    old = "" if answer.by_hand else "".join(f" {path}" for path in recordings)
+    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
     for pair in sorted(answer.pairs, key=lambda pair: pair.after):
         a, b = pair.effects
         print(

@@ -1,7 +1,7 @@
 """The recommended experiment: runs on the rig, stays in range, and tells rivals apart."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.resources import files
 
 import numpy as np
@@ -24,12 +24,14 @@ from surgisoft.diagnosis.next_experiment.catalogue import (
 from surgisoft.diagnosis.next_experiment.plans import make_plans
 from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
 from surgisoft.diagnosis.next_experiment.question import pose_question
+from surgisoft.diagnosis.next_experiment.words import words_for
 from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recording import save_recording
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.model import ArmModel
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +222,7 @@ def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):
         ([model, "-o", str(tmp_path / "s.txt")], "expected .csv"),
         ([str(tmp_path / "none"), "-o", str(out)], "no arm model there"),
         ([model, "-o", str(out), "--between", "creep"], "at least two"),
+        ([model, "-o", str(out), "--between", "creep,play"], "unknown effect 'play'"),
         ([model, str(tmp_path / "x.csv"), "-o", str(out)], "x.csv"),
     ]
     for arguments, said in bad:
@@ -236,5 +239,43 @@ def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):
     assert content["minutes"] <= 15
     assert content["pairs"][0]["effects"] == ["line_lag", "hysteresis"]
     assert load_schedule(out).chambers == 3
+    commas = [*arguments, "--force", "--between", "line_lag,hysteresis"]
+    assert run(commas) == 0
+    assert capsys.readouterr().out == printed
     assert run([*arguments, *between]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [("psi", "vented arm"), ("deg", "slack arm"), ("V", "relaxed arm")],
+)
+def test_a_bench_is_spoken_of_in_its_own_words(arm, unit, said):
+    spec = replace(arm.spec, unit=unit)
+    other = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    answer = propose(other, ["line_lag", "creep"], minutes=6.0, settings=(AS_IT_STANDS,))
+    assert f"each from a {said}" in answer.steps[-1]
+    assert answer.protocol.unit == unit
+
+
+def test_every_word_of_the_catalogue_is_filled_in():
+    for unit in ("kPa", "deg", "V"):
+        words = asdict(words_for(unit))
+        for thing in (*SETTINGS.values(), *FIGURES.values()):
+            assert "{" not in thing.about.format(**words)
+        if unit != "kPa":
+            texts = " ".join(thing.about.format(**words) for thing in SETTINGS.values())
+            assert not {"valve", "valves", "vented", "chamber", "tubes"} & set(texts.split())
+
+
+def test_after_a_change_by_hand_the_new_recording_is_diagnosed_alone(tmp_path, lagging, capsys):
+    model = str(files("surgisoft") / "assets" / "default_arm")
+    data, out = tmp_path / "r.parquet", tmp_path / "s.csv"
+    save_recording(lagging, data)
+    answer = recommend(pose(default_arm(), [lagging]), ["line_lag", "rate_dependence"])
+    arguments = ["next-experiment", model, str(data), "-o", str(out)]
+    assert run([*arguments, "--between", "line_lag", "rate_dependence"]) == 0
+    printed = capsys.readouterr().out
+    alone = f"then: surgisoft diagnose {model} NEW.parquet" in printed
+    together = f"then: surgisoft diagnose {model} {data} NEW.parquet" in printed
+    assert (alone, together) == (answer.by_hand, not answer.by_hand)

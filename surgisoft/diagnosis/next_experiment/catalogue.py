@@ -31,7 +31,7 @@ class Figure:
     """One kind of run."""
 
     about: str
-    """What is done, in words."""
+    """What is done, in words; {channels} stands for what the actuation goes to."""
     draw: Callable[[Knots, float, np.random.Generator], None]
     """Writes at least so many seconds into knots."""
 
@@ -102,7 +102,7 @@ FIGURES: dict[str, Figure] = {
     "reversals": Figure("small reversals about many mean loads", continuous.reversals),
     "ladder": Figure("triangles of growing and shrinking amplitude", continuous.ladder),
     "returns": Figure("the same two postures and rest, again and again", returns),
-    "sets": Figure("single, pair and all chambers in steady sweeps", sets),
+    "sets": Figure("single, pair and all {channels} in steady sweeps", sets),
     "wander": Figure("straight legs between random loads at random rates", continuous.wander),
 }
 """Every figure by name."""
@@ -116,7 +116,7 @@ class Setting:
     """How the bench stands while a schedule is played."""
 
     about: str
-    """What a person does to the bench; empty where nothing is to be done."""
+    """What a person does to the bench, with the places of `Words`; empty: nothing is to be done."""
     minutes: float
     """Time that this takes, minutes."""
     options: str = ""
@@ -164,7 +164,10 @@ SETTINGS: dict[str, Setting] = {
         flipped=True,
     ),
     "known_mass": Setting(
-        "hang a known mass of 2 g on the tip", 1.0, "--payload-g 2", payload_g=2.0
+        "hang a known mass on the tip, about a fifth of the arm's own (2 g on the virtual rig)",
+        1.0,
+        "--payload-g 2",
+        payload_g=2.0,
     ),
     "no_support": Setting(
         "move everything away that the arm's body may lean on", 1.0, removes=("contact",)
@@ -175,12 +178,12 @@ SETTINGS: dict[str, Setting] = {
         removes=("payload",),
     ),
     "short_tube": Setting(
-        "put the valves at the base of the arm: the shortest and widest tubes that fit",
+        "{short_line}",
         3.0,
         removes=("line_lag",),
     ),
     "new_frame": Setting(
-        "measure the base frame anew with the cameras, the arm vented",
+        "measure the base frame anew with the cameras, with a {resting}",
         3.0,
         removes=("misalignment",),
     ),

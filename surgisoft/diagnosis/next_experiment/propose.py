@@ -6,7 +6,7 @@ expected log probability of naming the right rival, over all pairs, whichever is
 Reiner 1965; Box & Hill 1967). The same is done for every change of the bench that touches a rival.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from surgisoft.diagnosis.next_experiment.plans import (
     pairs_of,
 )
 from surgisoft.diagnosis.next_experiment.question import Question, pose_question
+from surgisoft.diagnosis.next_experiment.words import words_for
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name
@@ -226,17 +227,20 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
     gravity = setting.gravity(question.model.facts.gravity)
     if gravity is not None:
         options = options.format(gravity=" ".join(f"{v:.4f}" for v in gravity))
+    words = asdict(words_for(question.model.spec.unit))
     what = "; ".join(
-        f"{plan.figures.count(f)} x {FIGURES[f].about}" for f in dict.fromkeys(plan.figures)
+        f"{plan.figures.count(f)} x {FIGURES[f].about.format(**words)}"
+        for f in dict.fromkeys(plan.figures)
     )
-    steps = [f"{setting.about} (about {setting.minutes:g} min)"] if setting.about else []
+    about = setting.about.format(**words)
+    steps = [f"{about} (about {setting.minutes:g} min)"] if about else []
     steps += [
         f"if the error is gone then, the missing effect is {name}; if it stays, it is not"
         for name in setting.removes
     ]
     steps.append(
         f"play the schedule: {len(figures)} runs of {RUN_S / 60:g} min ({what}), each from a "
-        "vented arm that has rested half a minute"
+        f"{words['resting']} that has rested half a minute"
     )
     return Recommendation(
         name, protocol, plan.setting, plan.minutes, pairs, tuple(steps), options, plan.result

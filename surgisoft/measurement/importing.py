@@ -16,7 +16,12 @@ import numpy as np
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing_join import Joined, join
 from surgisoft.measurement.importing_motive import is_motive, motive_table
-from surgisoft.measurement.importing_points import key_point_maps, needed_columns, read_points
+from surgisoft.measurement.importing_points import (
+    key_point_maps,
+    needed_columns,
+    quaternions,
+    read_points,
+)
 from surgisoft.measurement.importing_rows import (
     Draft,
     point_numbers,
@@ -31,7 +36,6 @@ from surgisoft.measurement.importing_spec import (
     ContextMap,
     FileRole,
     ImportMap,
-    PointMap,
 )
 from surgisoft.measurement.importing_table import RawTable, parquet_table
 from surgisoft.measurement.importing_text import text_table
@@ -150,7 +154,6 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     commanded = commanded if commanded and commanded.columns else None
     _check_actuation(measured, commanded, tables)
     points = key_point_maps(spec.key_points, tables[spec.key_points.file])
-    _check_orientations(points, spec, tables)
     needed: dict[str, list[Column]] = {name: [] for name in tables}
     needed[measured.file] += measured.columns
     needed[spec.key_points.file] += needed_columns(points, spec.frame)
@@ -160,7 +163,9 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
         held = {(commanded.file, column) for column in commanded.columns}
     main = spec.files[0].name
     needed[main] += [c.column for c in spec.context.values() if c.column is not None]
-    joined = join(tables, spec, held, {k: list(dict.fromkeys(v)) for k, v in needed.items()})
+    needed = {name: list(dict.fromkeys(columns)) for name, columns in needed.items()}
+    turns = {spec.key_points.file: quaternions(points, spec.frame)}
+    joined = join(tables, spec, held, needed, turns)
     unit_mm = spec.key_points.unit or tables[spec.key_points.file].unit
     if not unit_mm:
         raise InputError(
@@ -181,18 +186,6 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     draft, notes = tidy(draft, spec, joined.main.cells.place)
     recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
     return Imported(recording, [*joined.notes, *placed.notes, *notes])
-
-
-def _check_orientations(
-    points: tuple[PointMap, ...], spec: ImportMap, tables: dict[str, RawTable]
-) -> None:
-    role = spec.role(spec.key_points.file)
-    turned = spec.frame.base is not None or any(point.quaternion for point in points)
-    if turned and role.join == "time" and role.interpolate == "linear":
-        raise InputError(
-            f"{tables[role.name].path}: orientations cannot be interpolated between its rows; make "
-            f'it the map\'s first file, or set interpolate = "previous" in [file.{role.name}]'
-        )
 
 
 def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) -> ActuationMap:

@@ -7,6 +7,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing_clock import Between
+from surgisoft.measurement.importing_rotation import between
 from surgisoft.measurement.importing_spec import Column, FileRole, ImportMap
 from surgisoft.measurement.importing_table import RawTable
 from surgisoft.measurement.importing_units import SECONDS_PER
@@ -42,8 +43,12 @@ def join(
     spec: ImportMap,
     held: set[tuple[str, Column]],
     needed: dict[str, list[Column]],
+    turns: dict[str, list[tuple[Column, ...]]],
 ) -> Joined:
-    """One row a sample of the needed columns by role; `held` ones are not interpolated."""
+    """One row a sample of the needed columns by role.
+
+    `held` ones are not interpolated; `turns` are the quaternions among them, by role.
+    """
     main_role, *others = spec.files
     main = tables[main_role.name]
     values = {name: tables[name].numbers(columns) for name, columns in needed.items() if columns}
@@ -62,8 +67,10 @@ def join(
             pick = np.clip(picks[role.name], 0, len(values[role.name]) - 1)
             columns |= _columns(role.name, needed, values, pick)
         else:
-            held_here = [(role.name, column) in held for column in needed[role.name]]
-            matched, inside = _by_time(role, tables[role.name], t_s, values[role.name], held_here)
+            names, table = needed[role.name], tables[role.name]
+            held_here = [(role.name, column) in held for column in names]
+            turned = [[names.index(c) for c in turn] for turn in turns.get(role.name, [])]
+            matched, inside = _by_time(role, table, t_s, values[role.name], held_here, turned)
             columns |= _columns(role.name, needed, {role.name: matched}, rows)
             keep &= inside
             _note_time_join(role, tables[role.name], main, inside, notes)
@@ -111,12 +118,17 @@ def _paired(
 
 
 def _by_time(
-    role: FileRole, table: RawTable, t_s: np.ndarray, values: np.ndarray, held: list[bool]
+    role: FileRole,
+    table: RawTable,
+    t_s: np.ndarray,
+    values: np.ndarray,
+    held: list[bool],
+    turns: list[list[int]],
 ) -> tuple[np.ndarray, np.ndarray]:
     """The columns (R, c) at times t_s (T,), and (T,) bool: which times lie inside.
 
-    A held column keeps the value of the row before (or at) each time; the others are linear between
-    the two rows around it.
+    A held column keeps the value of the row before (or at) each time; a quaternion turns at a
+    constant rate, and the others are linear between the two rows around it.
     """
     own = times(table, role.time, role.time_unit) + role.clock_offset_s
     back = np.flatnonzero(~(np.diff(own) > 0))
@@ -130,7 +142,10 @@ def _by_time(
         own, t_s = own - own[0], t_s - t_s[0]
     at = Between.of(own, t_s)
     use_held = np.array(held) | (role.interpolate == "previous")
-    found = np.where(use_held, at.held(values), at.linear(values))
+    found = at.linear(values)
+    for turn in turns:
+        found[:, turn] = between(values[at.before][:, turn], values[at.after][:, turn], at.share)
+    found = np.where(use_held, at.held(values), found)
     return found, at.inside & (at.gap_s <= role.max_gap_s)
 
 

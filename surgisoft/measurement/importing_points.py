@@ -82,6 +82,12 @@ def needed_columns(points: tuple[PointMap, ...], frame: FrameMap) -> list[Column
     return found
 
 
+def quaternions(points: tuple[PointMap, ...], frame: FrameMap) -> list[tuple[Column, ...]]:
+    """The four columns of every orientation."""
+    found = [columns_of(point.quaternion, "xyzw") for point in points if point.quaternion]
+    return found + ([columns_of(frame.base.quaternion, "xyzw")] if frame.base else [])
+
+
 def read_points(
     joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...], frame: FrameMap, unit: str
 ) -> Points:

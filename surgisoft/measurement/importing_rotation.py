@@ -85,6 +85,31 @@ def mean_rotation(quaternions: np.ndarray, order: str) -> np.ndarray:
     return matrices(vectors[:, -1][None], order)[0]
 
 
+def between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Unit quaternions (T, 4) a share (T,) of the shortest way from first to second (T, 4).
+
+    At a constant rate about one axis: Shoemake, Animating Rotation with Quaternion Curves, 1985.
+    Either order of the four numbers and either sign of a quaternion will do; NaN where a length
+    is not 1 within 5 %. A share of 0 or 1 gives the given quaternion as it is.
+    """
+    lengths = [np.linalg.norm(q, axis=1, keepdims=True) for q in (first, second)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a, b = (
+            np.where(np.abs(length - 1) < 0.05, q / length, np.nan)
+            for q, length in zip((first, second), lengths, strict=True)
+        )
+        cosine = (a * b).sum(axis=1, keepdims=True)
+        b = np.where(cosine < 0, -b, b)
+        angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+        part = share[:, None]
+        far = angle > 1e-6
+        sine = np.where(far, np.sin(angle), 1.0)
+        turned = np.where(far, np.sin((1 - part) * angle) / sine, 1 - part) * a
+        turned += np.where(far, np.sin(part * angle) / sine, part) * b
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.where(part == 0, first, np.where(part == 1, second, turned))
+
+
 def turn_to_z(direction: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) whose z axis is this direction (3,), x staying as near to x as it can.
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
-
-from surgisoft.errors import InputError
+from scipy.spatial.transform import Rotation, Slerp
 
 from .test_importing import imported, text, written
 
@@ -151,20 +149,76 @@ def test_point_beside_a_body_turns_with_it(tmp_path):
     np.testing.assert_allclose(found[:, 1] - found[:, 0], 22 * along, atol=1e-12)
 
 
-def test_orientations_are_not_interpolated(tmp_path):
+def swinging(t):
+    """A base that swings about a skew axis and drifts, at any time t (T,): its rotations."""
+    axis = np.array([0.6, -0.48, 0.64])
+    return Rotation.from_rotvec(np.sin(2 * t)[:, None] * axis) * Rotation.from_euler("y", 1.0)
+
+
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_orientations_turn_between_the_rows_of_a_slower_file(tmp_path, order):
+    """The slow file's poses against the true ones, and against scipy's Slerp between its rows."""
+    slow, fast = np.arange(0, 3.001, 0.1), np.arange(0, 2.999, 0.0125)
+    rng = np.random.default_rng(3)
+    arm = np.array([0.0, 0.0, 80.0])
+    q = swinging(slow).as_quat() * rng.choice([-1, 1], (len(slow), 1))
+    place = np.stack([10 * slow, 0 * slow, -5 * slow], axis=1)
+    if order == "wxyz":
+        q = q[:, [3, 0, 1, 2]]
+    names = ["t", "x", "y", "z", "qa", "qb", "qc", "qd"]
+    files = [
+        written(tmp_path / "log.csv", text(np.stack([fast, fast], axis=1), header=["t", "u1"])),
+        written(tmp_path / "mocap.csv", text(np.column_stack([slow, place, q]), header=names)),
+    ]
+    content = f"""
+        [file.log]
+        match = "log*"
+        [file.mocap]
+        join = "time"
+        time = "t"
+        [time]
+        column = "t"
+        [measured]
+        columns = ["u1"]
+        unit = "kPa"
+        [key_points]
+        file = "mocap"
+        unit = "mm"
+        quaternion_order = "{order}"
+        [[key_points.point]]
+        position = ["x", "y", "z"]
+        quaternion = ["qa", "qb", "qc", "qd"]
+        offset = [0, 0, 80]
+    """
+    recording, _ = imported(tmp_path, files, content)
+    where = np.stack([10 * fast, 0 * fast, -5 * fast], axis=1)
+    tip = Slerp(slow, swinging(slow))(fast).apply(arm) + where
+    np.testing.assert_allclose(recording.key_points_mm[:, 0], tip, atol=1e-9)
+    # Angular acceleration is at most 4 rad/s2: a constant rate misses 4 / 8 * 0.1^2 rad of 80 mm.
+    true = swinging(fast).apply(arm) + where
+    assert np.abs(recording.key_points_mm[:, 0] - true).max() < 0.5 * 0.1**2 * 80
+
+
+def test_a_pose_between_rows_of_a_lost_body_is_missing(tmp_path):
     t, _, _, room, _ = arm_in_a_room(1)
     pose = np.tile([0, 0, 0, 0, 0, 0, 1.0], (len(t), 1))
+    pose[10, 3:] = 0.0  # what trackers write for a lost body
+    later = t[:-1] + 0.02
     files = [
-        written(tmp_path / "log.csv", text(np.stack([t, t], axis=1), header=["t", "u1"])),
+        written(tmp_path / "log.csv", text(np.stack([later, later], axis=1), header=["t", "u1"])),
         posed(tmp_path / "mocap.csv", t, room, pose),
     ]
     content = (
         '[file.log]\nmatch = "log*"\n[file.mocap]\njoin = "time"\ntime = "t"\n'
         + POSED.replace("[key_points]", '[key_points]\nfile = "mocap"')
+        + BODY
     )
-    recording, _ = imported(tmp_path, files, content)
-    np.testing.assert_allclose(recording.key_points_mm, room, atol=1e-9)
-    with pytest.raises(InputError, match="orientations cannot be interpolated between its rows"):
-        imported(tmp_path, files, content + BODY)
+    recording, _ = imported(tmp_path, files, content + 'mode = "moving"')
+    missing = np.isnan(recording.key_points_mm).any(axis=(1, 2))
+    np.testing.assert_array_equal(np.flatnonzero(missing), [9, 10])
+    np.testing.assert_allclose(
+        recording.key_points_mm[~missing], (0.6 * room[:-1] + 0.4 * room[1:])[~missing], atol=1e-9
+    )
     held = content.replace('time = "t"', 'time = "t"\ninterpolate = "previous"')
-    np.testing.assert_allclose(imported(tmp_path, files, held + BODY)[0].key_points_mm, room)
+    points = imported(tmp_path, files, held)[0].key_points_mm
+    np.testing.assert_allclose(points, room[:-1])

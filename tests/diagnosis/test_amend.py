@@ -212,3 +212,22 @@ def test_the_error_falls_on_a_rig_whose_creep_has_another_form():
     assert result.locked.claimed
     assert result.locked.after < 0.6 * result.locked.before
     assert list(result.model.effects) == ["hysteresis", "creep"]
+
+
+def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_claim():
+    """The network is off by a constant: re-tuning mends that, beside creep and without it."""
+    off = bare_arm()
+    with torch.no_grad():
+        off.network.layers[-1].bias += 0.02
+    with_creep = measured_on(TRUTHS["creep"])
+    both, kept = (amend(off, [with_creep], ["creep"], tune) for tune in (True, False))
+    assert both.claimed
+    assert both.retuned
+    assert not kept.retuned
+    assert both.alone == kept.locked
+    assert both.locked.after < 0.7 * kept.locked.after
+    assert both.locked.after < 1.5 * both.locked.floor
+    without = amend(off, [measured_on(bare_arm())], ["creep"])
+    assert not without.claimed
+    assert not without.retuned
+    assert without.locked == without.alone

@@ -1,6 +1,7 @@
 """A point of one arm follows a closed path: the tip, or where its beam meets a plane.
 
-State, action and reward are those of Chen et al. (2025, sec. IV-A) for tracking.
+Action and reward are those of Chen et al. (2025, sec. IV-A) for tracking. Beside what the paper's
+arm observes ours knows what its last steps did, and where its model expects the point next.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.aim import pressure_part
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.paths import PATHS
+from surgisoft.tasks.recall import Recall, nothing
 from surgisoft.tasks.seek import seek
 from surgisoft.tasks.streams import Stream
 from surgisoft.tasks.walk import Round, fresh_round
-from surgisoft.tasks.world import World
+from surgisoft.tasks.world import ArmPart, World
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class FollowConfig:
     """Whether an episode begins anywhere on the path and runs either way round."""
     preview: int = 2
     """Coming targets that the arm knows, one a step."""
+    recall: int = 2
+    """Last steps of which the arm knows how they changed its pressures and moved the point."""
+    foresight: bool = True
+    """Whether the arm knows where its model, which follows its pressures as the scripted solver's
+    does, expects the point a step from now if the commands are held."""
     fine_mm: float = 0.1
     """Scale of the second reward term, mm."""
     fine_weight: float = 1.0
@@ -50,9 +57,19 @@ class FollowConfig:
     def __post_init__(self):
         if self.path not in PATHS:
             raise unknown_name("path", self.path, PATHS)
-        for name in ("size_mm", "loop_s", "loops", "preview", "fine_mm"):
+        for name in ("size_mm", "loop_s", "loops", "preview", "recall", "fine_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Where a batch of episodes goes, and what was of it."""
+
+    round: Round
+    """How it goes round."""
+    recall: Recall
+    """The last steps."""
 
 
 class Follow:
@@ -83,12 +100,14 @@ class Follow:
         self._directions = directions
         self._rest = self.arm.model.rest_mm.to(centre_mm)
 
-    def goal(self, stream: Stream) -> tuple[Stream, Round]:
-        return fresh_round(stream, self.config.any_start)
+    def goal(self, stream: Stream) -> tuple[Stream, Course]:
+        stream, way = fresh_round(stream, self.config.any_start)
+        size = len(stream.key), self.config.recall, self.arm.chambers
+        return stream, Course(way, nothing(*size, self.world.device))
 
     def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
         """(B, 3) mm, world frame: where the point should be `ahead` steps from now."""
-        share = state.goal.share(state.world.steps + ahead, self.approach, self.loop)
+        share = state.goal.round.share(state.world.steps + ahead, self.approach, self.loop)
         flat = self.config.size_mm * PATHS[self.config.path](share)
         return self.centre + torch.nn.functional.pad(flat, (0, 1))
 
@@ -98,25 +117,44 @@ class Follow:
         return (point - self.target_mm(state)).norm(dim=1)
 
     def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
-        return replace(state, world=self.world.step(state.world, actions, in_place=in_place))
+        before = state.world.arms["arm"]
+        world = self.world.step(state.world, actions, in_place=in_place)
+        after = world.arms["arm"]
+        moved = self.marker(after.seen_mm) - self.marker(before.seen_mm)
+        recall = state.goal.recall.after(after.seen_kPa - before.seen_kPa, moved)
+        return TaskState(world, replace(state.goal, recall=recall))
 
     def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Body, errors now and ahead, commands and pressures, direction of change, time.
+        """Body, errors now and ahead, pressures, direction of change, last steps, time.
 
         Errors through asinh, in mm and the first two in `fine_mm` as well: as they are within that
-        length, by their logarithm beyond.
+        length, by their logarithm beyond. So is the error that the model expects a step from now
+        if the commands are held.
         """
         part = state.world.arms["arm"]
         point = self.marker(part.seen_mm)
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
+        fine = errors[:2]
+        if self.config.foresight:
+            fine.append(self.target_mm(state, 1) - self.marker(self._held(part)))
         parts = [
             (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
             *(error.asinh() for error in errors),
-            *((error / self.config.fine_mm).asinh() for error in errors[:2]),
+            *((error / self.config.fine_mm).asinh() for error in fine),
             *pressure_part(self.arm, part),
+            *state.goal.recall.seen(),
             2.0 * state.world.steps[:, None] / self.steps - 1.0,
         ]
         return {"arm": torch.cat(parts, 1)}
+
+    def _held(self, part: ArmPart) -> Tensor:
+        """(B, n, 3) mm: where the arm's model expects the key points if the commands are held."""
+        pressure = self.arm.pneumatics.follow(part.pressure, part.command, self.dt_s)
+        held = self.arm.foresee(part, pressure, self.dt_s)
+        if self.arm.vary.noise_mm == 0.0:
+            return held
+        # The model knows where the arm truly is: of what it expects only the movement is told.
+        return part.seen_mm + held - self.arm.foresee(part, part.pressure, self.dt_s)
 
     def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
         """track: exp(-e), e in mm (Chen et al. 2025, sec. IV-A); fine: the same, finer scale."""

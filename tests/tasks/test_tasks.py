@@ -255,6 +255,39 @@ def test_the_plane_is_where_the_config_says():
     assert (far.centre - near.centre)[2].item() == pytest.approx(25.0, abs=1e-4)
 
 
+def test_the_foreseen_error_is_that_of_a_step_without_action():
+    """Played for real: commands held, the pumps still catching up, chambers turning round."""
+    task = track_circle()
+    episodes = Episodes(task)
+    state, _, _ = played(episodes, 64, 20)
+    foreseen = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
+    after, _ = episodes.step(state, {"arm": torch.zeros(64, 3)})
+    tip = after.world.arms["arm"].points_mm[:, -1]
+    torch.testing.assert_close(foreseen, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
+
+
+def test_the_last_steps_are_recalled_newest_first():
+    """Pressures by the pumps' lag, movements from the key points; nothing before the episode."""
+    task = track_circle()
+    episodes = Episodes(task)
+    state, tips, changes = episodes.seeded(2, 5), [], []
+    assert not episodes.observe(state)["arm"][:, -13:-1].any()
+    share = 1.0 - math.exp(-0.1 / 0.2)
+    for step in range(3):
+        part, action = state.world.arms["arm"], 0.7 * (-1.0) ** step
+        changes.append(share * (part.command + action - part.pressure))
+        tips.append(part.points_mm[:, -1])
+        state, _ = episodes.step(state, {"arm": torch.full((5, 3), action)})
+    tips.append(state.world.arms["arm"].points_mm[:, -1])
+    recalled = episodes.observe(state)["arm"][:, -13:-1]
+    by_hand = (changes[2], changes[1], tips[3] - tips[2], tips[2] - tips[1])
+    torch.testing.assert_close(recalled, torch.cat(by_hand, 1), rtol=0, atol=1e-4)
+    anew = episodes.reset(state, torch.tensor([True] + 4 * [False]))
+    kept = episodes.observe(anew)["arm"][:, -13:-1]
+    assert not kept[0].any()
+    assert torch.equal(kept[1:], recalled[1:])
+
+
 def test_noise_is_seen_but_not_scored():
     vary = Randomisation(noise_mm=0.5, noise_kPa=0.3)
     noisy = Episodes(track_circle(TrackConfig(world=WorldConfig(randomisation=vary))))
@@ -269,6 +302,8 @@ def test_noise_is_seen_but_not_scored():
     assert (part.seen_kPa - part.pressure).std().item() == pytest.approx(0.3, rel=0.1)
     error = noisy.observe(a)["arm"][:, 12:15].sinh() - plain.observe(b)["arm"][:, 12:15].sinh()
     assert error.std().item() == pytest.approx(0.5, rel=0.05)
+    foreseen, truly = (e.observe(s)["arm"][:, 27:30].sinh() for e, s in ((noisy, a), (plain, b)))
+    assert (0.1 * (foreseen - truly)).std().item() == pytest.approx(0.5, rel=0.05)
 
 
 def test_randomised_mounts_and_gains_have_the_asked_spread():

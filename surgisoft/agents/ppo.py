@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -19,10 +20,13 @@ from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv
 
 
-def algorithm_config(agent: str, preset: Preset, processes: Processes) -> dict:
-    """rsl-rl's configuration of one agent; a fresh one each time, for rsl-rl writes into it."""
+def algorithm_config(agent: str, preset: Preset, processes: Processes, critic: str = STATE) -> dict:
+    """rsl-rl's configuration of one agent; a fresh one each time, for rsl-rl writes into it.
+
+    critic: the group of observations that the critic sees.
+    """
     return {
-        "obs_groups": {"actor": [agent], "critic": [STATE]},
+        "obs_groups": {"actor": [agent], "critic": [critic]},
         "num_steps_per_env": preset.rollout,
         "actor": {
             "class_name": "MLPModel",
@@ -46,6 +50,11 @@ def algorithm_config(agent: str, preset: Preset, processes: Processes) -> dict:
     }
 
 
+def groups_of(agent: str, agents: Collection[str]) -> tuple[str, ...]:
+    """Groups that an agent's actor and, the last, its critic see; one where the agent is alone."""
+    return (agent, STATE) if len(agents) > 1 else (agent,)
+
+
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
     """Agent -> its PPO: an actor of its own, a critic that sees the joint state."""
     seen, answer, device = env.get_observations().clone(), {}, env.task.world.device
@@ -53,9 +62,10 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         view = SimpleNamespace(
             num_envs=env.num_envs, num_actions=env.task.world.arms[agent].chambers
         )
-        config = algorithm_config(agent, preset, processes)
+        groups = groups_of(agent, env.task.agents)
+        config = algorithm_config(agent, preset, processes, groups[-1])
         with contextlib.redirect_stdout(io.StringIO()):
-            ppo = PPO.construct_algorithm(seen.select(agent, STATE), view, config, str(device))
+            ppo = PPO.construct_algorithm(seen.select(*groups), view, config, str(device))
         with torch.no_grad():
             # Before it has learned anything a policy asks for next to nothing.
             ppo.get_policy().mlp[-1].weight.mul_(0.01)
@@ -95,12 +105,16 @@ def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
     def note(name: str, value: Tensor) -> None:
         notes.setdefault(name, []).append(value)
 
+    groups = {agent: groups_of(agent, agents) for agent in agents}
     for _ in range(steps):
-        actions = {agent: ppo.act(seen.select(agent, STATE)) for agent, ppo in agents.items()}
+        actions = {agent: ppo.act(seen.select(*groups[agent])) for agent, ppo in agents.items()}
         seen, rewards, dones, extras = env.step(actions)
         for agent, ppo in agents.items():
             ppo.process_env_step(
-                seen.select(agent, STATE), rewards[agent], dones, {"time_outs": extras["time_outs"]}
+                seen.select(*groups[agent]),
+                rewards[agent],
+                dones,
+                {"time_outs": extras["time_outs"]},
             )
             note(f"reward/{agent}", rewards[agent])
             for term, value in extras["terms"][agent].items():
@@ -109,7 +123,7 @@ def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
             note(f"measure/{name}", value)
         note("done", dones)
     for agent, ppo in agents.items():
-        ppo.compute_returns(seen.select(agent, STATE))
+        ppo.compute_returns(seen.select(*groups[agent]))
     means = {name: _mean(values) for name, values in notes.items()}
 
     def part(prefix: str) -> dict[str, float]:

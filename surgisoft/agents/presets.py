@@ -91,8 +91,15 @@ STEPS: dict[str, int] = {
 PAPER_STEPS = 20_000_000
 """Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
 
-_FOLLOW = {"gamma": 0.6, "epochs": 8, "desired_kl": 0.03}
-"""Following a path each action shows at once what it was worth."""
+_FOLLOW = {
+    "envs": 1024,
+    "batches": 16,
+    "gamma": 0.6,
+    "desired_kl": 0.03,
+    "evaluate_every": 25,
+}
+"""Following a path each action shows at once what it was worth. Many small minibatches: the number
+of gradient steps decides how finely a path is followed at last."""
 
 TASK_CHANGES: dict[str, dict] = {
     "track_circle": _FOLLOW,

@@ -8,12 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
-import multiprocessing.connection
-import os
 import shutil
-import signal
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +22,7 @@ from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
 from surgisoft.tasks.episode_file import save_episode
 from surgisoft.toml_config import write_atomically
+from surgisoft.workers import workers
 
 Report = Callable[[float, float, str], None]
 
@@ -153,40 +149,20 @@ def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
 
 def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
     """Play the blocks in processes of their own; each block as it is done."""
-    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=_begin_worker)
     try:
-        waiting = {pool.submit(_play, spec, folder, job): job for job in left}
-        for future in as_completed(waiting):
-            future.result()
-            yield waiting[future]
+        with workers(processes) as pool:
+            waiting = {pool.submit(_play, spec, folder, job): job for job in left}
+            for future in as_completed(waiting):
+                future.result()
+                yield waiting[future]
     except BrokenProcessPool:
         raise InputError(
             f"a process of {processes} was ended from outside, memory may be short; go on with "
             "--resume and fewer --processes"
         ) from None
-    except BaseException:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _begin_worker() -> None:
-    """One thread; Ctrl-C is for the process that asked, and this one ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    asker = multiprocessing.parent_process().sentinel
-
-    def end_with_it() -> None:
-        multiprocessing.connection.wait([asker])
-        os._exit(1)
-
-    threading.Thread(target=end_with_it, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -36,10 +36,11 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
-EXPLAINED, LEFT_SIZE, STATIC_SIZE = 0.6, 2.5, 5.0
+LEAST_EXPLAINED, LEFT_SIZE = 0.5, 2.5
 """Share of the error above the floor that named effects must explain where what they leave is still
-so many times the surrogate's validated error, or the static part of it is so many times; else
-something that is not known is missing."""
+so many times the surrogate's validated error; else something that is not known is missing."""
+EXPLAINED, STATIC_SIZE = 0.6, 5.0
+"""The same where the static part alone of what they leave is so many times that."""
 MISSED_SHARE = 0.2
 """The same where they explain so much less, of the error above the floor, than a black box does."""
 BETTER_BOX = (0.05, 0.25)
@@ -243,8 +244,10 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     explained = numbers["explained_above_floor"]
     beaten = numbers["box_share"] - explained
     sure = numbers["box_p"] <= CHANCE
-    much = numbers["static_size_after"] >= STATIC_SIZE or numbers["left_size"] >= LEFT_SIZE
-    if explained < EXPLAINED and (much or (sure and beaten >= MISSED_SHARE)):
+    if explained < LEAST_EXPLAINED and numbers["left_size"] >= LEFT_SIZE:
+        return True
+    static = numbers["static_size_after"] >= STATIC_SIZE
+    if explained < EXPLAINED and (static or (sure and beaten >= MISSED_SHARE)):
         return True
     share, log_gain = BETTER_BOX
     if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:

@@ -7,7 +7,6 @@ network once a step; actor and critic once in the rollout, and in each epoch for
 (three times the forward products, less the first layer's gradient by its input).
 """
 
-import itertools
 import os
 import sys
 import time
@@ -24,6 +23,8 @@ from surgisoft.agents.training import Training
 from surgisoft.studies.driving import plan_of
 from surgisoft.tasks.registry import make_task
 
+ROWS = ((256, 8, 4), (256, 5, 4), (1024, 8, 4), (1024, 5, 4), (1024, 5, 16), (4096, 5, 4))
+"""Episodes side by side, epochs and minibatches of an update; the preset's are marked."""
 SAMPLES = 60_000
 """Steps that each row is measured over, at least."""
 
@@ -79,17 +80,19 @@ def main() -> None:
     plan = plan_of(name, 1)
     task = make_task(name, plan.task_config)
     print(f"{name}: microseconds of one processor for a step; limit by matrix products")
-    print(" envs epochs  rollout  update   steps/s  of limit  20 M steps, min")
-    for envs, epochs in itertools.product((256, 1024, 4096), (8, 5)):
-        preset = replace(plan.preset, envs=envs, epochs=epochs)
+    print("  envs epochs batches  rollout  update   steps/s  of limit  20 M steps, min")
+    own = (plan.preset.envs, plan.preset.epochs, plan.preset.batches)
+    for row in ROWS:
+        envs, epochs, batches = row
+        preset = replace(plan.preset, envs=envs, epochs=epochs, batches=batches)
         training = Training(replace(plan, preset=preset), task, Processes())
         most = peak()
         rollout, update = measured(training)
         rate = 1.0 / (rollout + update)
         share = rate * operations(training) / most
         print(
-            f"{envs:5d} {epochs:6d} {1e6 * rollout:8.1f} {1e6 * update:7.1f} {rate:9,.0f} "
-            f"{share:9.0%} {20e6 / rate / 60:16.1f}"
+            f"{'*' if row == own else ' '}{envs:5d} {epochs:6d} {batches:7d} {1e6 * rollout:8.1f} "
+            f"{1e6 * update:7.1f} {rate:9,.0f} {share:9.0%} {20e6 / rate / 60:16.1f}"
         )
 
 

@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
 from surgisoft.cli.options import Force, JsonFile, Model, NewModel, Report
 from surgisoft.cli.progress import progress
 
@@ -57,6 +57,7 @@ def amend(
     arm, known = load_model(model), load_known_error(model)
     names = [named_effect(given) for given in effects]
     measured = read_recordings(data)
+    arm = under_weight(arm, measured)
     torch.set_num_threads(1)
     with progress("amend") as tell:
         stages = iter(range(100))

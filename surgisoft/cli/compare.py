@@ -4,7 +4,7 @@ import math
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
-from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
 from surgisoft.cli.options import JsonFile, Model, Recordings, Replay, Report
 
 AXES_SHOWN = 5
@@ -31,6 +31,7 @@ def compare(
 
     arm = load_model(model)
     measured = read_recordings(recordings)
+    under_weight(arm, measured)
     result, rest = compare_model(arm, measured)
     warn_outside(arm, measured)
     print(result.sentence)

@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
 from surgisoft.cli.progress import progress
 
@@ -44,6 +44,7 @@ def diagnose(
         register_effect_file(path)
     arm = load_model(model)
     measured = read_recordings(recordings)
+    arm = under_weight(arm, measured)
     before = read_recordings(reference) if reference else load_known_error(model)
     torch.set_num_threads(1)
     with progress("diagnose") as tell:

@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, warn_outside
+from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
 from surgisoft.cli.options import (
     EffectFiles,
     Force,
@@ -52,6 +52,7 @@ def improve(
         register_effect_file(path)
     arm, known = load_model(model), load_known_error(model)
     measured = read_recordings(recordings)
+    arm = under_weight(arm, measured)
     warn_outside(arm, measured)
     torch.set_num_threads(1)
     with progress("improve") as tell:

@@ -38,3 +38,13 @@ def warn_outside(arm, recordings) -> None:
 
     for note in outside_range(arm.spec, recordings):
         warn(note)
+
+
+def under_weight(arm, recordings):
+    """The arm model for the recordings' direction of weight; warns where it is another one."""
+    from surgisoft.diagnosis.weight import under_weight as turned
+
+    model, notes = turned(arm, recordings)
+    for note in notes:
+        warn(note)
+    return model

@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, write_json, write_text
-from surgisoft.cli.inputs import read_recordings, warn
+from surgisoft.cli.inputs import read_recordings, under_weight
 from surgisoft.cli.options import Force, JsonFile, Model
 from surgisoft.errors import InputError
 
@@ -61,8 +61,7 @@ def next_experiment(
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
     if recordings:
         measured = read_recordings(recordings)
-        for name in {r.label for r in measured if _turned(arm.spec.gravity, r.gravity)}:
-            warn(f"{name}: the weight pulls along another direction than where MODEL was fitted")
+        under_weight(arm, measured)
         problem = pose(arm, measured)
         answer = recommend(problem, rivals or likely_rivals(problem), minutes, settings)
     else:
@@ -71,13 +70,6 @@ def next_experiment(
     if json_file:
         write_json(json_file, answer.to_json())
     _show(answer, arm.spec, model, recordings or [], output)
-
-
-def _turned(fitted, came) -> bool:
-    """Whether two directions of weight (3,) differ by more than 5 degrees (cos 0.9962)."""
-    if fitted is None or came is None:
-        return False
-    return sum(a * b for a, b in zip(fitted, came, strict=True)) < 0.9962
 
 
 def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> None:

@@ -1,0 +1,82 @@
+"""Recordings on a turned bench: the arm's own weight is not taken for a wrong effect."""
+
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.weight import under_weight
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recording import save_recording
+from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.default import default_arm
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return default_arm()
+
+
+@pytest.fixture(scope="module")
+def turned(arm):
+    """Three minutes of the model's own robot, bare, with its base rolled by 90 degrees."""
+    rig = VirtualRig(0, take=7, roll_deg=90.0)
+    return rig.record(make_protocol("mixed", rig.limits, 3600, seed=2))[0]
+
+
+def test_the_same_direction_changes_nothing(arm, turned):
+    tilt = np.radians(3.0)
+    near = np.array(arm.spec.gravity) * np.cos(tilt) + np.array([0, 1.0, 0]) * np.sin(tilt)
+    for direction in (np.array(arm.spec.gravity), near / np.linalg.norm(near), None):
+        model, notes = under_weight(arm, [replace(turned, gravity=direction)])
+        assert model is arm
+        assert notes == []
+
+
+def test_another_direction_is_told_and_frees_the_load(arm, turned):
+    model, notes = under_weight(arm, [turned])
+    assert model.spec.gravity is None
+    assert model.spec == replace(arm.spec, gravity=None)
+    # (x, y, z) rolled by 90 degrees is (y, -x, z): the cosine between them is z^2.
+    assert f"{np.degrees(np.arccos(arm.spec.gravity[2] ** 2)):.0f} degrees" in notes[0]
+    history = history_of([turned])
+    with torch.no_grad():
+        assert torch.equal(model.predict(history), arm.predict(history))
+
+
+def test_several_directions_are_told_and_no_load_is_freed(arm, turned):
+    model, notes = under_weight(arm, [turned, replace(turned, gravity=np.array(arm.spec.gravity))])
+    assert model is arm
+    assert "one direction at a time" in notes[-1]
+
+
+def test_own_weight_of_a_rolled_arm_is_called_a_load(arm, turned, tmp_path):
+    """Truth: nothing but gravity's direction differs from where the model was fitted."""
+    model, _ = under_weight(arm, [turned])
+    found = diagnose(model, [turned])
+    assert found.ranking[0].effect == "payload"
+    assert "payload" in found.verdict.effects
+    result = amend(model, [turned], ["payload"])
+    assert result.locked.after < 0.25 * result.locked.before
+    save_model(result.model, tmp_path / "turned", {})
+    history = history_of([turned])
+    with torch.no_grad():
+        again = load_model(tmp_path / "turned").predict(history)
+        torch.testing.assert_close(again, result.model.predict(history))
+
+
+def test_commands_tell_of_the_direction(turned, tmp_path, capsys):
+    path = tmp_path / "turned.parquet"
+    save_recording(turned, path)
+    model = str(files("surgisoft") / "assets" / "default_arm")
+    assert run(["compare", model, str(path)]) == 0
+    said = capsys.readouterr().err
+    assert "turned.parquet: the weight pulls along" in said
+    assert "35 degrees" in said

@@ -43,7 +43,8 @@ class FollowConfig:
     preview: int = 2
     """Coming targets that the arm knows, one a step."""
     recall: int = 2
-    """Last steps of which the arm knows how they changed its pressures and moved the point."""
+    """Last steps of which the arm knows how they changed its pressures and moved the point; 0: of
+    none."""
     foresight: bool = True
     """Whether the arm knows where its model, which follows its pressures as the scripted solver's
     does, expects the point a step from now if the commands are held."""
@@ -57,9 +58,11 @@ class FollowConfig:
     def __post_init__(self):
         if self.path not in PATHS:
             raise unknown_name("path", self.path, PATHS)
-        for name in ("size_mm", "loop_s", "loops", "preview", "recall", "fine_mm"):
+        for name in ("size_mm", "loop_s", "loops", "preview", "fine_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
+        if self.recall < 0:
+            raise InputError(f"task: recall is {self.recall}, expected 0 or more")
 
 
 @dataclass(frozen=True, eq=False)

@@ -286,6 +286,9 @@ def test_the_last_steps_are_recalled_newest_first():
     kept = episodes.observe(anew)["arm"][:, -13:-1]
     assert not kept[0].any()
     assert torch.equal(kept[1:], recalled[1:])
+    without = Episodes(track_circle(TrackConfig(FollowConfig(recall=0, foresight=False))))
+    plain, own = (play.observe(play.seeded(2, 5))["arm"] for play in (without, episodes))
+    assert torch.equal(plain, torch.cat((own[:, :27], own[:, 30:-13], own[:, -1:]), 1))
 
 
 def test_noise_is_seen_but_not_scored():
@@ -350,6 +353,7 @@ def test_the_script_is_the_same_for_one_and_for_many():
         (lambda: FollowConfig(path="star"), "star.*circle.*square"),
         (lambda: FollowConfig(size_mm=-1.0), "size_mm is -1.0"),
         (lambda: FollowConfig(loop_s=math.nan), "loop_s is nan"),
+        (lambda: FollowConfig(recall=-1), "recall is -1"),
         (lambda: LaserPlaneConfig(distance_mm=0.0), "distance_mm is 0.0"),
         (lambda: TrackBodyConfig(slow_s=0.0), "slow_s is 0.0"),
     ],

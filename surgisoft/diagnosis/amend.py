@@ -163,7 +163,7 @@ def amend(
     tell("judging on the locked part")
     locked = pose(model, recordings, EVERY_ROW, part="locked")
     alone = fall_of(locked, locked.with_model(fitted.model))
-    if retuned and not alone.claimed:
+    if retuned and not (alone.claimed and fall_of(locked, locked.with_model(better)).claimed):
         better, retuned = fitted.model, False
     pairs = [(part, part.with_model(better)) for part in (problem, locked)]
     return Amendment(

@@ -10,6 +10,7 @@ from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recording import save_recording
 from surgisoft.measurement.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_known_error, load_model
 from surgisoft.surrogate.default import default_arm
 
 
@@ -73,6 +74,33 @@ def test_command_writes_the_promised_json(tmp_path, capsys):
     assert "misalignment is missing" in capsys.readouterr().out
     after = {p.name: p.read_bytes() for p in (tmp_path / "arm").iterdir()}
     assert after == before
+
+
+def test_a_wrong_unit_of_length_is_told(tmp_path, capsys):
+    from dataclasses import replace
+
+    short = recorded(points=300)
+    save_recording(replace(short, key_points_mm=1e3 * short.key_points_mm), tmp_path / "x.parquet")
+    assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 2
+    error = capsys.readouterr().err
+    assert "unit of length" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_key_point_that_was_never_measured_is_left_out():
+    """The other four and the model's known error name the effect without it."""
+    from dataclasses import replace
+
+    recording = recorded([("misalignment", 1.0)])
+    points = recording.key_points_mm.copy()
+    points[:, 2] = np.nan
+    said = diagnose(
+        load_model("default"),
+        [replace(recording, key_points_mm=points)],
+        reference=load_known_error("default"),
+    )
+    assert said.verdict.effects == ("misalignment",)
+    assert np.isfinite(said.error_mm.before)
 
 
 def test_too_little_data_is_told(tmp_path, capsys):

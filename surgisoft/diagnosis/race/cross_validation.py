@@ -78,9 +78,8 @@ class CrossValidation:
         """
         seen = np.isfinite(residual).all(2)
         field = np.concatenate([residual[..., None], columns], axis=3).astype(np.float32)
-        mean = np.array(
-            [np.square(residual[seen[:, k], k]).sum(1).mean() for k in range(len(seen.T))]
-        )
+        square = np.where(seen, np.square(residual).sum(2), 0.0)
+        mean = square.sum(0) / np.maximum(seen.sum(0), 1)
         prior = np.maximum(surrogate_mm, 0.1 * noise_mm) ** 2 * ROOM**2
         ridges = [(noise_mm**2 + rows * mean) / prior for rows in PERSISTENCE]
         levels: list[list[Fold]] = [[] for _ in ridges]
@@ -132,7 +131,7 @@ def _split(features, field, seen, held, block) -> list[tuple]:
         turned = vectors.T @ (features[fit].T @ flat)
         own = flat.reshape(-1, field.shape[3])
         gram = (own.T @ own).astype(np.float64)
-        tested = field[test, k].reshape(int(test.sum()), -1)
+        tested = field[test, k].reshape(int(test.sum()), 3 * field.shape[3])
         answer.append((k, values, turned, gram, features[test] @ vectors, tested, block[test]))
     return answer
 

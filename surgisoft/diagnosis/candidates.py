@@ -61,7 +61,7 @@ class Signals:
     slope: Tensor
     """(S, n, 3, m) change of key points with the effective actuation, mm a unit."""
     rest: dict[str, Tensor]
-    """The signal of each stage at rest, (R, m) or (R, n, 3)."""
+    """The signal of each stage before the first row, (R, m) or (R, n, 3)."""
 
 
 @torch.no_grad()
@@ -71,16 +71,15 @@ def signals(problem: Problem) -> Signals:
     trace = model.trace(history)
     effective = model.effective(trace.pressure, trace.memory)
     points = model.network(effective, trace.direction)
-    start = model.initial_state(history.runs).memory
+    first, rest = model.before(model.first_pressure(history))
     context = replace(context_of(history), pressure=trace.pressure)
     stages = {}
     for stage in ("body", "sensor"):
         for name, effect in model.stage(stage):
-            points = effect.apply(points, effect.scan(start[name], points, context))
+            points = effect.apply(points, effect.scan(first.memory[name], points, context))
         stages[stage] = points
     at, direction = problem.rows(effective), problem.rows(trace.direction)
     slope = network_slope(model, at, direction)
-    rest = rest_signals(model, history.runs)
     return Signals(
         context, trace.pressure, effective, stages["body"], stages["sensor"], slope, rest
     )
@@ -93,22 +92,6 @@ def network_slope(model: ArmModel, effective: Tensor, direction: Tensor) -> Tens
         points = model.network(at, direction).flatten(1)
         parts = [torch.autograd.grad(p.sum(), at, retain_graph=True)[0] for p in points.unbind(1)]
     return torch.stack(parts, 1).unflatten(1, (model.spec.key_points, 3))
-
-
-def rest_signals(model: ArmModel, runs: int) -> dict[str, Tensor]:
-    """What each stage's effects, added behind the others, see of an arm at rest: (R, ...)."""
-    memory, answer = model.initial_state(runs).memory, {}
-    signal = model.rest.expand(runs, -1)
-    for stage in ("line", "material"):
-        for name, effect in model.stage(stage):
-            signal = effect.apply(signal, memory[name])
-        answer[stage] = signal = model.chambers(signal)
-    points = model.network(signal, torch.zeros_like(signal))
-    for stage in ("body", "sensor"):
-        for name, effect in model.stage(stage):
-            points = effect.apply(points, memory[name])
-        answer[stage] = points
-    return answer
 
 
 @torch.no_grad()

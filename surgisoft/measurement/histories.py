@@ -18,6 +18,8 @@ BAND_NOISES = 4.0
 STILL_SHARE = 0.1
 """A chamber that moved less than this share of the widest range is scaled as if it had moved all of
 it: its motion may be noise for the greater part."""
+SIZES = 20.0
+"""Factor by which the key points' extent and the arm's length differ when a unit is wrong."""
 OUTSIDE_SHARE = 0.03
 """How far beyond the fitted range, as a share of it, an actuation may go without a note."""
 IDLE_SHARE = 0.02
@@ -39,14 +41,21 @@ def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
 
 
 def history_of(recordings: list[Recording], actuation: str = "measured") -> History:
-    """All runs of all recordings as one padded history."""
-    times, pressures, points, warmth = [], [], [], []
+    """All runs of all recordings as one padded history.
+
+    A continuous run begins where its first measured actuation says; a settled one at rest, from
+    where its first point was approached.
+    """
+    times, pressures, points, warmth, stood = [], [], [], [], []
     for recording in recordings:
         signal = actuation_of(recording, actuation)
         for run in recording.runs:
             times.append(torch.from_numpy(recording.t_s[run].copy()))
             pressures.append(torch.from_numpy(signal[run].copy()))
             points.append(torch.from_numpy(recording.key_points_mm[run].copy()))
+            first = torch.from_numpy(recording.measured[run.start].copy())
+            settled = recording.kind == "settled"
+            stood.append(torch.full_like(first, torch.nan) if settled else first)
             room = recording.temp_C
             warmth.append(
                 torch.full((len(times[-1]),), torch.nan)
@@ -56,7 +65,7 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
     if all(room.isnan().all() for room in warmth):
         warmth = None
-    return pack(times, pressures, points, tuple(float(x) for x in noise), warmth)
+    return pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood)
 
 
 def actuation_noise(recording: Recording, actuation: str = "measured") -> np.ndarray:
@@ -145,7 +154,7 @@ def _with_room(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
-    """Raise unless every recording has the model's chambers, key points and unit."""
+    """Raise unless every recording has the model's chambers, key points, unit and size."""
     for recording in recordings:
         for what, came, expected in (
             ("chambers", recording.chambers, spec.chambers),
@@ -157,3 +166,18 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
                     f"{recording.label}: {what}: {came}, but the model has {expected}; "
                     "use recordings of the model's own arm"
                 )
+        extent = _extent_mm(recording.key_points_mm)
+        if spec.length_mm and (extent > SIZES * spec.length_mm or extent < spec.length_mm / SIZES):
+            raise InputError(
+                f"{recording.label}: its key points span {extent:.3g} mm, the model's arm is "
+                f"{spec.length_mm:.3g} mm long; import them again in the right unit of length"
+            )
+
+
+def _extent_mm(points: np.ndarray) -> float:
+    """Median distance of the last measured key point from the first one, (N, n, 3) mm."""
+    seen = np.isfinite(points).all(2)
+    ends = np.flatnonzero(seen.any(0))[[0, -1]]
+    both = seen[:, ends].all(1)
+    apart = np.linalg.norm(points[both][:, ends[1]] - points[both][:, ends[0]], axis=1)
+    return float(np.median(apart)) if len(apart) and ends[0] != ends[1] else float("nan")

@@ -24,6 +24,9 @@ class History:
     """Standard deviation of the measured actuation at rest, one a chamber, if known."""
     temperature_C: Tensor | None = None
     """(R, T) float32 temperature of the room, degrees Celsius; NaN where missing."""
+    stood: Tensor | None = None
+    """(R, m) float32 measured actuation at which the arm stood when each run's recording began, in
+    the arm's unit; NaN, or None for all, where runs begin at rest."""
 
     @property
     def runs(self) -> int:
@@ -62,6 +65,7 @@ class History:
             self.valid[runs, :length],
             self.noise,
             None if self.temperature_C is None else self.temperature_C[runs, :length],
+            None if self.stood is None else self.stood[runs],
         )
 
     def to(self, device) -> "History":
@@ -73,6 +77,7 @@ class History:
             self.valid.to(device),
             self.noise,
             None if self.temperature_C is None else self.temperature_C.to(device),
+            None if self.stood is None else self.stood.to(device),
         )
 
 
@@ -82,10 +87,12 @@ def pack(
     key_points: list[Tensor],
     noise: tuple[float, ...] | None = None,
     temperature_C: list[Tensor] | None = None,
+    stood: list[Tensor] | None = None,
 ) -> History:
     """Runs of any lengths as one padded history.
 
-    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm, temperature_C (T,).
+    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm, temperature_C (T,),
+    stood (m,).
     """
     if not pressure:
         raise InputError("no run: expected at least one with one row; check the recordings")
@@ -109,4 +116,5 @@ def pack(
         valid=stack([torch.ones(len(run), dtype=torch.bool) for run in pressure], torch.bool, 0),
         noise=noise,
         temperature_C=None if temperature_C is None else stack(temperature_C, torch.float32, None),
+        stood=None if stood is None else torch.stack(stood).float(),
     )

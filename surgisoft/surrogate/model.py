@@ -14,6 +14,11 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.network import HawNN
 from surgisoft.surrogate.recurrent import RecurrentArm
 
+AWAY_SHARE = 0.15
+"""A run begins away from rest where a chamber's measured actuation is farther from it than this
+share of its range."""
+STOOD_S = 10.0
+"""Time for which an arm has stood where a run begins away from rest, s."""
 NETWORK = "network"
 """Key of a remembering network's state in `ArmState.memory`."""
 
@@ -106,6 +111,74 @@ class ArmModel(nn.Module):
                 points = effect.apply(points, memory[name])
         return ArmState(pressure, pressure, torch.zeros_like(pressure), memory)
 
+    def first_pressure(self, history: History) -> Tensor:
+        """(R, m) actuation at which each run begins, in the arm's unit.
+
+        At rest (`ArmSpec.rest`); or at the first row, where its measured actuation is away from
+        rest: a chamber's pressure does not jump, so the arm has been there. A command may jump in
+        the first row, so it does not decide.
+        """
+        rest = self.rest.expand(history.runs, -1)
+        if history.stood is None:
+            return rest
+        span = torch.tensor(self.spec.span, device=rest.device)
+        away = ((history.stood - rest).abs() > AWAY_SHARE * span) & ~self.still
+        return torch.where(away.any(-1, keepdim=True), history.pressure[:, 0], rest)
+
+    def first_state(self, pressure: Tensor) -> ArmState:
+        """(R) arms before the first row of runs that begin at `first_pressure`, (R, m).
+
+        Nobody knows how such an arm came there. It is taken to have come straight from rest and to
+        have stood for STOOD_S: lags and oscillations have died away, the material remembers.
+        """
+        return self.before(pressure)[0]
+
+    def before(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
+        """The same, and what an effect added behind the others of each stage sees there.
+
+        (R, m) for line and material, (R, n, 3) in mm for body and sensor.
+        """
+        state = self.initial_state(len(pressure))
+        seen = self._seen_at_rest(state)
+        away = (pressure != self.rest).any(-1)
+        if not away.any():
+            return state, seen
+        memory, there, signal = dict(state.memory), {}, pressure
+        for name, effect in self.stage("line"):
+            memory[name] = effect.rest(signal)
+            signal = effect.apply(signal, memory[name])
+        there["line"] = signal = self.chambers(signal)
+        context = Context(pressure.new_full((len(pressure),), STOOD_S), None, None, signal)
+        anchor, direction = directions.advance(state.anchor, state.direction, signal, self.band)
+        for name, effect in self.stage("material"):
+            memory[name], signal = effect.step(memory[name], signal, context)
+        hidden = memory
+        if self.remembers:
+            hidden = {NETWORK: self.network.advance(memory[NETWORK], signal, direction)}
+        points = self._network(signal, direction, hidden)
+        for stage in ("body", "sensor"):
+            for name, effect in self.stage(stage):
+                memory[name] = effect.rest(points)
+                points = effect.apply(points, memory[name])
+            there[stage] = points
+        for stage, signal in there.items():
+            seen[stage] = signal.where(away.view(-1, *[1] * (signal.ndim - 1)), seen[stage])
+        return state.where(away, ArmState(pressure, anchor, direction, memory)), seen
+
+    def _seen_at_rest(self, state: ArmState) -> dict[Stage, Tensor]:
+        """What an effect added behind the others of each stage sees of arms at rest."""
+        seen, signal = {}, state.pressure
+        for stage in ("line", "material"):
+            for name, effect in self.stage(stage):
+                signal = effect.apply(signal, state.memory[name])
+            seen[stage] = signal = self.chambers(signal)
+        points = self._network(signal, torch.zeros_like(signal), state.memory)
+        for stage in ("body", "sensor"):
+            for name, effect in self.stage(stage):
+                points = effect.apply(points, state.memory[name])
+            seen[stage] = points
+        return seen
+
     def _network(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         if self.remembers:
             return self.network(pressure, direction, memory[NETWORK])
@@ -143,8 +216,9 @@ class ArmModel(nn.Module):
         return ArmState(pressure, anchor, direction, memory), points
 
     def trace(self, history: History) -> Trace:
-        """What `shape` needs in each row; every run starts from an arm at rest."""
-        context, start = context_of(history), self.initial_state(history.runs).memory
+        """What `shape` needs in each row; every run starts from `first_pressure`."""
+        context = context_of(history)
+        start = self.first_state(self.first_pressure(history)).memory
         memory, signal = {}, history.pressure
         for name, effect in self.stage("line"):
             memory[name] = effect.scan(start[name], signal, context)
@@ -178,7 +252,7 @@ class ArmModel(nn.Module):
         outer = self.stage("body") + self.stage("sensor")
         if outer:
             context = replace(context_of(history), pressure=trace.pressure)
-            start = self.initial_state(history.runs).memory
+            start = self.first_state(self.first_pressure(history)).memory
             for name, effect in outer:
                 points = effect.apply(points, effect.scan(start[name], points, context))
         return points

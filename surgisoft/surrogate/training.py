@@ -115,6 +115,7 @@ class _Through:
     def __init__(self, model, data: Data, parameters, weights, config, epochs, generator):
         self.model, self.weights, self.generator = model, weights, generator
         self.history, self.targets = data.train, data.targets
+        self.first = model.first_pressure(data.train)
         self.optimiser = torch.optim.Adam(parameters, lr=MEMORY_RATE * config.learning_rate)
         self.schedule = _schedule(self.optimiser, epochs * MEMORY_STEPS, 0)
         lengths = data.train.valid.sum(1)
@@ -150,7 +151,7 @@ class _Through:
         inside = columns <= last
         columns = columns.clamp(max=last)
         context = self._context(rows, columns)
-        rest = self.model.initial_state(len(starts)).memory
+        rest = self.model.first_state(self.first[starts[:, 0]]).memory
         first = starts[:, 1] == 0
         memory = {}
 

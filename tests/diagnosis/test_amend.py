@@ -113,8 +113,7 @@ def test_an_amended_model_is_a_model(lab, capsys):
     assert list(model.effects) == ["creep"]
     history = history_of([recording]).select(torch.tensor([0]))
     predicted = model.predict(history)[0]
-    state = model.initial_state(1)
-    state = replace(state, pressure=history.pressure[:, 0])
+    state = model.first_state(model.first_pressure(history))
     for row in range(60):
         change = history.pressure[:, row] - state.pressure
         state, points = model.step(state, change, history.dt_s[:, row])

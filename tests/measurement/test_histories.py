@@ -1,5 +1,7 @@
 """Recordings as histories: what comes with the actuation."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -34,3 +36,14 @@ def test_without_any_temperature_there_is_none():
     assert history_of([recording("unknown")]).temperature_C is None
     nowhere = recording("missing", np.full(5, np.nan))
     assert history_of([nowhere]).temperature_C is None
+
+
+def test_runs_know_where_the_measured_actuation_stood_when_they_began():
+    first = recording("first")
+    history = history_of([first, replace(first, kind="settled")])
+    nan = torch.nan
+    expected = torch.tensor([[0.0], [3.0], [nan], [nan]])
+    assert torch.allclose(history.stood, expected, equal_nan=True)
+    assert history.select(torch.tensor([1])).stood.tolist() == [[3.0]]
+    commanded = replace(first, commanded=first.measured + 50)
+    assert history_of([commanded], "commanded").stood.tolist() == [[0.0], [3.0]]

@@ -1,6 +1,7 @@
 """The arm model: stepping is predicting, gradients are right, arms do not disturb each other."""
 
 import dataclasses
+from dataclasses import replace
 
 import pytest
 import torch
@@ -65,6 +66,46 @@ def test_stepping_is_predicting(kind, seed, lengths):
         state, points = arm.step(state, dp, history.dt_s[:, t])
         alive = history.valid[:, t]
         assert torch.allclose(points[alive], predicted[:, t][alive], atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["haw_nn", "recurrent", "constant_curvature"])
+@pytest.mark.parametrize("effects", [(), ("line_lag", "hysteresis", "creep", "inertia")])
+def test_stepping_is_predicting_where_runs_begin_away_from_rest(kind, effects):
+    arm, history = model(kind, effects), walks([20, 30, 25], 5)
+    stood = torch.stack([history.pressure[0, 0], torch.full((3,), 4.0), torch.full((3,), 50.0)])
+    history = replace(history, stood=stood)
+    first = arm.first_pressure(history)
+    state, predicted = arm.first_state(first), arm.predict(history)
+    assert torch.equal(state.pressure[[0, 2]], history.pressure[[0, 2], 0])
+    assert torch.equal(state.pressure[1], arm.rest)  # 4 of 69 kPa away: at rest
+    for t in range(30):
+        dp = history.pressure[:, t] - state.pressure
+        state, points = arm.step(state, dp, history.dt_s[:, t])
+        alive = history.valid[:, t]
+        assert torch.allclose(points[alive], predicted[:, t][alive], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "effects", [("line_lag",), ("inertia",), ("line_lag", "hysteresis", "inertia")]
+)
+def test_a_run_cut_after_a_long_hold_goes_on_as_the_whole_one(effects):
+    """Held for a day, the arm stands where a run is taken to begin that starts pressurised."""
+    arm = model(effects=effects)
+    hold = torch.tensor([40.0, 10.0, 25.0])
+    tail = walks([40], 2).pressure[0] * 0.3 + hold
+    tail[0] = hold
+    dwell = torch.cat([torch.zeros(1), torch.logspace(-1, 5, 100)]).double()
+    times = [torch.cat([dwell, dwell[-1] + 0.05 * torch.arange(1, 41)]), 0.05 * torch.arange(40.0)]
+    pressure = [torch.cat([hold.expand(101, 3), tail]), tail]
+    whole, cut = (
+        pack([t], [p], [torch.zeros(len(p), 5, 3)], stood=[stood])
+        for t, p, stood in zip(times, pressure, [torch.zeros(3), hold], strict=True)
+    )
+    went_on = arm.predict(whole)[0, 101:]
+    # From row 1 on, when every chamber has moved and its direction is no longer of the way there.
+    late = (arm.predict(cut)[0] - went_on)[1:].norm(dim=-1).amax()
+    fresh = (arm.predict(replace(cut, stood=None))[0] - went_on)[1:].norm(dim=-1).amax()
+    assert late < 0.05 * fresh
 
 
 def test_a_batch_is_its_arms_one_by_one():

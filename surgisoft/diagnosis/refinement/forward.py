@@ -45,6 +45,8 @@ class Forward:
         """keys: names of the effects whose parameters change; of none, those of the network."""
         self.model, self.problem = model, problem
         self.context = context_of(problem.history)
+        first = model.first_pressure(problem.history)
+        self.first = first[:1] if (first == first[:1]).all() else first
         outer = model.stage("body") + model.stage("sensor")
         self.thin = all(isinstance(effect, Memoryless) for _, effect in outer)
         links: list[tuple[str, Link]] = []
@@ -71,7 +73,7 @@ class Forward:
         return replace(self.context, pressure=signal.pressure)
 
     def _run(self, links: list[Link], signal: Signal) -> Signal:
-        rest = self.model.initial_state(1).memory
+        rest = self.model.first_state(self.first).memory
         runs = self.problem.history.runs
         rest = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in rest.items()}
         for link in links:

@@ -37,7 +37,7 @@ def strength_slopes(model: ArmModel, problem: Problem, key: str) -> np.ndarray:
     """
     effect = model.effects[key]
     forward = Forward(model, problem, [key])
-    rest = model.initial_state(problem.history.runs).memory[key]
+    rest = model.first_state(forward.first).memory[key]
     signal = forward.start
     context = forward.context_at(signal)
     memory = problem.rows(effect.scan(rest, signal.value, context))

@@ -62,6 +62,8 @@ class Signals:
     """(S, n, 3, m) change of key points with the effective actuation, mm a unit."""
     rest: dict[str, Tensor]
     """The signal of each stage before the first row, (R, m) or (R, n, 3)."""
+    first: Tensor
+    """(R, m) actuation at which each run begins."""
 
 
 @torch.no_grad()
@@ -71,17 +73,18 @@ def signals(problem: Problem) -> Signals:
     trace = model.trace(history)
     effective = model.effective(trace.pressure, trace.memory)
     points = model.network(effective, trace.direction)
-    first, rest = model.before(model.first_pressure(history))
+    first = model.first_pressure(history)
+    state, rest = model.before(first)
     context = replace(context_of(history), pressure=trace.pressure)
     stages = {}
     for stage in ("body", "sensor"):
         for name, effect in model.stage(stage):
-            points = effect.apply(points, effect.scan(first.memory[name], points, context))
+            points = effect.apply(points, effect.scan(state.memory[name], points, context))
         stages[stage] = points
     at, direction = problem.rows(effective), problem.rows(trace.direction)
     slope = network_slope(model, at, direction)
     return Signals(
-        context, trace.pressure, effective, stages["body"], stages["sensor"], slope, rest
+        context, trace.pressure, effective, stages["body"], stages["sensor"], slope, rest, first
     )
 
 
@@ -102,7 +105,9 @@ def columns_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
     them is taken to follow.
     """
     at = getattr(signal, effect.stage)
-    memory = effect.scan(effect.rest(signal.rest[effect.stage]), at, signal.context)
+    seen = signal.rest[effect.stage]
+    before = problem.model.first_memory(effect, seen, at[:, 0], signal.first)
+    memory = effect.scan(before, at, signal.context)
     changes = effect.columns(problem.rows(at), problem.rows(memory))
     if effect.stage in ("line", "material"):
         changes = torch.einsum("snjm,ksm->ksnj", signal.slope, changes)

@@ -165,6 +165,20 @@ class ArmModel(nn.Module):
             seen[stage] = signal.where(away.view(-1, *[1] * (signal.ndim - 1)), seen[stage])
         return state.where(away, ArmState(pressure, anchor, direction, memory)), seen
 
+    def first_memory(self, effect: Effect, seen: Tensor, signal: Tensor, first: Tensor) -> Tensor:
+        """Memory before the first row of an effect that is added behind the others of its stage.
+
+        seen: what `before` says of its stage; signal (R, ...): what it sees in the first row;
+        first (R, m): `first_pressure`.
+        """
+        memory = effect.rest(seen)
+        away = (first != self.rest).any(-1)
+        if effect.stage != "material" or not away.any():
+            return memory
+        context = Context(first.new_full((len(first),), STOOD_S), None, None, self.chambers(first))
+        stood = effect.advance(memory, signal, context)
+        return stood.where(away.view(-1, *[1] * (memory.ndim - 1)), memory)
+
     def _seen_at_rest(self, state: ArmState) -> dict[Stage, Tensor]:
         """What an effect added behind the others of each stage sees of arms at rest."""
         seen, signal = {}, state.pressure

@@ -7,6 +7,7 @@ import torch
 from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.problem import locked_rows, pose
 from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recording import Recording
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.default import default_arm
@@ -22,6 +23,24 @@ def recording():
 @pytest.fixture(scope="module")
 def problem(recording):
     return pose(default_arm(), [recording], rows=400)
+
+
+@pytest.fixture(scope="module")
+def pressurised(recording):
+    """The last run from its highest load on."""
+    last = recording.runs[-1]
+    top = last.start + int(recording.measured[last.start : last.stop - 100].sum(axis=1).argmax())
+    rows = slice(top, last.stop)
+    names = ("t_s", "measured", "key_points_mm")
+    cut = Recording("cut", **{name: getattr(recording, name)[rows] for name in names})
+    return pose(default_arm(), [cut], rows=400)
+
+
+@pytest.mark.parametrize("name", ["creep", "inertia", "rate_dependence", "softening", "payload"])
+def test_columns_are_slopes_where_a_run_begins_away_from_rest(pressurised, name):
+    model = pressurised.model
+    assert not torch.equal(model.first_pressure(pressurised.history), model.rest[None])
+    test_columns_are_slopes_of_the_whole_prediction(pressurised, name)
 
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"hysteresis"}))

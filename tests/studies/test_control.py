@@ -19,14 +19,14 @@ def nothing(done, total, note=""):
 def folder(tmp_path_factory):
     """A folder with one run of a few turns, trained elsewhere with its own number of steps."""
     place = tmp_path_factory.mktemp("runs")
-    trained(place / "track_circle-seed-4", plan_of("track_circle", 4, 3072), nothing)
+    trained(place / "track_circle-seed-4", plan_of("track_circle", 4, 12288), nothing)
     return place
 
 
 def test_a_run_that_is_there_is_taken_as_it_is(folder, monkeypatch):
     weights = (folder / "track_circle-seed-4" / "checkpoints" / "best.pt").read_bytes()
     first = run(TINY, folder, nothing)
-    assert first.runs[0].cost.steps == 3072
+    assert first.runs[0].cost.steps == 12288
     assert (folder / "track_circle-seed-4" / "checkpoints" / "best.pt").read_bytes() == weights
     shown = {(p.place, p.driver): p.numbers["error_mean_mm"]["mean"] for p in first.played}
     assert len(shown) == 6
@@ -46,9 +46,9 @@ def test_a_run_of_another_task_is_refused(folder, tmp_path):
 def test_another_plan_is_not_taken_for_the_wanted_one(folder):
     place = folder / "track_circle-seed-4"
     with pytest.raises(InputError, match="its seed: 4, expected 5"):
-        trained(place, plan_of("track_circle", 5, 3072), nothing)
-    with pytest.raises(InputError, match="its steps: 3072, expected 6144"):
-        trained(place, plan_of("track_circle", 4, 6144), nothing)
+        trained(place, plan_of("track_circle", 5, 12288), nothing)
+    with pytest.raises(InputError, match="its steps: 12288, expected 24576"):
+        trained(place, plan_of("track_circle", 4, 24576), nothing)
 
 
 def test_every_task_has_numbers_and_those_with_bodies_a_referee():
@@ -60,8 +60,8 @@ def test_every_task_has_numbers_and_those_with_bodies_a_referee():
 
 
 def test_cost_is_that_of_the_last_turn(folder):
-    run_folder = trained(folder / "track_circle-seed-4", plan_of("track_circle", 4, 3072), nothing)
-    assert cost(run_folder).steps == 3072
+    run_folder = trained(folder / "track_circle-seed-4", plan_of("track_circle", 4, 12288), nothing)
+    assert cost(run_folder).steps == 12288
     assert Cost(6000, 10.0, 3.0).steps_per_s == 2000.0
 
 

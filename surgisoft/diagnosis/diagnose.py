@@ -36,9 +36,13 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
+LEAST_LEFT = 1.0
+"""Factor on the surrogate's validated error that is left wherever something unknown is told: what
+is less may be the surrogate's own."""
 LEAST_EXPLAINED, LEFT_SIZE = 0.5, 2.5
-"""Share of the error above the floor that named effects must explain where what they leave is still
-so many times the surrogate's validated error; else something that is not known is missing."""
+"""Share of the error above the floor that named effects and the next best one must explain where
+what the named ones leave is still so many times the surrogate's validated error; else something
+that is not known is missing."""
 EXPLAINED, STATIC_SIZE = 0.6, 5.0
 """The same where the static part alone of what they leave is so many times that."""
 MISSED_SHARE = 0.2
@@ -220,16 +224,16 @@ def _order(found: Findings) -> list[Standing]:
 def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     """The kind of the answer and the effects that it names."""
     names = tuple(standing.effect for standing in found.named)
+    beyond = numbers["left_size"] >= LEAST_LEFT
     if names:
-        if _imitated(found, numbers):
+        if beyond and _imitated(found, numbers):
             return "unknown_effect", ()
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
         return ("several" if len(names) > 1 else "identified"), names
     if numbers["before_over_floor"] >= TRAINED:
-        if numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE:
-            return "unknown_effect", ()
-        if numbers["static_size"] >= OFF_SIZE:
+        box = numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE
+        if beyond and (box or numbers["static_size"] >= OFF_SIZE):
             return "unknown_effect", ()
         if numbers["static_share"] >= 0.5:
             return "surrogate_undertrained", ()
@@ -242,12 +246,14 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     They explain too little and leave much, or a black box explains more, or other forms of them do.
     """
     explained = numbers["explained_above_floor"]
+    further = found.next[0].gain if found.next else 0.0
+    together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
     sure = numbers["box_p"] <= CHANCE
-    if explained < LEAST_EXPLAINED and numbers["left_size"] >= LEFT_SIZE:
+    if together < LEAST_EXPLAINED and numbers["left_size"] >= LEFT_SIZE:
         return True
     static = numbers["static_size_after"] >= STATIC_SIZE
-    if explained < EXPLAINED and (static or (sure and beaten >= MISSED_SHARE)):
+    if together < EXPLAINED and (static or (sure and beaten >= MISSED_SHARE)):
         return True
     share, log_gain = BETTER_BOX
     if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:

@@ -15,7 +15,7 @@ import numpy as np
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Race, Standing, validation_of
 
-WRONG, ALL_WRONG = 0.009, 0.03
+WRONG, ALL_WRONG = 0.015, 0.03
 """Least product of what goes when a form is let loose, as a share of the error above the floor, and
 the mean fall of a block's log error, from which that form is wrong; the same where it stands for
 all of several rivals, which an experiment may tell apart."""

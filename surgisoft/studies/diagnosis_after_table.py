@@ -180,6 +180,6 @@ def amendments(outcomes: list[Outcome]) -> str:
         lines.append(f"| {name} | {what} | {numbers} | {100 * pooled_share(some):.0f} % |")
     note = (
         "Errors in mm on the locked quarter. Oracle: the same model on the same robot with nothing "
-        "hidden. Share: of the oracle's fall."
+        "hidden, re-tuned where that pays. Share: of the oracle's fall."
     )
     return f"## Amendments\n\n{note}\n\n" + "\n".join(lines)

@@ -175,9 +175,12 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
 
 
 def _extent_mm(points: np.ndarray) -> float:
-    """Median distance of the last measured key point from the first one, (N, n, 3) mm."""
+    """Median distance of the last measured of the key points (N, n, 3) mm from the first; or NaN."""
     seen = np.isfinite(points).all(2)
-    ends = np.flatnonzero(seen.any(0))[[0, -1]]
-    both = seen[:, ends].all(1)
-    apart = np.linalg.norm(points[both][:, ends[1]] - points[both][:, ends[0]], axis=1)
-    return float(np.median(apart)) if len(apart) and ends[0] != ends[1] else float("nan")
+    measured = np.flatnonzero(seen.any(0))
+    if len(measured) < 2:
+        return float("nan")
+    first, last = measured[0], measured[-1]
+    both = seen[:, first] & seen[:, last]
+    apart = np.linalg.norm(points[both, last] - points[both, first], axis=1)
+    return float(np.median(apart)) if len(apart) else float("nan")

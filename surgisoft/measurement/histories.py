@@ -175,7 +175,7 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
 
 
 def _extent_mm(points: np.ndarray) -> float:
-    """Median distance of the last measured of the key points (N, n, 3) mm from the first; or NaN."""
+    """Median distance, mm, between the first and last measured of the key points (N, n, 3); NaN."""
     seen = np.isfinite(points).all(2)
     measured = np.flatnonzero(seen.any(0))
     if len(measured) < 2:

@@ -22,7 +22,7 @@ from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.gates import first_shares, studentised
 from surgisoft.diagnosis.race.naming import CHANCE, name_effects
-from surgisoft.diagnosis.race.ranking import Race, Standing
+from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
@@ -87,7 +87,7 @@ class Findings:
     @property
     def picked(self) -> tuple[int, ...]:
         """Columns of the named effects."""
-        return sum((standing.option.picked for standing in self.named), ())
+        return picked_by(self.named)
 
 
 def diagnose(
@@ -133,7 +133,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     race = Race.of(problem, some)
     first = race.standings()
     named, following = name_effects(race, first)
-    base = sum((standing.option.picked for standing in named), ())
+    base = picked_by(named)
     rivals = _rivals(race, first, named)
     report("black box")
     return Findings(

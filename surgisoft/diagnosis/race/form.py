@@ -5,6 +5,9 @@ smaller effect. So before a further effect is named, those before it are let loo
 them explains may be scaled by any first-order function of the chambers' pressures, of their
 directions and of the place along the body. Only what a further effect explains beside that is its
 own. (The discrepancy term of Kennedy & O'Hagan 2001, here for the form of an effect.)
+
+Where effects that are let loose explain much more than they do as they are, their form is not that
+of what is missing: they are its nearest relatives only, and something unknown is missing.
 """
 
 from collections.abc import Sequence
@@ -13,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.race.gates import family_p_values
-from surgisoft.diagnosis.race.ranking import Race, Standing, validation_of
+from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by, validation_of
 
 WRONG, ALL_WRONG = 0.015, 0.03
 """Least product of what goes when a form is let loose, as a share of the error above the floor, and
@@ -60,7 +63,7 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
         columns = _loose_columns(race, named)
         tried.append(validation_of(race.problem, columns).losses(range(columns.shape[3])))
     best = min(tried, key=np.sum)
-    beyond = [_beyond(race, _picked(named), best, len(ways)) for named in ways]
+    beyond = [_beyond(race, picked_by(named), best, len(ways)) for named in ways]
     return min(beyond, key=lambda one: one.worth)
 
 
@@ -91,13 +94,9 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     return float(before.sum()), answer
 
 
-def _picked(named: Sequence[Standing]) -> tuple[int, ...]:
-    return sum((standing.option.picked for standing in named), ())
-
-
 def _loose_columns(race: Race, named: Sequence[Standing]) -> np.ndarray:
     """(S, n, 3, K) the named effects' columns, and what each of them explains, scaled."""
-    base = _picked(named)
+    base = picked_by(named)
     amplitudes = race.validation.amplitudes(base)
     columns, first = [race.columns[..., list(base)]], 0
     for standing in named:

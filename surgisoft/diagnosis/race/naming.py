@@ -1,7 +1,7 @@
 """Which effects the gates let through: forward, exchanged where another fits better, and back."""
 
 from surgisoft.diagnosis.race.form import beside_loose
-from surgisoft.diagnosis.race.ranking import Race, Standing
+from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 
 CHANCE = 0.02
 """Largest chance, over all effects together, at which an effect is named."""
@@ -46,14 +46,10 @@ def name_effects(race: Race, first: list[Standing]) -> tuple[list[Standing], lis
             break
         before = {standing.effect for standing in named}
         named = _without_idle(race, first, _exchanged(race, [*named, passed]))
-        following = race.standings(_picked(named), tuple(s.effect for s in named))
+        following = race.standings(picked_by(named), tuple(s.effect for s in named))
         if {standing.effect for standing in named} == before:
             break
     return named, following
-
-
-def _picked(named: list[Standing]) -> tuple[int, ...]:
-    return sum((standing.option.picked for standing in named), ())
 
 
 def _joins(race: Race, first: list[Standing], named: list[Standing], s: Standing) -> bool:
@@ -75,7 +71,7 @@ def _joins(race: Race, first: list[Standing], named: list[Standing], s: Standing
 def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing) -> bool:
     """Whether one effect on top of the named ones is beyond chance and large enough."""
     start = race.excess(race.losses())
-    share = (race.losses(_picked(named)).sum() - s.losses.sum()) / start
+    share = (race.losses(picked_by(named)).sum() - s.losses.sum()) / start
     log_gain = s.log_gain.mean()
     if not named:
         chance, large, least = LARGE
@@ -97,7 +93,7 @@ def _exchanged(race: Race, named: list[Standing]) -> list[Standing]:
             others = named[:place] + named[place + 1 :]
             if not others:
                 break
-            best = race.standings(_picked(others), tuple(s.effect for s in others))[0]
+            best = race.standings(picked_by(others), tuple(s.effect for s in others))[0]
             changed = changed or best.effect != named[place].effect
             named = [*named[:place], best, *named[place + 1 :]]
         if not changed:
@@ -110,11 +106,11 @@ def _in_order(race: Race, named: list[Standing]) -> list[Standing]:
 
     def missed(standing: Standing) -> float:
         rest = [other for other in named if other is not standing]
-        return -float(race.losses(_picked(rest)).sum())
+        return -float(race.losses(picked_by(rest)).sum())
 
     answer: list[Standing] = []
     for standing in sorted(named, key=missed):
-        found = race.standings(_picked(answer), tuple(s.effect for s in answer))
+        found = race.standings(picked_by(answer), tuple(s.effect for s in answer))
         again = next((s for s in found if s.effect == standing.effect), standing)
         answer.append(again)
     return answer
@@ -125,7 +121,7 @@ def _without_idle(race: Race, first: list[Standing], named: list[Standing]) -> l
     while len(named) > 1:
         for standing in reversed(named):
             others = [other for other in named if other is not standing]
-            found = race.standings(_picked(others), tuple(s.effect for s in others))
+            found = race.standings(picked_by(others), tuple(s.effect for s in others))
             again = next((s for s in found if s.effect == standing.effect), None)
             if again is None or not passes(race, first, others, again):
                 named = _in_order(race, others)

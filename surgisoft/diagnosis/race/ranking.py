@@ -1,5 +1,6 @@
 """Which effects explain what is left, alone and beside others, on held-out blocks."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,6 +54,11 @@ class Standing:
     def score(self) -> float:
         """What effects are ranked by."""
         return _score(self.log_gain, self.option)
+
+
+def picked_by(standings: Sequence[Standing]) -> tuple[int, ...]:
+    """The columns of effects, one after another."""
+    return sum((standing.option.picked for standing in standings), ())
 
 
 def _near(quantity: Quantity) -> bool:

@@ -187,6 +187,8 @@ def body(rest: Residuals, backbone: Backbone, title: str = ""):
     axis.set_ylabel("y [mm]")
     axis.set_zlabel("z [mm]")
     axis.set_aspect("equal")
+    # The label of z stands outside the axes' own box.
+    figure.get_layout_engine().set(rect=(0.0, 0.0, 0.94, 1.0))
     if len(whole):
         axis.legend(frameon=False, loc="upper left")
     axis.set_title(title or "Body, measured and predicted")

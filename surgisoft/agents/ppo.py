@@ -70,6 +70,9 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             # Before it has learned anything a policy asks for next to nothing.
             ppo.get_policy().mlp[-1].weight.mul_(0.01)
             ppo.get_policy().mlp[-1].bias.zero_()
+        for group in ppo.optimizer.param_groups:
+            # One call for all weights instead of a dozen small ones for each.
+            group["fused"] = True
         ppo.train_mode()
         answer[agent] = ppo
     return answer

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.agents.on_rig import RigConfig
+from surgisoft.agents.presets import PAPER_STEPS
 from surgisoft.agents.run_folder import BEST, RunFolder
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.studies.driving import Cost, cost, plan_of, played, trained
 from surgisoft.studies.kept import Kept, Meter, Report
+from surgisoft.studies.two_processes import trained_by_two
 from surgisoft.tasks.configs import config_of, config_table
 
 LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
@@ -43,6 +45,8 @@ class ControlConfig:
     """Seed of the episodes that are played; training and its evaluations use others."""
     rate_steps: int = 1_048_576
     """Steps of preset `paper` by which its rate is measured; 0: it is not."""
+    whole_steps: int = PAPER_STEPS
+    """Steps that two processes train together on `RATE_TASK`; 0: they do not."""
 
     def __post_init__(self):
         for name in self.tasks:
@@ -92,15 +96,23 @@ class Results:
     """Every driver in every place."""
     paper: Cost | None
     """The run that measures the rate of preset `paper`."""
+    whole: Cost | None = None
+    """The run of as many steps as the paper's, by two processes; its wall time is what counts."""
 
 
 def run(config: ControlConfig, folder: Path, report: Report) -> Results:
     """Train what is missing, then play everything that is not kept from before."""
     learned = [(task, seed) for task in LEARNED if task in config.tasks for seed in config.seeds]
     plays = 2 * (len(learned) + 2 * len(config.tasks))
-    meter = Meter(report, 100 * len(learned) + 25 * bool(config.rate_steps) + 5 * plays)
+    whole = config.whole_steps if RATE_TASK in config.tasks else 0
+    alone = 25 * bool(config.rate_steps) + 100 * bool(whole)
+    meter = Meter(report, 100 * len(learned) + alone + 5 * (plays + 2 * bool(whole)))
     folder.mkdir(parents=True, exist_ok=True)
-    drivers, runs = [], []
+    drivers, runs, both = [], [], None
+    if whole:
+        place = folder / f"{RATE_TASK}-{whole}-steps"
+        both = trained_by_two(place, RATE_TASK, whole, meter.stage(100, f"train {place.name}"))
+        drivers.append((RATE_TASK, f"learned, {whole:,} steps", str(place)))
     for task, seed in learned:
         place = folder / f"{task}-seed-{seed}"
         one = _learned(place, task, seed, meter.stage(100, f"train {place.name}"))
@@ -115,7 +127,7 @@ def run(config: ControlConfig, folder: Path, report: Report) -> Results:
             shown.append(
                 Played(task, where, name, _played(config, kept, task, where, driver, tell))
             )
-    return Results(tuple(runs), tuple(shown), paper)
+    return Results(tuple(runs), tuple(shown), paper, cost(both) if both else None)
 
 
 def _learned(folder: Path, task: str, seed: int, report: Report) -> Trained:

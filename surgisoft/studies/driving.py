@@ -123,7 +123,8 @@ def _check_same(run: RunFolder, plan: Plan) -> None:
 
 def _rows(folder: Path) -> list[dict]:
     file = folder / "metrics.jsonl"
-    lines = file.read_text().splitlines() if file.is_file() else []
+    text = file.read_text() if file.is_file() else ""
+    lines = text.rpartition("\n")[0].splitlines()  # the last line may be half written
     if not lines:
         raise InputError(f"{file}: nothing was trained there yet")
     return [json.loads(line) for line in lines]

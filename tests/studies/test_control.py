@@ -3,12 +3,13 @@
 import pytest
 
 from surgisoft.errors import InputError
-from surgisoft.studies import control
+from surgisoft.studies import control, two_processes
 from surgisoft.studies.control import ControlConfig, Played, Results, Trained, run
 from surgisoft.studies.control_table import markdown
 from surgisoft.studies.driving import Cost, cost, plan_of, played, trained
+from surgisoft.studies.two_processes import trained_by_two
 
-TINY = ControlConfig(("track_circle",), (4,), 2, 1, rate_steps=0)
+TINY = ControlConfig(("track_circle",), (4,), 2, 1, rate_steps=0, whole_steps=0)
 
 
 def nothing(done, total, note=""):
@@ -38,7 +39,7 @@ def test_a_run_that_is_there_is_taken_as_it_is(folder, monkeypatch):
 
 def test_a_run_of_another_task_is_refused(folder, tmp_path):
     (tmp_path / "laser_plane-seed-4").symlink_to(folder / "track_circle-seed-4")
-    config = ControlConfig(("laser_plane",), (4,), 2, 1, rate_steps=0)
+    config = ControlConfig(("laser_plane",), (4,), 2, 1, rate_steps=0, whole_steps=0)
     with pytest.raises(InputError, match="was trained on track_circle, expected laser_plane"):
         run(config, tmp_path, nothing)
 
@@ -81,12 +82,34 @@ def test_goals_are_bold_where_they_are_reached_and_only_there():
         _played("circle_ablation", "simulation", "random", success=0.0, collided=1.0),
     )
     one = Trained("track_circle", 1, "fast", Cost(4_000_000, 400.0, 200.0), {"error_mm": 0.005})
-    results = Results((one,), shown, Cost(1_000_000, 2000.0, 1000.0))
+    whole = Cost(20_000_000, 240.0, 230.0)
+    results = Results((one,), shown, Cost(1_000_000, 2000.0, 1000.0), whole)
     text = markdown(results, ControlConfig(("track_circle", "circle_ablation")))
     assert "**0.005**, 0.0051 | **0.001** | 30 |" in text
     assert "success | >= 0.99 |  | 98.0% | **100.0%** | 0.0% |" in text
     assert "collided | <= 0 |  | **0.0%** | 1.0% | 100.0% |" in text
-    # 20 M steps at 1,000 and 20,000 steps a second; half of the latter on two cores.
+    # 20 M steps at 1,000 and 20,000 steps a second, and as two processes took them.
     assert "| paper | 1,000,000 steps of track_circle | 1,000 | 333.3 |" in text
     assert "| fast | 4,000,000 steps of track_circle | 20,000 | 16.7 |" in text
-    assert "8.3 minutes at the quicker preset, which misses the goal" in text
+    assert "in 240 s of wall time, 4.0 minutes for 20,000,000" in text
+    assert "5 minutes on two cores, which is reached" in text
+    late = Results((one,), shown, results.paper, Cost(10_000_000, 151.0, 230.0))
+    text = markdown(late, ControlConfig(("track_circle",)))
+    assert "151 s of wall time, 5.0 minutes" in text and "which is missed" in text
+
+
+def test_two_processes_train_together_and_are_taken_once_they_are_done(tmp_path, monkeypatch):
+    place = tmp_path / "whole"
+    told = []
+    run_folder = trained_by_two(place, "track_circle", 100_000, lambda *seen: told.append(seen))
+    assert run_folder.config["processes"] == 2
+    assert cost(run_folder).steps == 2 * 2 * 4096 * 12  # two turns of two processes
+    monkeypatch.setattr(two_processes.subprocess, "Popen", lambda *a, **k: pytest.fail("again"))
+    assert trained_by_two(place, "track_circle", 100_000, nothing).path == place
+    with pytest.raises(InputError, match="track_circle by 2 processes, expected track_square by 2"):
+        trained_by_two(place, "track_square", 100_000, nothing)
+
+
+def test_two_processes_that_fail_say_where_to_look(tmp_path):
+    with pytest.raises(InputError, match=r"ended early, see .*whole\.log"):
+        trained_by_two(tmp_path / "whole", "no_task", 100_000, nothing)

@@ -1,14 +1,15 @@
 """Forward, exchanged, back: on a hand-made table of losses, and on a robot that hides two."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.race import naming
 from surgisoft.diagnosis.race.gates import family_p_values
-from surgisoft.diagnosis.race.ranking import Option, Standing
+from surgisoft.diagnosis.race.ranking import Option, Race, Standing
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_known_error, load_model
@@ -31,6 +32,9 @@ class Table:
 
     def excess(self, losses):
         return float(losses.sum() - 1.0)
+
+    def in_fit(self, effect):
+        return False
 
     def standings(self, base=(), without=()):
         answer = []
@@ -66,6 +70,14 @@ def test_the_best_alone_gives_way_to_the_two_that_are_best_together(table):
     assert [s.effect for s in following] == ["blend"]
 
 
+def test_an_effect_of_the_fit_is_not_named_for_what_the_fit_left(table, monkeypatch):
+    monkeypatch.setattr(table, "in_fit", lambda effect: effect == "blend", raising=False)
+    named, _ = naming.name_effects(table, table.standings())
+    assert "blend" not in [s.effect for s in named]
+    monkeypatch.setattr(table, "in_fit", lambda effect: True)
+    assert naming.name_effects(table, table.standings())[0] == []
+
+
 def test_what_a_form_leaves_behind_is_no_further_effect(table, monkeypatch):
     """Where the first effect let loose explains what the second would, one is named."""
 
@@ -86,6 +98,22 @@ def test_two_effects_of_a_robot_are_both_named():
     found = diagnose(model, [recording], reference=known)
     assert found.verdict.kind == "several"
     assert set(found.verdict.effects) == {"creep", "payload"}
+
+
+def test_what_the_fit_left_is_the_validated_error_with_the_effect_in_the_model():
+    rig = VirtualRig(0, take=5)
+    recording, _ = rig.record(make_protocol("ramps", rig.limits, 1200, seed=5))
+    problem = pose(load_model("default"), [recording], part="open")
+    square = np.square(problem.residual).sum(2)
+    above = float(np.sqrt(np.nanmean(square) - np.mean(problem.noise_mm**2)))
+
+    def in_fit(effect, factor):
+        validated = np.full_like(problem.surrogate_mm, factor * above)
+        return Race.of(replace(problem, surrogate_mm=validated), []).in_fit(effect)
+
+    assert in_fit("hysteresis", 1.01)
+    assert not in_fit("hysteresis", 0.99)
+    assert not in_fit("creep", 2.0)  # the model was fitted without it
 
 
 @pytest.mark.parametrize("name", ["leak", "breathing"])

@@ -74,6 +74,8 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     share = (race.losses(picked_by(named)).sum() - s.losses.sum()) / start
     log_gain = s.log_gain.mean()
     if not named:
+        if race.in_fit(s.effect):
+            return False
         chance, large, least = LARGE
         sure = s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN
         return bool(sure or (s.p_value <= chance and share >= large and log_gain >= least))

@@ -126,6 +126,18 @@ class Race:
         """Squared error above the noise floor, mm^2."""
         return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
+    def in_fit(self, effect: str) -> bool:
+        """Whether the model was fitted with an effect and is off by no more than it was then.
+
+        The validated error holds what was wrong with the effect's parameters from the beginning.
+        """
+        if effect not in self.problem.model.effects:
+            return False
+        residual = self.problem.residual
+        seen = np.isfinite(residual).all(2).sum(0)
+        allowed = float(seen @ np.square(self.problem.surrogate_mm))
+        return bool(np.nansum(np.square(residual)) - self.floor.sum() < allowed)
+
     def log_ratio(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(B,) log of errors before over after; the floor keeps quiet blocks from shouting."""
         return np.log((before + self.floor) / (after + self.floor))

@@ -13,6 +13,32 @@ from surgisoft.cli.progress import progress
 benchmark = typer.Typer(help="Long studies on the virtual rig.", no_args_is_help=True)
 app.add_typer(benchmark, name="benchmark")
 
+Images = Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the pictures here.")]
+"""Option of the studies that draw."""
+Output = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
+]
+"""Option of all studies."""
+
+
+def _numbers(option: str, text: str) -> list[int]:
+    """Whole numbers between commas, or one line that says what was expected."""
+    from surgisoft.errors import InputError
+
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} '{text}': expected whole numbers such as 1,2,3") from None
+
+
+def _show(title: str, command: str, body: str, output: Path | None) -> None:
+    """Print a study's results under the command and the day, and write them where asked for."""
+    today = datetime.date.today().isoformat()
+    text = f"# {title}\n\nPrinted by `{command}` on {today}.\n\n{body}"
+    if output:
+        write_text(output, text)
+    print(text)
+
 
 @benchmark.command()
 def modelling(
@@ -21,31 +47,19 @@ def modelling(
         int | None, typer.Option(min=64, help="Training points; default the paper's 13,824.")
     ] = None,
     processes: Annotated[int, typer.Option(min=1, help="Fits that run side by side.")] = 2,
-    images: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw loops and bodies of the first robot.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
-    ] = None,
+    images: Images = None,
+    output: Output = None,
 ) -> None:
     """The paper's modelling results: architectures, inputs, baselines and memory."""
-    from surgisoft.errors import InputError
     from surgisoft.studies.modelling import run
 
-    try:
-        numbers = [int(word) for word in seeds.split(",")]
-    except ValueError:
-        raise InputError(f"--seeds '{seeds}': expected whole numbers such as 1,2,3") from None
+    numbers = _numbers("--seeds", seeds)
     with progress("modelling") as report:
         table = run(numbers, points, processes, report, images)
     command = f"surgisoft benchmark modelling --seeds {seeds}"
     if points:
         command += f" --points {points}"
-    today = datetime.date.today().isoformat()
-    text = f"# Modelling results\n\nPrinted by `{command}` on {today}.\n\n{table}"
-    if output:
-        write_text(output, text)
-    print(text)
+    _show("Modelling results", command, table, output)
 
 
 @benchmark.command()
@@ -64,35 +78,23 @@ def diagnosis(
         int,
         typer.Option(min=0, help="Cases with one effect of the list whose model is amended too."),
     ] = 45,
-    images: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw the reliability diagram here.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
-    ] = None,
+    images: Images = None,
+    output: Output = None,
 ) -> None:
     """The benchmark of `diagnose`: virtual robots with hidden effects, clean ones, unknown ones."""
-    from surgisoft.errors import InputError
     from surgisoft.studies.diagnosis import run
     from surgisoft.studies.diagnosis_cases import cases
     from surgisoft.studies.diagnosis_table import draw, markdown
 
-    try:
-        numbers = [int(word) for word in robots.split(",")]
-    except ValueError:
-        raise InputError(f"--robots '{robots}': expected whole numbers such as 4,5,6") from None
+    numbers = _numbers("--robots", robots)
     some = cases(numbers, count, seed)
     with progress("diagnosis") as report:
         outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
     command += f" --amend {amend}"
-    today = datetime.date.today().isoformat()
-    text = f"# Diagnosis results\n\nPrinted by `{command}` on {today}.\n\n{markdown(outcomes)}"
     if images:
         print(f"wrote {draw(outcomes, images)}")
-    if output:
-        write_text(output, text)
-    print(text)
+    _show("Diagnosis results", command, markdown(outcomes), output)
 
 
 @benchmark.command("hidden-effect")
@@ -108,12 +110,8 @@ def hidden_effect(
     work: Annotated[
         Path, typer.Option(metavar="DIR", help="Keeps recordings, models and policies: goes on.")
     ] = Path("runs/benchmark-hidden-effect"),
-    images: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw the error bars here.")
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
-    ] = None,
+    images: Images = None,
+    output: Output = None,
 ) -> None:
     """The loop closed: train, diagnose on a rig that hides an effect, amend, train anew."""
     import torch
@@ -131,16 +129,11 @@ def hidden_effect(
         f"surgisoft benchmark hidden-effect --effects {effects} --specimen {specimen} "
         f"--strength {strength:g} --steps {steps} --episodes {episodes} --seed {seed}"
     )
-    today = datetime.date.today().isoformat()
     shown = ""
     if images:
         paths = draw(outcomes, images)
         shown = "".join(f"\n![{path.stem}](../images/{path.name})\n" for path in paths)
-    text = f"# The loop closed\n\nPrinted by `{command}` on {today}.\n\n"
-    text += markdown(outcomes, config) + shown
-    if output:
-        write_text(output, text)
-    print(text)
+    _show("The loop closed", command, markdown(outcomes, config) + shown, output)
 
 
 @benchmark.command()
@@ -158,22 +151,16 @@ def control(
     seeds: Annotated[str, typer.Option(help="Seeds of the training runs.")] = "1,2,3",
     episodes: Annotated[int, typer.Option(min=2, help="Episodes in simulation.")] = 100,
     rig_episodes: Annotated[int, typer.Option(min=2, help="Episodes on the rig.")] = 20,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
-    ] = None,
+    output: Output = None,
 ) -> None:
     """Learned beside scripted beside random on every task, in simulation and on the rig."""
     import torch
 
-    from surgisoft.errors import InputError
     from surgisoft.studies.control import TASKS, ControlConfig, run
     from surgisoft.studies.control_table import markdown
 
     check_folder(runs)
-    try:
-        numbers = tuple(int(word) for word in seeds.split(","))
-    except ValueError:
-        raise InputError(f"--seeds '{seeds}': expected whole numbers such as 1,2,3") from None
+    numbers = tuple(_numbers("--seeds", seeds))
     chosen = tuple(tasks.split(",")) if tasks else TASKS
     config = ControlConfig(chosen, numbers, episodes, rig_episodes)
     torch.set_num_threads(1)
@@ -182,9 +169,4 @@ def control(
     command = f"surgisoft benchmark control --seeds {seeds}"
     command += f" --tasks {tasks}" if tasks else ""
     command += f" --episodes {episodes} --rig-episodes {rig_episodes}"
-    today = datetime.date.today().isoformat()
-    text = f"# Control results\n\nPrinted by `{command}` on {today}.\n\n"
-    text += markdown(results, config)
-    if output:
-        write_text(output, text)
-    print(text)
+    _show("Control results", command, markdown(results, config), output)

@@ -69,28 +69,30 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
 
 def _beyond(race: Race, picked: tuple[int, ...], after: np.ndarray, ways: int) -> Loosened:
     before = race.losses(picked)
-    log_gain = race.log_ratio(before, after)
-    chance = float(family_p_values(log_gain[None])[0]) if log_gain.any() else 1.0
+    log_gain, chance = _fall(race, before, after)
     share = (before.sum() - after.sum()) / race.excess(race.losses())
     return Loosened(after, float(share), float(log_gain.mean()), chance, ways)
 
 
+def _fall(race: Race, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float]:
+    """(B,) fall of each block's log error, and the chance of such a fall without a cause."""
+    log_gain = race.log_ratio(before, after)
+    return log_gain, float(family_p_values(log_gain[None])[0]) if log_gain.any() else 1.0
+
+
 def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[float, Standing]:
-    """(excess of the named effects let loose in mm^2, the further effect's standing beside them).
+    """(loss of the named effects let loose in mm^2, the further effect's standing beside them).
 
     The chance counts this one effect alone: the others have been corrected for before.
     """
-    columns = [_loose_columns(race, named), race.columns[..., list(further.option.picked)]]
+    picked = further.option.picked
+    columns = [_loose_columns(race, named), race.columns[..., list(picked)]]
     together = np.concatenate(columns, axis=3)
-    validation = validation_of(race.problem, together)
-    total = together.shape[3]
-    before = validation.losses(range(total - len(further.option.picked)))
-    after = validation.losses(range(total))
-    log_gain = race.log_ratio(before, after)
-    chance = float(family_p_values(log_gain[None])[0]) if log_gain.any() else 1.0
-    excess = race.excess(before)
-    gain = (before.sum() - after.sum()) / excess
-    answer = Standing(further.effect, further.option, after, log_gain, chance, float(gain))
+    validation, total = validation_of(race.problem, together), together.shape[3]
+    before, after = (validation.losses(range(n)) for n in (total - len(picked), total))
+    log_gain, chance = _fall(race, before, after)
+    gain = float((before.sum() - after.sum()) / race.excess(before))
+    answer = Standing(further.effect, further.option, after, log_gain, chance, gain)
     return float(before.sum()), answer
 
 

@@ -39,14 +39,14 @@ RIVAL_GAIN = 0.8
 LEAST_LEFT = 1.0
 """Factor on the surrogate's validated error that is left wherever something unknown is told: what
 is less may be the surrogate's own."""
-LEAST_EXPLAINED, LEFT_SIZE = 0.5, 2.5
-"""Share of the error above the floor that named effects and the next best one must explain where
-what the named ones leave is still so many times the surrogate's validated error; else something
-that is not known is missing."""
-EXPLAINED, STATIC_SIZE = 0.6, 5.0
-"""The same where the static part alone of what they leave is so many times that."""
-MISSED_SHARE = 0.2
-"""The same where they explain so much less, of the error above the floor, than a black box does."""
+LEAST_EXPLAINED = ((2.5, 0.67), (1.0, 0.55))
+"""(what the named effects leave, in units of the surrogate's validated error; share of the error
+above the floor that they and the next best one must explain where they leave at least that); else
+something that is not known is missing. The smaller what is left, the more of it may be the
+surrogate's own."""
+EXPLAINED, MISSED_SHARE = 0.6, 0.2
+"""The same wherever something is left, where they explain so much less, of the error above the
+floor, than a black box does."""
 BETTER_BOX = (0.05, 0.25)
 """From when on a black box does so much better than the named effects that they are not what is
 missing: share of the error above the floor that it explains besides, and mean fall of a block's log
@@ -250,10 +250,9 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
     sure = numbers["box_p"] <= CHANCE
-    if together < LEAST_EXPLAINED and numbers["left_size"] >= LEFT_SIZE:
+    if any(numbers["left_size"] >= left and together < least for left, least in LEAST_EXPLAINED):
         return True
-    static = numbers["static_size_after"] >= STATIC_SIZE
-    if together < EXPLAINED and (static or (sure and beaten >= MISSED_SHARE)):
+    if together < EXPLAINED and sure and beaten >= MISSED_SHARE:
         return True
     share, log_gain = BETTER_BOX
     if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:

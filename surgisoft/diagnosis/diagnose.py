@@ -39,11 +39,9 @@ RIVAL_GAIN = 0.8
 LEAST_LEFT = 1.0
 """Factor on the surrogate's validated error that is left wherever something unknown is told: what
 is less may be the surrogate's own."""
-LEAST_EXPLAINED = ((2.5, 0.67), (1.0, 0.55))
-"""(what the named effects leave, in units of the surrogate's validated error; share of the error
-above the floor that they and the next best one must explain where they leave at least that); else
-something that is not known is missing. The smaller what is left, the more of it may be the
-surrogate's own."""
+LEAST_EXPLAINED = 0.68
+"""Share of the error above the floor and above the surrogate's validated error that the named
+effects and the next best one must explain; else something that is not known is missing."""
 EXPLAINED, MISSED_SHARE = 0.6, 0.2
 """The same wherever something is left, where they explain so much less, of the error above the
 floor, than a black box does."""
@@ -250,7 +248,8 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
     sure = numbers["box_p"] <= CHANCE
-    if any(numbers["left_size"] >= left and together < least for left, least in LEAST_EXPLAINED):
+    own = (1.0 - explained) / numbers["left_size"] ** 2
+    if together < LEAST_EXPLAINED * (1.0 - own):
         return True
     if together < EXPLAINED and sure and beaten >= MISSED_SHARE:
         return True

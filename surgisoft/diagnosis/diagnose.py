@@ -24,6 +24,7 @@ from surgisoft.diagnosis.race.gates import first_shares, studentised
 from surgisoft.diagnosis.race.naming import CHANCE, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
+from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
 from surgisoft.measurement.recording import Recording
@@ -53,6 +54,10 @@ UNKNOWN_SHARE = 0.35
 """Share of the error above the floor that a black box must explain where no effect does."""
 OFF_SIZE = 2.2
 """Factor on the validated error from which a static error is more than the surrogate's own."""
+NEAR = 0.1
+"""Least share of the error above the floor that an effect explains that is said to come nearest."""
+FAR = 2.0
+"""Factor on the validated error that is left from which something is missing, whatever it is."""
 NEAREST = 0.25
 """Most confidence in the effect that comes nearest to an unknown one."""
 TRAINED = 2.0
@@ -131,6 +136,12 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     race = Race.of(problem, some)
     first = race.standings()
     named, following = name_effects(race, first)
+    close = _close(first, named)
+    if close:
+        report(f"shapes of {' and '.join(standing.effect for standing in close)}")
+        race = Race.of(problem, [*some, *sharpened(problem, race, close)])
+        first = race.standings()
+        named, following = name_effects(race, first)
     base = picked_by(named)
     rivals = _rivals(race, first, named)
     report("black box")
@@ -146,6 +157,15 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
         static=static_error(problem, race, base),
         loose=_loose(race, first, named, rivals),
     )
+
+
+def _close(first: list[Standing], named: list[Standing]) -> list[Standing]:
+    """The one effect that is named and those that explain about as much; none where none does."""
+    if len(named) != 1:
+        return []
+    best = named[0]
+    others = [s for s in first if s.effect != best.effect and s.gain >= RIVAL_GAIN * best.gain]
+    return [best, *others[:MOST_RIVALS]] if others else []
 
 
 def _loose(
@@ -231,7 +251,8 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
         return ("several" if len(names) > 1 else "identified"), names
     if numbers["before_over_floor"] >= TRAINED:
         box = numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE
-        if beyond and (box or numbers["static_size"] >= OFF_SIZE):
+        far = numbers["left_size"] >= FAR
+        if beyond and (box or far or numbers["static_size"] >= OFF_SIZE):
             return "unknown_effect", ()
         if numbers["static_share"] >= 0.5:
             return "surrogate_undertrained", ()
@@ -359,10 +380,10 @@ def _sentence(kind: Kind, effects, levels: ErrorLevels, reached: float, sure: fl
             f"{reached:.3g} mm on held-out blocks; {error}"
         )
     if kind == "unknown_effect":
-        best = found.first[0].effect if found.first else "none"
+        near = [s.effect for s in found.first[:1] if s.gain >= NEAR]
         return (
-            f"something is missing and it is none of the known effects ({best} comes nearest): a "
-            f"black box or the surrogate's own correction explains more than any of them; {error}"
+            f"something is missing and it is none of the known effects "
+            f"({f'{near[0]} comes nearest' if near else 'none comes near'}); {error}"
         )
     if kind == "surrogate_undertrained":
         return (

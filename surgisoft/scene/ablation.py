@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, SPACING_WAISTS, DosePatch, samples_at
-from surgisoft.scene.kernels import compiled
 from surgisoft.scene.tissue import Tissue
 
 REACH_WAISTS = 2.3

@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from surgisoft.scene.kernels import boxes_d2, compiled, point_triangle, segment_triangle_d2
+from surgisoft.compiled import compiled
+from surgisoft.scene.kernels import boxes_d2, point_triangle, segment_triangle_d2
 from surgisoft.scene.mesh import Mesh
 
 LEAF_FACES = 4

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.buried import buried
-from surgisoft.scene.kernels import compiled
 from surgisoft.scene.mesh import Mesh
 
 LESION, RING, HEALTHY = 0, 1, 2

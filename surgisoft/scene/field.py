@@ -19,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene.bvh import TriangleTree, build_tree, point_surface, triangle
-from surgisoft.scene.kernels import compiled, point_triangle
+from surgisoft.scene.kernels import point_triangle
 from surgisoft.scene.mesh import Mesh
 
 FORMAT = 1

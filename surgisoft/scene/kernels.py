@@ -6,31 +6,9 @@ are the primitives of the tree in `bvh`; the referee in `collision` shares none 
 
 from __future__ import annotations
 
-import hashlib
 import math
-from pathlib import Path
 
-from numba import njit
-
-
-def _source_stamp() -> str:
-    """sha256 of this package's source files that hold compiled functions."""
-    sources = [file.read_bytes() for file in sorted(Path(__file__).parent.glob("*.py"))]
-    return hashlib.sha256(b"".join(s for s in sources if b"@compiled" in s)).hexdigest()
-
-
-_STAMP = _source_stamp()
-
-
-def compiled(function):
-    """Compile for float64 arithmetic without the interpreter's lock, kept on disk between runs.
-
-    numba looks for changes in the function's own file only, so a kernel that calls one of another
-    file would go on running the other's old code; the stamp of all files closes that hole.
-    """
-    dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
-    dispatcher._cache._cache_file._source_stamp = _STAMP
-    return dispatcher
+from surgisoft.compiled import compiled
 
 
 @compiled

@@ -16,7 +16,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from surgisoft.scene.kernels import compiled
+from surgisoft.compiled import compiled
 from surgisoft.scene.mesh import Body, Mesh
 
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from surgisoft.compiled import compiled
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape, self_contact_gap_mm
-from surgisoft.scene.kernels import compiled
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import EmbreeSurface, rays_to_chains
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from surgisoft.scene.kernels import compiled
+from surgisoft.compiled import compiled
 from surgisoft.scene.mesh import Mesh
 
 

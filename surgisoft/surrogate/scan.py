@@ -3,7 +3,8 @@
 A play operator clamps its last value into a band around the input. Clamps compose to clamps, so a
 run of T steps is a prefix scan of log2(T) passes over all runs, chambers and thresholds, and gives
 bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms"). First-order lags
-are affine maps of their last value, which compose to affine maps: `linear_scan`.
+are affine maps of their last value, which compose to affine maps: `linear_scan`. On a processor and
+where no gradient is asked for, a compiled loop over the rows is quicker than either.
 """
 
 import math
@@ -11,12 +12,32 @@ import math
 import torch
 from torch import Tensor
 
+from surgisoft.surrogate.scan_loops import clamp_loop, linear_loop
+
+
+def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:
+    """A recurrence (R, T, ...) by a compiled loop; None where that does not apply."""
+    parts = (*bands, start)
+    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    plain = all(p.device.type == "cpu" and p.dtype == start.dtype for p in parts)
+    if wanted or not plain or start.dtype not in (torch.float32, torch.float64):
+        return None
+    shape = torch.broadcast_shapes(*(band.shape for band in bands))
+    out = start.new_empty(shape)
+    rows = [p.detach().expand(shape).reshape(*shape[:2], -1).numpy() for p in bands]
+    first = start.detach().expand(shape[0], *shape[2:]).reshape(shape[0], -1).numpy()
+    loop(*rows, first, out.view(*shape[:2], -1).numpy())
+    return out
+
 
 def clamp_scan(low: Tensor, high: Tensor, start: Tensor) -> Tensor:
     """y[:, t] = clamp(y[:, t-1], low[:, t], high[:, t]) with y[:, -1] = start.
 
     Shapes: low, high (R, T, ...), start (R, ...); answer (R, T, ...).
     """
+    looped = _looped(clamp_loop, (low, high), start)
+    if looped is not None:
+        return looped
     steps = low.shape[1]
     shift = 1
     while shift < steps:
@@ -75,6 +96,9 @@ def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
     maps compose to affine maps (Blelloch 1990, "Prefix sums and their applications", sec. 1.4):
     all blocks of about sqrt(T) rows are stepped at once, then the blocks one after the other.
     """
+    looped = _looped(linear_loop, (factor, addend), start)
+    if looped is not None:
+        return looped
     runs, steps = addend.shape[:2]
     block = max(1, math.isqrt(steps))
     blocks = -(-steps // block)

@@ -165,11 +165,15 @@ class Race:
 
         All shapes side by side are as plausible as the best of them.
         """
-        if way.shape is None:
-            singles = [w for w in self.options[way.effect] if w.shape is not None]
-            way = min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
-        effect = self.in_place(way, base)
+        effect = self.in_place(self.single(way, base), base)
         return effect is None or all(_near(quantity) for quantity in effect.quantities())
+
+    def single(self, way: Option, base: tuple[int, ...] = ()) -> Option:
+        """The way itself, or the best single shape of all that stand side by side in it."""
+        if way.shape is not None:
+            return way
+        singles = [w for w in self.options[way.effect] if w.shape is not None]
+        return min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
 
     def in_place(self, way: Option, base: tuple[int, ...] = ()) -> Effect | None:
         """The effect of a single shape at the strengths that the race gives it beside a base."""

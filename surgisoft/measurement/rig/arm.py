@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
+from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
-from surgisoft.measurement.rig.compiled import compiled
 from surgisoft.measurement.rig.friction import lag, move, rested
 from surgisoft.measurement.rig.rod import Loads, Rod, Shape, balance, new_shape
 from surgisoft.measurement.rig.wall import Wall, line_strain, strain_under

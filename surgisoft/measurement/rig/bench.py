@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from surgisoft.compiled import compiled
 from surgisoft.measurement.rig.arm import (
     Memory,
     Specimen,
@@ -18,7 +19,6 @@ from surgisoft.measurement.rig.arm import (
     new_memory,
     remember,
 )
-from surgisoft.measurement.rig.compiled import compiled
 from surgisoft.measurement.rig.effects import (
     Effects,
     History,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from surgisoft.measurement.rig.compiled import compiled
+from surgisoft.compiled import compiled
 
 CREEP_TIMES = np.array([0.6, 2.4, 9.6, 38.4, 153.6])
 """Retardation times [s] whose sum stands for a power law over three decades (Findley 1976)."""

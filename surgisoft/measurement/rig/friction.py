@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from surgisoft.measurement.rig.compiled import compiled
+from surgisoft.compiled import compiled
 
 DEPTH = 64
 """Turning points that a line can remember; a deeper history loses its smallest loop."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from surgisoft.measurement.rig.compiled import compiled
+from surgisoft.compiled import compiled
 
 
 @dataclass(frozen=True)

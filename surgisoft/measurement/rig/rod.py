@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from surgisoft.measurement.rig.compiled import compiled
+from surgisoft.compiled import compiled
 from surgisoft.measurement.rig.wall import NOT_CONVERGED, Wall, strain_under
 
 TOLERANCE = 1e-7

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from surgisoft.measurement.rig.compiled import compiled
+from surgisoft.compiled import compiled
 
 LAST_STEP = 3e-6
 """Newton's method ends after a step in strain [-] below this; the error left is of its square."""

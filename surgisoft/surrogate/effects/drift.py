@@ -137,7 +137,7 @@ class Drift(Effect):
             return [
                 Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
                 Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
-                Quantity("tau_s", tau, "s", 5.0, 1e6, held),
+                Quantity("tau_s", tau, "s", 60.0, 1e6, "quicker is a misalignment from the start"),
             ]
         rubber = "wide: an ideal rubber has 3 % in 10 K (modulus ~ T, Treloar 1975)"
         return [

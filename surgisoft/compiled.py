@@ -1,0 +1,29 @@
+"""How inner loops are compiled: by numba, kept on disk, division as in IEEE 754."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from pathlib import Path
+
+from numba import njit
+
+
+@functools.cache
+def _source_stamp(folder: Path) -> str:
+    """sha256 of a folder's source files that hold compiled functions."""
+    sources = [file.read_bytes() for file in sorted(folder.glob("*.py"))]
+    return hashlib.sha256(b"".join(s for s in sources if b"@compiled" in s)).hexdigest()
+
+
+def compiled(function):
+    """Compile without the interpreter's lock, kept on disk between runs.
+
+    numba looks for changes in the function's own file only, so a kernel that calls one of another
+    file would go on running the other's old code; the stamp of all files of its folder closes that
+    hole.
+    """
+    dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
+    folder = Path(function.__code__.co_filename).parent
+    dispatcher._cache._cache_file._source_stamp = _source_stamp(folder)
+    return dispatcher

@@ -1,0 +1,60 @@
+"""Rivals at their best: shapes that are fitted instead of taken from a grid.
+
+A diagnosis tries each effect in a few shapes, to first order in its strengths. Between effects that
+then explain about as much, the grid decides: a lag whose time constant lies between two of the grid
+loses to a viscosity with two strengths that lie well. So the shapes of such rivals are fitted
+through the whole chain, and what each changes in the prediction there is one more way to add it.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.candidates import Candidate, with_effect
+from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.race.ranking import Race, Standing
+from surgisoft.diagnosis.refinement.forward import Forward
+from surgisoft.diagnosis.refinement.refine import refine
+from surgisoft.surrogate.effects import Effect
+
+ITERATIONS = 8
+"""Most steps of a fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sharpened(Candidate):
+    """An effect in its fitted shape; its one column is what it changes at its fitted strengths."""
+
+    @torch.no_grad()
+    def with_amplitudes(self, amplitudes: np.ndarray) -> Effect:
+        """The effect at a multiple (1,) of its fitted strengths."""
+        effect = copy.deepcopy(self.effect)
+        for parameter in effect.strengths().values():
+            parameter.mul_(float(amplitudes[0]))
+        return effect
+
+
+def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Candidate]:
+    """Some effects of a race in shapes fitted to the problem, those left out that change nothing.
+
+    Effects that the model has already are not fitted: there is only more or less of them.
+    """
+    with torch.no_grad():
+        before = Forward(problem.model, problem, [])().double().numpy()
+    answer = []
+    for standing in some:
+        effect = race.in_place(race.single(standing.option))
+        if effect is None:
+            continue
+        model = with_effect(copy.deepcopy(problem.model), standing.effect, effect)
+        refine(model, problem, [standing.effect], ITERATIONS)
+        with torch.no_grad():
+            after = Forward(model, problem, [standing.effect])().double().numpy()
+        column = (after - before)[..., None]
+        if np.isfinite(column).all() and np.abs(column).max() > 1e-6:
+            fitted = model.effects[standing.effect].requires_grad_(False)
+            answer.append(Sharpened(standing.effect, fitted, column))
+    return answer

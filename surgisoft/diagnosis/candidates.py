@@ -24,6 +24,8 @@ class Candidate:
     """(S, n, 3, K) change of the key points with each strength, mm."""
     more: bool = False
     """Whether the columns make an effect that the model has already stronger."""
+    fitted: bool = False
+    """Whether the shape was fitted through the whole chain; else it is one of a grid."""
 
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:

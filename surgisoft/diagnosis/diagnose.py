@@ -41,8 +41,10 @@ LEAST_LEFT = 1.0
 """Factor on the surrogate's validated error that is left wherever something unknown is told: what
 is less may be the surrogate's own."""
 LEAST_EXPLAINED = 0.68
-"""Share of the error above the floor and above the surrogate's validated error that the named
-effects and the next best one must explain; else something that is not known is missing."""
+"""Share of the error above the floor and above the surrogate's own that the named effects and the
+next best one must explain; else something that is not known is missing."""
+OWN = 1.5
+"""Factor on the validated error up to which what is left there is taken for the surrogate's own."""
 EXPLAINED, MISSED_SHARE = 0.6, 0.2
 """The same wherever something is left, where they explain so much less, of the error above the
 floor, than a black box does."""
@@ -56,6 +58,12 @@ OFF_SIZE = 2.2
 """Factor on the validated error from which a static error is more than the surrogate's own."""
 NEAR = 0.1
 """Least share of the error above the floor that an effect explains that is said to come nearest."""
+NEAR_TIE = 0.1
+"""Difference of what two effects leave, as a share of what the better one leaves, below which no
+effect's form is known well enough to tell them apart, however sure the blocks are."""
+CLOSE_GAIN = 0.6
+"""Least gain, as a share of the best one's, of effects whose shapes are fitted before they race
+again: to first order and on a grid a large effect loses some of what it explains."""
 FAR = 2.0
 """Factor on the validated error that is left from which something is missing, whatever it is."""
 NEAREST = 0.25
@@ -164,7 +172,7 @@ def _close(first: list[Standing], named: list[Standing]) -> list[Standing]:
     if len(named) != 1:
         return []
     best = named[0]
-    others = [s for s in first if s.effect != best.effect and s.gain >= RIVAL_GAIN * best.gain]
+    others = [s for s in first if s.effect != best.effect and s.gain >= CLOSE_GAIN * best.gain]
     return [best, *others[:MOST_RIVALS]] if others else []
 
 
@@ -188,7 +196,8 @@ def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[st
         if other.effect == best.effect or other.gain < RIVAL_GAIN * best.gain:
             continue
         pair = np.stack([-best.log_gain, -other.log_gain])
-        if first_shares(pair)[0] < RIVAL_SHARE:
+        near = best.gain - other.gain < NEAR_TIE * (1.0 - best.gain)
+        if near or first_shares(pair)[0] < RIVAL_SHARE:
             answer.append(other.effect)
     return answer
 
@@ -269,7 +278,7 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
     sure = numbers["box_p"] <= CHANCE
-    own = (1.0 - explained) / numbers["left_size"] ** 2
+    own = (1.0 - explained) * min(1.0, OWN / numbers["left_size"]) ** 2
     if together < LEAST_EXPLAINED * (1.0 - own):
         return True
     if together < EXPLAINED and sure and beaten >= MISSED_SHARE:

@@ -98,12 +98,12 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
 
 def _loose_columns(race: Race, named: Sequence[Standing]) -> np.ndarray:
     """(S, n, 3, K) the named effects' columns, and what each of them explains, scaled."""
-    base = picked_by(named)
+    ways = [race.freest(standing) for standing in named]
+    base = sum(ways, ())
     amplitudes = race.validation.amplitudes(base)
     columns, first = [race.columns[..., list(base)]], 0
-    for standing in named:
-        picked = list(standing.option.picked)
-        part = race.columns[..., picked] @ amplitudes[first : first + len(picked)]
+    for picked in ways:
+        part = race.columns[..., list(picked)] @ amplitudes[first : first + len(picked)]
         columns.append(_loose(race, part))
         first += len(picked)
     return np.concatenate(columns, axis=3)

@@ -106,8 +106,9 @@ class Race:
             options.setdefault(candidate.name, []).append(Option(candidate.name, picked, number))
             first += count
         for name, ways in options.items():
-            if len(ways) > 1 and candidates[ways[0].shape].effect.side_by_side:
-                ways.append(Option(name, sum((way.picked for way in ways), ()), None))
+            grid = [way for way in ways if not candidates[way.shape].fitted]
+            if len(grid) > 1 and candidates[grid[0].shape].effect.side_by_side:
+                ways.append(Option(name, sum((way.picked for way in grid), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(problem, candidates, validation, options, columns, validation.counts * noise)
 
@@ -167,6 +168,15 @@ class Race:
         """
         effect = self.in_place(self.single(way, base), base)
         return effect is None or all(_near(quantity) for quantity in effect.quantities())
+
+    def freest(self, standing: Standing) -> tuple[int, ...]:
+        """An effect's columns; beside a fitted one those of the grid that do best with it."""
+        own = standing.option.picked
+        shape = standing.option.shape
+        if shape is None or not self.candidates[shape].fitted:
+            return own
+        ways = [w for w in self.options[standing.effect] if w.shape != shape]
+        return min((own + w.picked for w in ways), key=lambda p: float(self.losses(p).sum()))
 
     def single(self, way: Option, base: tuple[int, ...] = ()) -> Option:
         """The way itself, or the best single shape of all that stand side by side in it."""

@@ -79,7 +79,7 @@ def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str)
     small = [each for each in dict.fromkeys(names) if not is_large(model.effects[each])]
     if name not in small or not free_parameters(model, small, held=name):
         return None
-    if not _shrink(model.effects[name]):
+    if not shrink(model.effects[name]):
         return None
     fit = refine(model, problem.with_model(model), small, held=name)
     if not model.effects[name].plausible():
@@ -94,7 +94,7 @@ def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str)
 
 
 @torch.no_grad()
-def _shrink(effect: Effect) -> bool:
+def shrink(effect: Effect) -> bool:
     """Scale an effect's strengths by the largest factor that makes it plausible, if there is one.
 
     By bisection between nothing, of which a share must be plausible, and the present strengths.

@@ -16,12 +16,16 @@ import torch
 from surgisoft.diagnosis.candidates import Candidate, with_effect
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.race.ranking import Race, Standing
+from surgisoft.diagnosis.refinement.effects import shrink
 from surgisoft.diagnosis.refinement.forward import Forward
 from surgisoft.diagnosis.refinement.refine import refine
 from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.model import ArmModel
 
 ITERATIONS = 8
 """Most steps of a fit."""
+MOST_VALUES = 12
+"""Most values of an effect that is fitted: the rows that judge it are those it is fitted to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +44,41 @@ class Sharpened(Candidate):
 def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Candidate]:
     """Some effects of a race in shapes fitted to the problem, those left out that change nothing.
 
-    Effects that the model has already are not fitted: there is only more or less of them.
+    Effects that the model has already are not fitted, there is only more or less of them; nor are
+    those with many values.
     """
     with torch.no_grad():
         before = Forward(problem.model, problem, [])().double().numpy()
     answer = []
     for standing in some:
         effect = race.in_place(race.single(standing.option))
-        if effect is None:
+        if effect is None or _values(effect) > MOST_VALUES:
             continue
         model = with_effect(copy.deepcopy(problem.model), standing.effect, effect)
-        refine(model, problem, [standing.effect], ITERATIONS)
+        if not _fitted(model, problem, standing.effect):
+            continue
         with torch.no_grad():
             after = Forward(model, problem, [standing.effect])().double().numpy()
         column = (after - before)[..., None]
         if np.isfinite(column).all() and np.abs(column).max() > 1e-6:
             fitted = model.effects[standing.effect].requires_grad_(False)
-            answer.append(Sharpened(standing.effect, fitted, column))
+            answer.append(Sharpened(standing.effect, fitted, column, fitted=True))
     return answer
+
+
+def _fitted(model: ArmModel, problem: Problem, name: str) -> bool:
+    """Fit an effect of a model in place; whether that ends, or can be held, where it is plausible.
+
+    Half a lag twice as long is nearly the same lag: strengths beyond their range are held at its
+    end while the shapes go on.
+    """
+    refine(model, problem, [name], ITERATIONS)
+    effect = model.effects[name]
+    if not effect.plausible() and effect.shapes() and shrink(effect):
+        refine(model, problem, [name], ITERATIONS, held=name)
+    return effect.plausible()
+
+
+def _values(effect: Effect) -> int:
+    """How many numbers a fit of the effect chooses."""
+    return sum(p.numel() for p in [*effect.strengths().values(), *effect.shapes().values()])

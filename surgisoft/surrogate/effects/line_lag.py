@@ -180,7 +180,7 @@ class LineLag(Effect):
         tube = "wide: tubes of up to some ten metres; slower is creep"
         both = "from turbulent in every flow to laminar in every flow"
         return [
-            Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the line lags"),
+            Quantity("share", value_of(self.share), "", 0.0, 1.05, "1: all of the line lags"),
             Quantity("tau_up_s", value_of(self.log_up.exp()), "s", 0.005, 10.0, tube),
             Quantity("tau_down_s", value_of(self.log_down.exp()), "s", 0.005, 20.0, tube),
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),

@@ -90,11 +90,12 @@ class RateDependence(Effect):
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: what is slower than a second is creep"
-        passive = "a fluid takes energy at every rate; a little less than 0 for the noise"
+        passive = "a fluid takes energy at high rates; a little less than 0 for the noise"
+        learned = "less than 0 where a network that sees directions has learned too much of it"
         at_one = float((self.viscous + self.thinning).detach())
         return [
             Quantity("viscous_s", value_of(self.viscous), "s", -0.05, 1.0, passive),
-            Quantity("thinning_s^0.5", value_of(self.thinning), "s^0.5", -0.05, 1.0, passive),
+            Quantity("thinning_s^0.5", value_of(self.thinning), "s^0.5", -0.5, 1.0, learned),
             Quantity("shift_at_1_per_s_share", at_one, "", 0.0, 1.0, "viscosity takes energy"),
             Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.01, 10.0, rubber),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),

@@ -66,7 +66,7 @@ def markdown(results: Results, config: ControlConfig) -> str:
     """All tables."""
     parts = [_setting(config), "## Goals", _goals(results), "## Training", _training(results)]
     if results.paper:
-        parts += [f"### {PAPER_STEPS:,} steps", _paper(results)]
+        parts += [f"### {PAPER_STEPS:,} steps", _paper(results, config)]
     for place in PLACES:
         parts.append(f"## {'In simulation' if place == 'simulation' else 'On the virtual rig'}")
         for task in config.tasks:
@@ -146,7 +146,7 @@ def _training(results: Results) -> str:
     )
 
 
-def _paper(results: Results) -> str:
+def _paper(results: Results, config: ControlConfig) -> str:
     """Time that the paper's number of steps takes, from measured rates."""
     rows = [("paper", results.paper)]
     fast = [run.cost for run in results.runs if (run.task, run.preset) == (RATE_TASK, "fast")]
@@ -165,7 +165,7 @@ def _paper(results: Results) -> str:
     text = "\n".join(lines)
     if results.whole:
         whole = results.whole
-        told = " ".join(arguments(RATE_TASK, whole.steps, Path("RUN")))
+        told = " ".join(arguments(RATE_TASK, config.whole_steps, Path("RUN")))
         minutes = whole.wall_s * PAPER_STEPS / whole.steps / 60
         text += (
             f"\n\nTwo processes (`torchrun {told}`) trained {whole.steps:,} steps in "

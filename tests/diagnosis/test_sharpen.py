@@ -1,0 +1,74 @@
+"""Rivals at fitted shapes: a lag that no grid holds, in an arm whose wall remembers."""
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis import diagnose as diagnosing
+from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.race.ranking import Race
+from surgisoft.diagnosis.refinement.sharpen import sharpened
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.default import default_arm
+from tests.diagnosis.synthetic import walk
+
+PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
+
+
+def lagged(signal: np.ndarray, time_s: float) -> np.ndarray:
+    """(T, m) first-order lag of a signal that goes straight from row to row, in small steps."""
+    answer, y = [signal[0]], signal[0].copy()
+    for before, after in zip(signal[:-1], signal[1:], strict=True):
+        for k in range(SUBSTEPS):
+            u = before + (k + 0.5) / SUBSTEPS * (after - before)
+            y = u + (y - u) * np.exp(-PERIOD_S / SUBSTEPS / time_s)
+        answer.append(y.copy())
+    return np.array(answer)
+
+
+def made(commands: np.ndarray, pressure: np.ndarray) -> Recording:
+    """What the default arm does under a pressure (T, m), recorded as if under the commands."""
+    arm, time_s = default_arm(), PERIOD_S * np.arange(len(commands))
+    blank = np.zeros((len(commands), arm.spec.key_points, 3))
+    history = history_of([Recording("made", time_s, measured=pressure, key_points_mm=blank)])
+    points = arm.predict(history)[0].numpy()
+    noise = np.random.default_rng(1).normal(0, NOISE_MM, points.shape)
+    return Recording(
+        "made", time_s, measured=commands, key_points_mm=points + noise, noise_mm=NOISE_MM
+    )
+
+
+@pytest.fixture(scope="module", params=[0.24, 0.6])
+def lagging(request):
+    """An arm whose pressure lags behind what is taken for it; the grid has 0.15, 0.4 and 1 s."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + (0.1 + 0.05 * walk(6000, 3)) * (high - low)
+    return made(commands, lagged(commands, request.param))
+
+
+def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
+    found = diagnose(default_arm(), [lagging])
+    assert found.verdict.effects == ("line_lag",)
+    monkeypatch.setattr(diagnosing, "sharpened", lambda *_: [])
+    grid = diagnose(default_arm(), [lagging])
+    fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
+    rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
+    assert fine["line_lag"] < 0.7 * rough["line_lag"]
+
+
+def test_what_is_fitted_is_plausible_small_and_new(lagging):
+    problem = pose(default_arm(), [lagging], part="open")
+    race = Race.of(problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"]))
+    first = race.standings()
+    assert {standing.effect for standing in first} >= {"line_lag", "hysteresis"}
+    fitted = sharpened(problem, race, first)
+    names = [candidate.name for candidate in fitted]
+    assert "line_lag" in names
+    assert "hysteresis" not in names  # the model has it already
+    assert all(candidate.effect.plausible() for candidate in fitted)
+    assert all(candidate.columns.shape[3] == 1 for candidate in fitted)
+    twice = next(c for c in fitted if c.name == "line_lag")
+    half = twice.with_amplitudes(np.array([0.5]))
+    assert half.share.item() == pytest.approx(0.5 * twice.effect.share.item())

@@ -1,5 +1,7 @@
 """Rivals at fitted shapes: a lag that no grid holds, in an arm whose wall remembers."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
 def lagged(signal: np.ndarray, time_s: float) -> np.ndarray:
     """(T, m) first-order lag of a signal that goes straight from row to row, in small steps."""
     answer, y = [signal[0]], signal[0].copy()
-    for before, after in zip(signal[:-1], signal[1:], strict=True):
+    for before, after in itertools.pairwise(signal):
         for k in range(SUBSTEPS):
             u = before + (k + 0.5) / SUBSTEPS * (after - before)
             y = u + (y - u) * np.exp(-PERIOD_S / SUBSTEPS / time_s)

@@ -58,9 +58,9 @@ OFF_SIZE = 2.2
 """Factor on the validated error from which a static error is more than the surrogate's own."""
 NEAR = 0.1
 """Least share of the error above the floor that an effect explains that is said to come nearest."""
-NEAR_TIE = 0.1
-"""Difference of what two effects leave, as a share of what the better one leaves, below which no
-effect's form is known well enough to tell them apart, however sure the blocks are."""
+NEAR_TIE = (0.02, 0.3)
+"""Difference of two effects' gains, as a share of the better one's and of what it leaves, below
+which no form is known well enough to tell them apart, however sure the blocks are."""
 CLOSE_GAIN = 0.6
 """Least gain, as a share of the best one's, of effects whose shapes are fitted before they race
 again: to first order and on a grid a large effect loses some of what it explains."""
@@ -190,13 +190,13 @@ def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[st
     """Effects that would do about as well in the place of the first one named."""
     if not named:
         return []
-    best = named[0]
+    best, (of_gain, of_left) = named[0], NEAR_TIE
     answer = []
     for other in first:
         if other.effect == best.effect or other.gain < RIVAL_GAIN * best.gain:
             continue
         pair = np.stack([-best.log_gain, -other.log_gain])
-        near = best.gain - other.gain < NEAR_TIE * (1.0 - best.gain)
+        near = best.gain - other.gain < min(of_gain * best.gain, of_left * (1.0 - best.gain))
         if near or first_shares(pair)[0] < RIVAL_SHARE:
             answer.append(other.effect)
     return answer

@@ -86,7 +86,7 @@ def read_toml(path: Path) -> tuple[dict, Where]:
     try:
         text = path.read_bytes().decode("utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
+        raise InputError(f"{path}: there is no such file; expected a TOML file") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; expected a TOML file") from None
     except UnicodeDecodeError:

@@ -106,7 +106,7 @@ def hidden_effect(
     ] = "creep,line_lag,payload,hysteresis",
     specimen: Annotated[int, typer.Option(min=0, help="Which arm was cast.")] = 0,
     strength: Annotated[float, typer.Option(help="Strength of what is hidden in the rig.")] = 1.0,
-    steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 1_000_000,
+    steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 2_000_000,
     episodes: Annotated[int, typer.Option(min=2, help="Episodes of each driver.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of training and of episodes.")] = 0,
     work: Annotated[

@@ -26,7 +26,14 @@ from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.diagnosis.residuals import residuals
-from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Kind, Ranked, Verdict
+from surgisoft.diagnosis.verdict import (
+    Diagnosis,
+    ErrorLevels,
+    Kind,
+    Ranked,
+    Verdict,
+    sentence_of,
+)
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
@@ -219,7 +226,8 @@ def answer(found: Findings) -> Diagnosis:
         _ranked(found, standing, sure if place == 0 else min(sure, 1.0 - sure))
         for place, standing in enumerate(_order(found))
     )
-    sentence = _sentence(kind, effects, levels, reached, sure, found)
+    near = [s.effect for s in found.first[:1] if s.gain >= NEAR]
+    sentence = sentence_of(kind, effects, levels, reached, sure, near[0] if near else None)
     plan = None
     if kind == "ambiguous":
         # Imported here: it predicts every experiment of the catalogue, which takes seconds.
@@ -367,36 +375,3 @@ def _checks(found: Findings) -> list[str]:
     if missing > 0.2:
         answer.append(f"{100 * missing:.0f} % of the key points are missing")
     return answer
-
-
-def _sentence(kind: Kind, effects, levels: ErrorLevels, reached: float, sure: float, found) -> str:
-    """The verdict in words."""
-    error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
-    if kind == "identified":
-        return (
-            f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached:.3g} mm remain on "
-            f"held-out blocks; {error}"
-        )
-    if kind == "several":
-        together = " and ".join(effects)
-        return (
-            f"{together} are missing (confidence {sure:.2f} in the first): with them "
-            f"{reached:.3g} mm remain on held-out blocks; {error}"
-        )
-    if kind == "ambiguous":
-        return (
-            f"cannot tell {' from '.join(effects)} with these recordings: each would leave about "
-            f"{reached:.3g} mm on held-out blocks; {error}"
-        )
-    if kind == "unknown_effect":
-        near = [s.effect for s in found.first[:1] if s.gain >= NEAR]
-        return (
-            f"something is missing and it is none of the known effects "
-            f"({f'{near[0]} comes nearest' if near else 'none comes near'}); {error}"
-        )
-    if kind == "surrogate_undertrained":
-        return (
-            f"the network itself is off (its validated error says so too): fit it longer or to "
-            f"more data before looking for effects; {error}"
-        )
-    return f"nothing is missing that these recordings could show; {error}"

@@ -97,3 +97,46 @@ class Diagnosis:
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
         return asdict(self)
+
+
+def sentence_of(
+    kind: Kind,
+    effects: tuple[str, ...],
+    levels: ErrorLevels,
+    reached: float,
+    sure: float,
+    nearest: str | None,
+) -> str:
+    """The verdict in words.
+
+    reached: held-out error with the named effects, mm; sure: confidence in the first of them;
+    nearest: effect that comes nearest to something unknown, None where none comes near.
+    """
+    error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
+    if kind == "identified":
+        return (
+            f"{effects[0]} is missing (confidence {sure:.2f}): with it {reached:.3g} mm remain on "
+            f"held-out blocks; {error}"
+        )
+    if kind == "several":
+        together = " and ".join(effects)
+        return (
+            f"{together} are missing (confidence {sure:.2f} in the first): with them "
+            f"{reached:.3g} mm remain on held-out blocks; {error}"
+        )
+    if kind == "ambiguous":
+        return (
+            f"cannot tell {' from '.join(effects)} with these recordings: each would leave about "
+            f"{reached:.3g} mm on held-out blocks; {error}"
+        )
+    if kind == "unknown_effect":
+        return (
+            f"something is missing and it is none of the known effects "
+            f"({f'{nearest} comes nearest' if nearest else 'none comes near'}); {error}"
+        )
+    if kind == "surrogate_undertrained":
+        return (
+            f"the network itself is off (its validated error says so too): fit it longer or to "
+            f"more data before looking for effects; {error}"
+        )
+    return f"nothing is missing that these recordings could show; {error}"

@@ -28,8 +28,8 @@ def arguments(task: str, steps: int, folder: Path) -> list[str]:
 
 def trained_by_two(folder: Path, task: str, steps: int, report: Report) -> RunFolder:
     """The run in a folder, trained with preset `fast` by two processes where it is missing."""
-    if _steps(folder) >= steps:
-        return _checked(folder, task)
+    if (folder / "config.json").is_file() and _checked(folder, task) and _steps(folder) >= steps:
+        return RunFolder(folder)
     log = folder.with_suffix(".log")
     command = [sys.executable, "-m", "torch.distributed.run", *arguments(task, steps, folder)]
     with open(log, "w") as lines, subprocess.Popen(command, stdout=lines, stderr=lines) as process:

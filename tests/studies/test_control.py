@@ -104,6 +104,8 @@ def test_two_processes_train_together_and_are_taken_once_they_are_done(tmp_path,
     told = []
     run_folder = trained_by_two(place, "track_circle", 100_000, lambda *seen: told.append(seen))
     assert run_folder.config["processes"] == 2
+    assert all(of == 100_000 for _, of, _ in told)
+    assert told
     assert cost(run_folder).steps == 2 * 2 * 4096 * 12  # two turns of two processes
     monkeypatch.setattr(two_processes.subprocess, "Popen", lambda *a, **k: pytest.fail("again"))
     assert trained_by_two(place, "track_circle", 100_000, nothing).path == place

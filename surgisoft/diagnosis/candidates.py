@@ -144,12 +144,13 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
     points = problem.rows(signal.body)
     answer, known = [], known_effects()
     for name in names or known:
-        # Of an effect that the model has there can only be more or less.
         more = more_of(problem, signal, name) if name in model.effects else None
-        if more is not None:
+        if more is None:
+            fresh = known[name].candidates(model.facts, points)
+        else:
             answer.append(more)
-            continue
-        for effect in known[name].candidates(model.facts, points):
+            fresh = known[name].further(model.facts, points)
+        for effect in fresh:
             columns = columns_of(problem, signal, effect)
             answer.append(Candidate(name, copy.deepcopy(effect), columns))
     return [c for c in answer if np.isfinite(c.columns).all() and np.abs(c.columns).max() > 1e-6]

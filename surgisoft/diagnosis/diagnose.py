@@ -75,6 +75,9 @@ FAR = 2.0
 """Factor on the validated error that is left from which something is missing, whatever it is."""
 NEAREST = 0.25
 """Most confidence in the effect that comes nearest to an unknown one."""
+LEAST_MOTIONS = 10
+"""Fewest different motions of which a black box may say that something is missing: on fewer it
+knows the surrogate's own error by heart."""
 TRAINED = 2.0
 """Factor on the floor from which an error of the surrogate's own is too much."""
 
@@ -202,7 +205,7 @@ def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[st
     for other in first:
         if other.effect == best.effect or other.gain < RIVAL_GAIN * best.gain:
             continue
-        pair = np.stack([-best.log_gain, -other.log_gain])
+        pair = race.problem.by_motion(np.stack([-best.log_gain, -other.log_gain]))
         near = best.gain - other.gain < min(of_gain * best.gain, of_left * (1.0 - best.gain))
         if near or first_shares(pair)[0] < RIVAL_SHARE:
             answer.append(other.effect)
@@ -267,7 +270,7 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
             return "ambiguous", (names[0], *found.rivals)
         return ("several" if len(names) > 1 else "identified"), names
     if numbers["before_over_floor"] >= TRAINED:
-        box = numbers["box_share"] >= UNKNOWN_SHARE and numbers["box_p"] <= CHANCE
+        box = numbers["box_share"] >= UNKNOWN_SHARE and _sure_of_box(numbers)
         far = numbers["left_size"] >= FAR
         if beyond and (box or far or numbers["static_size"] >= OFF_SIZE):
             return "unknown_effect", ()
@@ -285,7 +288,7 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     further = found.next[0].gain if found.next else 0.0
     together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
-    sure = numbers["box_p"] <= CHANCE
+    sure = _sure_of_box(numbers)
     own = (1.0 - explained) * min(1.0, OWN / numbers["left_size"]) ** 2
     if together < LEAST_EXPLAINED * (1.0 - own):
         return True
@@ -295,6 +298,11 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:
         return True
     return found.loose is not None and found.loose.wrong
+
+
+def _sure_of_box(numbers: dict) -> bool:
+    """Whether what a black box explains is more than chance and seen in motions enough."""
+    return numbers["box_p"] <= CHANCE and numbers["motions"] >= LEAST_MOTIONS
 
 
 def statistics(found: Findings) -> dict:
@@ -311,9 +319,9 @@ def statistics(found: Findings) -> dict:
     runner = others[0] if others else None
     margin, share = 0.0, 1.0
     if best is not None and runner is not None:
-        gap = best.log_gain - runner.log_gain
-        margin = float(studentised(gap[None])[0])
-        share = float(first_shares(np.stack([-best.log_gain, -runner.log_gain]))[0])
+        pair = problem.by_motion(np.stack([-best.log_gain, -runner.log_gain]))
+        margin = float(studentised(pair[1:] - pair[:1])[0])
+        share = float(first_shares(pair)[0])
     return {
         "before_over_floor": float(np.sqrt(raw / floor)),
         "static_share": float((raw - null.sum()) / max(raw - floor, 1e-9 * raw)),
@@ -334,6 +342,7 @@ def statistics(found: Findings) -> dict:
         "loose_share": found.loose.share if found.loose else 0.0,
         "loose_log_gain": found.loose.log_gain if found.loose else 0.0,
         "loose_p": found.loose.p_value if found.loose else 1.0,
+        "motions": int(problem.motion.max()) + 1,
         "named": len(found.named),
         "rivals": len(found.rivals),
         "steps": [
@@ -347,9 +356,9 @@ def _ranked(found: Findings, standing: Standing, sure: float) -> Ranked:
     """One row of the ranking."""
     race = found.race
     rng = np.random.default_rng(0)
-    count = len(race.floor)
-    weights = rng.multinomial(count, np.full(count, 1 / count), size=400)
-    draws = np.sqrt((weights @ standing.losses) / (weights @ race.validation.counts))
+    losses, counts = race.problem.by_motion(np.stack([standing.losses, race.validation.counts]))
+    weights = rng.multinomial(len(losses), np.full(len(losses), 1 / len(losses)), size=400)
+    draws = np.sqrt((weights @ losses) / (weights @ counts))
     return Ranked(
         effect=standing.effect,
         confidence=round(float(sure), 4),
@@ -370,6 +379,12 @@ def _checks(found: Findings) -> list[str]:
         answer.append(
             "the noise is not stated and no holds show it: it was taken from second differences "
             "in time; state noise_mm in the sidecar for a better floor"
+        )
+    blocks, motions = len(problem.motion), int(problem.motion.max()) + 1
+    if 2 * motions <= blocks:
+        answer.append(
+            f"the recordings repeat themselves: their {blocks} blocks of time show {motions} "
+            "different motions, and each counts once; record other paths and speeds"
         )
     missing = float(np.isnan(problem.measured).mean())
     if missing > 0.2:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.comparing.floor import noise_floor
+from surgisoft.diagnosis.motions import motions
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of
 from surgisoft.measurement.recording import Recording
@@ -21,7 +22,7 @@ ROWS = 2000
 BLOCK_S = 5.0
 """Length of a block of time, the unit of every test, s."""
 TOGETHER = 2
-"""Neighbouring blocks that are held out together."""
+"""Neighbouring motions that are held out together."""
 BLOCK_ROWS = 8
 """Fewest of the fitted rows in a block."""
 LEAST_BLOCKS = 10
@@ -70,8 +71,10 @@ class Problem:
     """(S,) time in the recording, s."""
     block: np.ndarray
     """(S,) block of time of each row, from 0."""
+    motion: np.ndarray
+    """(B,) motion of each block, from 0: blocks that repeat a motion share it."""
     fold: np.ndarray
-    """(B,) part that each block judges in."""
+    """(B,) part that each block judges in; one for all blocks of a motion."""
     surrogate_mm: np.ndarray
     """(n,) validated RMS error of each key point, measurement noise taken out, mm."""
     noise_mm: np.ndarray
@@ -85,6 +88,12 @@ class Problem:
     def residual(self) -> np.ndarray:
         """(S, n, 3) measured less predicted, mm."""
         return self.measured - self.predicted
+
+    def by_motion(self, values: np.ndarray) -> np.ndarray:
+        """(..., M) sums of values (..., B) of the blocks over those that share a motion."""
+        answer = np.zeros((int(self.motion.max()) + 1, *values.shape[:-1]))
+        np.add.at(answer, self.motion, np.moveaxis(values, -1, 0))
+        return np.moveaxis(answer, 0, -1)
 
     def rows(self, tensor: Tensor) -> Tensor:
         """The fitted rows of a (R, T, ...) tensor."""
@@ -131,11 +140,12 @@ def pose(
     step = max(1, round(seen.sum() / rows))
     index = np.flatnonzero(seen)[::step]
     names, kept = np.unique(block[index], return_inverse=True)
-    fold = np.arange(len(names)) // TOGETHER % FOLDS
     spec = model.spec
     low, high = np.array(spec.low), np.array(spec.high)
     half = np.where(high > low, (high - low) / 2, 1.0)
     pressure = history.rows(history.pressure).double().numpy()
+    places = np.where(np.isin(block, names), np.searchsorted(names, block), -1)
+    motion = motions(history, half, places)
     validated = np.array(
         [value or 0.0 for value in model.validation.get("per_key_point_mm", [])]
         or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
@@ -151,7 +161,8 @@ def pose(
         predicted=predicted.double().numpy()[index],
         time_s=history.rows(history.t_s).numpy()[index],
         block=kept,
-        fold=fold,
+        motion=motion,
+        fold=folds(motion),
         surrogate_mm=np.sqrt(np.maximum(validated**2 - noise**2, (0.3 * validated) ** 2)),
         noise_mm=noise,
         floor_source=source,
@@ -193,6 +204,14 @@ def noise_of(recordings: list[Recording], measured: np.ndarray) -> tuple[np.ndar
         spread = 1.4826 * np.nanmedian(np.abs(second), axis=0) / np.sqrt(6.0)
     spread = np.nan_to_num(spread, nan=0.0)
     return np.maximum(np.sqrt((spread**2).sum(1)), 1e-4), "second differences"
+
+
+def folds(motion: np.ndarray) -> np.ndarray:
+    """(B,) part that each block judges in: neighbouring motions together, where there are many."""
+    count = int(motion.max()) + 1
+    if count < 2:
+        return np.arange(len(motion)) // TOGETHER % FOLDS
+    return motion // (TOGETHER if count >= TOGETHER * FOLDS else 1) % FOLDS
 
 
 def blocks(history: History, seen: np.ndarray) -> np.ndarray:

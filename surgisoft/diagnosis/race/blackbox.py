@@ -48,7 +48,7 @@ def black_box(problem: Problem) -> BlackBox:
     best = min((null, *(_held_out(problem, static, s * wide)[0] for s in SIZES)), key=np.sum)
     floor = counts * float(np.mean(problem.noise_mm**2))
     gain = np.log((null + floor) / (best + floor))[None]
-    chance = float(family_p_values(gain)[0]) if gain.any() else 1.0
+    chance = float(family_p_values(problem.by_motion(gain))[0]) if gain.any() else 1.0
     return BlackBox(best, float(np.sqrt(best.sum() / counts.sum())), chance)
 
 

@@ -6,7 +6,6 @@ linear, so everything that a set of columns can do on held-out blocks follows fr
 that are computed once: trying a set costs a small linear solve.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,24 +95,27 @@ class CrossValidation:
         """(B,) held-out sum of squared distances of each block, mm^2, with the picked columns."""
         index = np.asarray(picked, int) + 1
         ridges = RIDGES if len(index) > 1 else RIDGES[:1]
-        tried = itertools.product(self.levels, ridges)
-        return min((self._losses(folds, index, ridge) for folds, ridge in tried), key=np.sum)
+        tried = np.concatenate([self._losses(folds, index, ridges) for folds in self.levels])
+        return tried[tried.sum(axis=1).argmin()]
 
-    def _losses(self, folds: list[Fold], index: np.ndarray, ridge: float) -> np.ndarray:
-        answer = np.zeros(len(self.counts))
+    def _losses(self, folds: list[Fold], index: np.ndarray, ridges: tuple[float, ...]):
+        """(r, B) held-out sums of squares with each of r ridges."""
+        answer = np.zeros((len(ridges), len(self.counts)))
         rows = np.concatenate([[0], index])
         for fold in folds:
-            mix = np.concatenate([[1.0], -_amplitudes(fold.gram, index, ridge)])
             part = fold.judged[:, rows[:, None], rows[None]]
-            answer[fold.blocks] = np.einsum("bij,i,j->b", part, mix, mix)
+            for number, ridge in enumerate(ridges):
+                mix = np.concatenate([[1.0], -_amplitudes(fold.gram, index, ridge)])
+                answer[number, fold.blocks] = part @ mix @ mix
         return answer
 
     def amplitudes(self, picked: list[int] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the picked columns, mean over the folds."""
         index = np.asarray(picked, int) + 1
-        tried = itertools.product(self.levels, RIDGES)
-        folds, ridge = min(tried, key=lambda pair: self._losses(pair[0], index, pair[1]).sum())
-        return np.mean([_amplitudes(fold.gram, index, ridge) for fold in folds], axis=0)
+        tried = np.array([self._losses(f, index, RIDGES).sum(axis=1) for f in self.levels])
+        level, ridge = np.unravel_index(tried.argmin(), tried.shape)
+        some = [_amplitudes(fold.gram, index, RIDGES[ridge]) for fold in self.levels[level]]
+        return np.mean(some, axis=0)
 
 
 def _split(features, field, seen, held, block) -> list[tuple]:

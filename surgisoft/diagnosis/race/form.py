@@ -77,7 +77,8 @@ def _beyond(race: Race, picked: tuple[int, ...], after: np.ndarray, ways: int) -
 def _fall(race: Race, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float]:
     """(B,) fall of each block's log error, and the chance of such a fall without a cause."""
     log_gain = race.log_ratio(before, after)
-    return log_gain, float(family_p_values(log_gain[None])[0]) if log_gain.any() else 1.0
+    gain = race.problem.by_motion(log_gain[None])
+    return log_gain, float(family_p_values(gain)[0]) if log_gain.any() else 1.0
 
 
 def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[float, Standing]:

@@ -106,8 +106,10 @@ class Race:
             options.setdefault(candidate.name, []).append(Option(candidate.name, picked, number))
             first += count
         for name, ways in options.items():
+            # Beside more of an effect that the model has, one further shape of it is enough.
             grid = [way for way in ways if not candidates[way.shape].fitted]
-            if len(grid) > 1 and candidates[grid[0].shape].effect.side_by_side:
+            own = any(candidates[way.shape].more for way in ways)
+            if len(grid) > 1 and not own and candidates[grid[0].shape].effect.side_by_side:
                 ways.append(Option(name, sum((way.picked for way in grid), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(problem, candidates, validation, options, columns, validation.counts * noise)
@@ -151,7 +153,7 @@ class Race:
         if not ways:
             return []
         gains = np.array([self.log_ratio(before, losses) for losses in after])
-        chances = family_p_values(gains, [way.effect for way in ways])
+        chances = family_p_values(self.problem.by_motion(gains), [way.effect for way in ways])
         best: dict[str, Standing] = {}
         scores = [_score(gain, way) for gain, way in zip(gains, ways, strict=True)]
         for i in np.argsort(-np.array(scores), kind="stable"):

@@ -52,7 +52,11 @@ def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Ca
     answer = []
     for standing in some:
         effect = race.in_place(race.single(standing.option))
-        if effect is None or _values(effect) > MOST_VALUES:
+        if (
+            effect is None
+            or standing.effect in problem.model.effects
+            or _values(effect) > MOST_VALUES
+        ):
             continue
         model = with_effect(copy.deepcopy(problem.model), standing.effect, effect)
         if not _fitted(model, problem, standing.effect):

@@ -175,6 +175,14 @@ class Effect(nn.Module, ABC):
         """
         return [cls(facts)]
 
+    @classmethod
+    def further(cls, facts: ArmFacts, points: Tensor) -> list["Effect"]:
+        """The same where the model has the effect already: shapes that add up with any other.
+
+        Most effects have none: of them there can only be more or less.
+        """
+        return []
+
     def memory_parameters(self) -> list[nn.Parameter]:
         """Parameters that the memory depends on: they are fitted through whole runs."""
         return []

@@ -7,9 +7,13 @@ like a Kelvin-Voigt element under a constant load (Findley 1976, ch. 5),
 
 so that `turn` and `shift` are those after ten minutes, and a tau of hours is a steady drift.
 
+`actuation`: sensors and regulators of the chambers, or their walls, change in the same way,
+
+    x_eff_i = x_i + g(t) (gain_i x_i + offset_i),      x = load.
+
 `temperature`: actuation and wall change with the room's temperature, to first order
 
-    x_eff_i = x_i + (T - T_0) / 10 K (gain x_i + shift_i).
+    x_eff_i = x_i + (T - T_0) / 10 K (gain x_i + offset_i).
 
 Elapsed time is that of the recording where there is one, and the sum of the steps in a world; where
 no temperature is known it counts as T_0.
@@ -30,17 +34,19 @@ from surgisoft.surrogate.effects.base import (
 )
 from surgisoft.surrogate.rotation import rotate
 
-KINDS = ("base", "temperature")
+KINDS = ("base", "actuation", "temperature")
 TEN_MINUTES = 600.0
 """Time at which the amplitudes are given, s."""
 TEN_KELVIN = 10.0
 """Change of temperature at which the amplitudes are given, K."""
 GRID = (60.0, 250.0, 1000.0, 20000.0)
-"""Times tau that a diagnosis tries, s."""
+"""Times tau of the base that a diagnosis tries, s."""
+FEW = (250.0, 20000.0)
+"""The same of the actuation."""
 
 
 class Drift(Effect):
-    """A yielding holder, or a gain and offset that follow the temperature."""
+    """A yielding holder, or gains and offsets that follow the time or the temperature."""
 
     stage = "body"
 
@@ -51,7 +57,7 @@ class Drift(Effect):
         tau_s: float = 1000.0,
         reference_C: float = 22.0,
     ):
-        """kind: `base` or `temperature`; tau of the base, s; T_0, degrees Celsius."""
+        """kind: one of KINDS; tau of base and actuation, s; T_0, degrees Celsius."""
         super().__init__(facts)
         if kind not in KINDS:
             raise unknown_name("kind of drift", kind, KINDS)
@@ -59,11 +65,13 @@ class Drift(Effect):
         if kind == "base":
             self.turn = amplitude(3)
             self.shift = amplitude(3)
-            self.log_tau = logarithm(tau_s)
         else:
             self.stage = "material"
-            self.gain = amplitude(1)
-            self.offset = amplitude(len(facts.low))
+            chambers = len(facts.low)
+            self.gain = amplitude(1 if kind == "temperature" else chambers)
+            self.offset = amplitude(chambers)
+        if kind != "temperature":
+            self.log_tau = logarithm(tau_s)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         if self.kind == "base":
@@ -72,7 +80,8 @@ class Drift(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [*(cls(facts, "base", tau) for tau in GRID), cls(facts, "temperature")]
+        timed = [("base", tau) for tau in GRID] + [("actuation", tau) for tau in FEW]
+        return [*(cls(facts, *each) for each in timed), cls(facts, "temperature")]
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, 1) elapsed time, s, or warming over T_0, K: none."""
@@ -105,12 +114,16 @@ class Drift(Effect):
         tau = self.log_tau.exp()
         return torch.expm1(-elapsed_s / tau) / torch.expm1(-TEN_MINUTES / tau)
 
+    def _share(self, memory: Tensor) -> Tensor:
+        """(..., 1) share of the change of the actuation after ten minutes, or in 10 K."""
+        return memory / TEN_KELVIN if self.kind == "temperature" else self.grown(memory)
+
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Drifted key points (..., n, 3), mm, or effective actuation (..., m)."""
         if self.kind == "base":
             grown = self.grown(memory).unsqueeze(-2)
             return rotate(signal, grown * self.turn) + grown * self.shift
-        share = memory / TEN_KELVIN
+        share = self._share(memory)
         moved = self.gain * (signal - self.origin) + self.reach * self.offset
         return signal + share * moved
 
@@ -122,10 +135,12 @@ class Drift(Effect):
                 axes = axes.view(3, *[1] * (signal.ndim - 1), 3).expand(3, *signal.shape)
                 turned = torch.linalg.cross(axes, signal.expand(axes.shape))
                 return grown * torch.cat([turned, axes])
-            share = memory / TEN_KELVIN
-            offsets = torch.diag_embed((share * self.reach).expand(signal.shape))
-            gain = (share * (signal - self.origin)).unsqueeze(0)
-            return torch.cat([gain, offsets.movedim(-1, 0)])
+            share = self._share(memory)
+            offsets = torch.diag_embed((share * self.reach).expand(signal.shape)).movedim(-1, 0)
+            gain = share * (signal - self.origin)
+            if self.kind == "temperature":
+                return torch.cat([gain.unsqueeze(0), offsets])
+            return torch.cat([torch.diag_embed(gain).movedim(-1, 0), offsets])
 
     def config(self) -> dict:
         return {"kind": self.kind, "reference_C": self.reference_C}
@@ -138,6 +153,14 @@ class Drift(Effect):
                 Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
                 Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
                 Quantity("tau_s", tau, "s", 60.0, 1e6, "quicker is a misalignment from the start"),
+            ]
+        if self.kind == "actuation":
+            part = "a regulator or wall that changes a little, not one that fails"
+            tau = value_of(self.log_tau.exp())
+            return [
+                Quantity("gain_in_10_min_share", value_of(self.gain), "", -0.4, 0.4, part),
+                Quantity("offset_in_10_min_share", value_of(self.offset), "", -0.3, 0.3, part),
+                Quantity("tau_s", tau, "s", 60.0, 1e6, "quicker is a creep"),
             ]
         rubber = "wide: an ideal rubber has 3 % in 10 K (modulus ~ T, Treloar 1975)"
         return [

@@ -27,7 +27,7 @@ RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
 the half range (a larger radius never moves)."""
 OTHERS = (0.0, -0.2, -0.4)
 """Shares of the other chambers in a line that a diagnosis tries."""
-FEW_RADII = (0.04, 0.10, 0.22, 0.44, 0.74)
+FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
 """Radii where a diagnosis asks whether there is any play."""
 
 
@@ -88,8 +88,13 @@ class Hysteresis(Effect):
         """Alike chambers, whose lines are stretched the other way by the rest of them or not."""
         if len(facts.low) == 1:
             return [cls(facts, FEW_RADII, ring=True, pairs=False)]
-        alone = [cls(facts, FEW_RADII, True, False, others) for others in OTHERS]
-        return [*alone, cls(facts, FEW_RADII, True, True, OTHERS[1])]
+        return [*cls.further(facts, points), cls(facts, FEW_RADII, True, True, OTHERS[1])]
+
+    @classmethod
+    def further(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        """Lines along single chambers: loops add up (Kuhnen 2003)."""
+        some = OTHERS if len(facts.low) > 1 else OTHERS[:1]
+        return [cls(facts, FEW_RADII, True, False, others) for others in some]
 
     def use_chambers(self, use: Tensor) -> None:
         self.use.copy_(use)

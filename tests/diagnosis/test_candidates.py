@@ -79,6 +79,20 @@ def test_more_of_an_effect_is_its_own_share(problem):
     assert np.sqrt(np.square(off).mean()) < 0.05 * np.sqrt(np.square(change / 0.1).mean())
 
 
+def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
+    """Loops add up, so a model with hysteresis may lack a narrow one; of creep there is no more."""
+    made = candidates(problem, ["hysteresis"])
+    assert [candidate.more for candidate in made] == [True, False, False, False]
+    widths = {candidate.effect.others: candidate.effect.radii[0] for candidate in made[1:]}
+    assert len(widths) == 3
+    assert max(widths.values()) < 0.02
+    creep = make_effect("creep", problem.model.facts)
+    with torch.no_grad():
+        next(iter(creep.strengths().values())).fill_(0.1)
+    fresh = with_effect(problem.model, "creep", creep)
+    assert [c.more for c in candidates(problem.with_model(fresh), ["creep"])] == [True]
+
+
 def test_open_and_locked_parts_share_no_row(recording, problem):
     """The last runs are locked away, and both parts together are everything."""
     locked = locked_rows([recording])

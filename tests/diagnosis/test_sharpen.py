@@ -14,7 +14,7 @@ from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.default import default_arm
-from tests.diagnosis.synthetic import walk
+from tests.diagnosis.synthetic import backlash, walk
 
 PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
 
@@ -48,6 +48,16 @@ def lagging(request):
     low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
     commands = low + (0.1 + 0.05 * walk(6000, 3)) * (high - low)
     return made(commands, lagged(commands, request.param))
+
+
+def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
+    """A dead travel of one kPa, in tubes or gears, is narrower than the arm's own loops."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + (0.1 + 0.05 * walk(6000, 3)) * (high - low)
+    behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
+    found = diagnose(default_arm(), [made(commands, behind)])
+    assert found.verdict.effects == ("hysteresis",)
+    assert found.ranking[0].gain_alone > 0.8
 
 
 def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):

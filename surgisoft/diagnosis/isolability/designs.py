@@ -1,5 +1,6 @@
 """Effects on schedules of actuations: what each would change, nothing measured."""
 
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +21,8 @@ ROWS = 800
 """Rows of a schedule whose columns are computed; memories follow every row."""
 PERIOD_S = 0.1
 """Time between the rows of a planned schedule, s."""
+SHAPE_STEP = 0.02
+"""Step of a slope by a value of a shape, in units of max(1, the value)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,8 @@ class Shape:
     """The effect, at zero strength."""
     more: bool = False
     """Whether it is the one that the model has already, stronger or weaker."""
+    fitted: bool = False
+    """Whether it was fitted to recordings; then its shape, too, may be a little another."""
 
 
 def shapes_of(model: ArmModel, reference: Design, names: list[str] | None = None) -> list[Shape]:
@@ -82,6 +87,8 @@ def columns_on(
 ) -> list[np.ndarray]:
     """(S, n, 3, K_j) change of the key points, mm, with each strength of each shape.
 
+    Of a fitted one with each value of its shape too, at the strengths that it has.
+
     facts: those of the arm as it stands in the experiment, where they are not the model's own.
     """
     signal = design.signals
@@ -94,8 +101,28 @@ def columns_on(
             answer.append(empty if found is None else found.columns)
         else:
             effect = shape.effect if facts is None else under(shape.effect, facts)
-            answer.append(columns_of(design, signal, effect))
+            columns = columns_of(design, signal, effect)
+            if shape.fitted:
+                moved = _slopes(design, signal, effect, columns)
+                columns = np.concatenate([columns, moved], axis=3)
+            answer.append(columns)
     return answer
+
+
+def _slopes(design: Design, signal: Signals, effect: Effect, columns: np.ndarray) -> np.ndarray:
+    """(S, n, 3, P) change of the key points, mm, with each value of a fitted effect's shape.
+
+    columns: (S, n, 3, K) change with each of its strengths.
+    """
+    strengths = torch.cat([p.flatten() for p in effect.strengths().values()]).numpy()
+    now, answer = columns @ strengths, []
+    for name, parameter in effect.shapes().items():
+        for i, value in enumerate(parameter.flatten().tolist()):
+            other = copy.deepcopy(effect)
+            step = SHAPE_STEP * max(1.0, abs(value))
+            other.get_parameter(name).view(-1)[i] += step
+            answer.append((columns_of(design, signal, other) @ strengths - now) / step)
+    return np.stack(answer, axis=3) if answer else columns[..., :0]
 
 
 def under(effect: Effect, facts: ArmFacts) -> Effect:

@@ -1,5 +1,6 @@
 """Rivals on a model, and what the recordings so far say about them."""
 
+import copy
 import itertools
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,7 @@ from surgisoft.diagnosis.isolability.matrix import (
 )
 from surgisoft.diagnosis.isolability.moments import Moments, Uncertainty, sample_time, unimitated
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.refinement.sharpen import with_fitted
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 
@@ -95,6 +97,12 @@ def pose_question(
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
         gram = _with(residual, design, columns, uncertainty).gram()
         fitted, gains = _fitted(gram, sizes)
+        sharp = _sharp(problem, sizes, fitted, gains) if rivals else []
+        if sharp:
+            sizes = Sizes.of(reference, columns_on(reference, shapes + sharp), shapes + sharp)
+            columns += columns_on(design, sizes.shapes[len(columns) :])
+            gram = _with(residual, design, columns, uncertainty).gram()
+            fitted, gains = _fitted(gram, sizes)
         best = int(np.argmax(gains))
         rms = float(np.sqrt(3.0 * np.mean((columns[best] @ fitted[best]) ** 2)))
         # Once more with the size that was found, and the shapes that matter.
@@ -172,6 +180,26 @@ def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
         seconds,
     )
     return design, residual[rows]
+
+
+def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Shape]:
+    """Each rival's best shape fitted through the whole chain to the recordings, where it can be."""
+    owners, answer = owners_of(sizes), []
+    for name in dict.fromkeys(owners):
+        mine = [j for j, owner in enumerate(owners) if owner == name and not sizes.shapes[j].more]
+        best = max(mine, key=lambda j: gains[j], default=None)
+        if best is None or gains[best] < CLEAR:
+            continue
+        effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
+        for parameter in effect.strengths().values():
+            part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
+            parameter.data.copy_(part.view_as(parameter))
+            first += parameter.numel()
+        model = with_fitted(problem, name, effect)
+        if model is not None:
+            found = model.effects[name].requires_grad_(False)
+            answer.append(Shape(name, found, fitted=True))
+    return answer
 
 
 def _spread(sizes: Sizes) -> np.ndarray:

@@ -42,24 +42,15 @@ class Sharpened(Candidate):
 
 
 def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Candidate]:
-    """Some effects of a race in shapes fitted to the problem, those left out that change nothing.
-
-    Effects that the model has already are not fitted, there is only more or less of them; nor are
-    those with many values.
-    """
+    """Some effects of a race in shapes fitted to the problem, those left out that change nothing
+    or are not fitted (`with_fitted`)."""
     with torch.no_grad():
         before = Forward(problem.model, problem, [])().double().numpy()
     answer = []
     for standing in some:
         effect = race.in_place(race.single(standing.option))
-        if (
-            effect is None
-            or standing.effect in problem.model.effects
-            or _values(effect) > MOST_VALUES
-        ):
-            continue
-        model = with_effect(copy.deepcopy(problem.model), standing.effect, effect)
-        if not _fitted(model, problem, standing.effect):
+        model = None if effect is None else with_fitted(problem, standing.effect, effect)
+        if model is None:
             continue
         with torch.no_grad():
             after = Forward(model, problem, [standing.effect])().double().numpy()
@@ -70,17 +61,21 @@ def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Ca
     return answer
 
 
-def _fitted(model: ArmModel, problem: Problem, name: str) -> bool:
-    """Fit an effect of a model in place; whether that ends, or can be held, where it is plausible.
+def with_fitted(problem: Problem, name: str, effect: Effect) -> ArmModel | None:
+    """A problem's model with one effect more, fitted from where it stands to the problem.
 
-    Half a lag twice as long is nearly the same lag: strengths beyond their range are held at its
-    end while the shapes go on.
+    None where the fit ends, and cannot be held, where it is implausible, for an effect that the
+    model has already, and for one with many values. Half a lag twice as long is nearly the same
+    lag: strengths beyond their range are held at its end while the shapes go on.
     """
+    if name in problem.model.effects or _values(effect) > MOST_VALUES:
+        return None
+    model = with_effect(copy.deepcopy(problem.model), name, effect)
     refine(model, problem, [name], ITERATIONS)
     effect = model.effects[name]
     if not effect.plausible() and effect.shapes() and shrink(effect):
         refine(model, problem, [name], ITERATIONS, held=name)
-    return effect.plausible()
+    return model if effect.plausible() else None
 
 
 def _values(effect: Effect) -> int:

@@ -69,6 +69,9 @@ def variants() -> dict[str, Effect]:
     for name, kind in known_effects().items():
         answer[name] = make_effect(name, FACTS)
         made = kind.candidates(FACTS, points)
-        for number in {len(made) // 2, len(made) - 1}:
+        kinds = {}
+        for number, effect in enumerate(made):
+            kinds[effect.stage, *(tuple(p.shape) for p in effect.parameters())] = number
+        for number in {len(made) // 2, *kinds.values()}:
             answer[f"{name}-{number}"] = made[number]
     return answer

@@ -168,6 +168,14 @@ def test_pairs_couple_one_way_each():
     assert answer == pytest.approx([0.5 - 0.1, 1.0 - 0.3 * 0.25, -0.5])
 
 
+def test_a_neighbour_takes_a_share_of_what_a_chamber_pushes():
+    """Chamber 1 loses 0.1 of its 0.5 to a full chamber 2, and chamber 2 0.3 of its 1 to 0.5."""
+    shares = [0.1, 0.0, 0.3, 0.0, 0.0, 0.5]
+    both = make_effect("coupling", RANGE, pairs=True, product=True)
+    answer = run(with_strength(both, product=shares), [[0.5, 1.0, 0.0]])[0].tolist()
+    assert answer == pytest.approx([0.5 - 0.1 * 0.5, 1.0 - 0.3 * 0.5, 0.0])
+
+
 def test_play_loop_has_its_area():
     """Sweeping by +-A opens a play of radius r by 2 r over a height of 2 (A - r)."""
     play = make_effect("hysteresis", RANGE, radii=(0.3,), ring=True, pairs=False)
@@ -268,6 +276,19 @@ def test_drift_goes_on_where_a_new_run_begins():
     t = torch.tensor([[0.0, 1.0, 2.0], [500.0, 501.0, 502.0]])
     dt = torch.tensor([[0.0, 1.0, 1.0]] * 2)
     assert torch.equal(drift.scan(drift.rest(points[:, 0]), points, Context(dt, t))[..., 0], t)
+
+
+def test_a_regulator_that_drifts_is_off_by_its_amplitudes_after_ten_minutes():
+    """Chamber 1 gains a tenth of its 25 kPa and 2 % of the range of 50 kPa, chamber 2 nothing."""
+    drift = make_effect("drift", RANGE, kind="actuation", tau_s=600.0)
+    with_strength(drift, gain=[0.1, 0.0, 0.0], offset=[0.02, 0.0, 0.0])
+    x = torch.full((1, 3, 3), 25.0)
+    seen = Context(torch.zeros(1, 3), torch.tensor([[0.0, 300.0, 600.0]]))
+    answer = drift.apply(x, drift.scan(drift.rest(x[:, 0]), x, seen))[0]
+    half = (1 - math.exp(-0.5)) / (1 - math.exp(-1))
+    assert answer[:, 0].tolist() == pytest.approx([25.0, 25.0 + half * 3.5, 28.5])
+    assert answer[:, 1].tolist() == [25.0] * 3
+    assert drift.stage == "material"
 
 
 def test_warm_rooms_change_the_gain_and_unknown_ones_nothing():

@@ -1,0 +1,77 @@
+"""A sweep that is played again is no further evidence."""
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.motions import motions
+from surgisoft.diagnosis.problem import folds, pose
+from surgisoft.surrogate.history import pack
+from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
+
+HALF = np.array([5.0, 5.0])
+
+
+def path(rows: np.ndarray, period_s: float = PERIOD_S):
+    """One run along an actuation (T, 2)."""
+    time = torch.arange(len(rows), dtype=torch.float64) * period_s
+    return pack([time], [torch.from_numpy(rows)], [torch.full((len(rows), 1, 3), torch.nan)])
+
+
+def sweep(speed: float, times: int) -> np.ndarray:
+    """(T, 2) the first chamber up and down, then the second, so many times."""
+    legs = []
+    for chamber in (0, 1):
+        for goals in ((0.0, 10.0), (10.0, 0.0)):
+            leg = np.zeros((round(10.0 / speed / PERIOD_S), 2))
+            leg[:, chamber] = np.linspace(*goals, len(leg), endpoint=False)
+            legs.append(leg)
+    return np.tile(np.concatenate(legs), (times, 1))
+
+
+def test_copies_share_a_motion_and_other_paths_do_not():
+    once = sweep(1.0, 1)
+    block = np.repeat(np.arange(4 * 3), len(once) // 4)
+    assert motions(path(np.tile(once, (3, 1))), HALF, block).tolist() == [0, 1, 2, 3] * 3
+    random = walk(6000)
+    found = motions(path(random), HALF, np.arange(6000) // 50)
+    assert found.max() + 1 > 90
+
+
+@pytest.mark.parametrize("speed", [0.3, 3.0])
+def test_the_same_path_at_another_speed_is_another_motion(speed):
+    slow, other = sweep(1.0, 1), sweep(speed, 1)
+    block = np.concatenate([np.zeros(len(slow), int), np.ones(len(other), int)])
+    assert motions(path(np.concatenate([slow, other])), HALF, block).tolist() == [0, 1]
+
+
+def test_rows_of_no_block_count_for_nothing():
+    once = sweep(1.0, 2)
+    block = np.full(len(once), -1)
+    block[:100], block[400:500] = 0, 1
+    assert motions(path(once), HALF, block).tolist() == [0, 0]
+
+
+def test_copies_are_left_out_of_a_fit_together():
+    part = folds(np.array([0, 1, 2, 3, 0, 1, 2, 3]))
+    assert part[:4].tolist() == part[4:].tolist()
+    assert len(set(part)) >= 2
+    assert len(set(folds(np.zeros(12, int)))) >= 2
+
+
+def bumpy(rows: np.ndarray) -> np.ndarray:
+    """(T,) an error of the surrogate that depends on the actuation alone, mm."""
+    return 0.5 * np.sin(1.3 * rows[:, 0]) + 0.4 * np.cos(1.1 * rows[:, 1])
+
+
+def test_an_error_of_the_surrogate_that_is_shown_again_and_again_is_no_effect():
+    rows = sweep(1.0, 16)
+    some = [recording(bumpy(rows), rows, seed=seed) for seed in range(2)]
+    found = diagnose(still_model(), some)
+    assert found.verdict.kind in ("nothing_missing", "surrogate_undertrained")
+    assert any("repeat themselves" in check for check in found.checks)
+    problem = pose(still_model(), some, part="open")
+    assert problem.motion.max() + 1 < len(problem.motion) / 2
+    sums = problem.by_motion(np.ones((3, len(problem.motion))))
+    np.testing.assert_allclose(sums, np.bincount(problem.motion)[None].repeat(3, 0))

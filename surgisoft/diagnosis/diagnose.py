@@ -7,7 +7,6 @@
 5. One effect after another, until the gates are silent; rivals and leftovers decide the answer.
 """
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -312,8 +311,6 @@ def statistics(found: Findings) -> dict:
     raw = float(np.nansum(np.square(problem.residual)))
     null = race.losses()
     after = race.losses(found.picked)
-    seen = np.isfinite(problem.residual).all(2).sum(0)
-    allowed = np.square(problem.surrogate_mm)
     best = found.named[0] if found.named else (found.first[0] if found.first else None)
     others = [s for s in found.first if best is not None and s.effect != best.effect]
     runner = others[0] if others else None
@@ -338,7 +335,7 @@ def statistics(found: Findings) -> dict:
         "box_share": float((null.sum() - found.box.losses.sum()) / race.excess(null)),
         "box_p": found.box.p_value,
         "box_log_gain": float(race.log_ratio(after, found.box.losses).mean()),
-        "left_size": math.sqrt(race.excess(after) / float(seen @ allowed)),
+        "left_size": race.size(after),
         "loose_share": found.loose.share if found.loose else 0.0,
         "loose_log_gain": found.loose.log_gain if found.loose else 0.0,
         "loose_p": found.loose.p_value if found.loose else 1.0,

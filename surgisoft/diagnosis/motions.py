@@ -17,7 +17,9 @@ TIMES_S = (0.5, 2.0)
 ALIKE = 0.1
 """How far actuation and its past may differ, in half ranges, to count as the same."""
 SHARE = 0.5
-"""Share of the rows of each of two blocks that must come again in the other."""
+"""Share of the rows of each of two blocks that must come again in the other, in motion."""
+STILL = 0.02
+"""Way that an actuation is ahead of its past, in half ranges, up to which the arm is still."""
 MOST_ROWS = 6000
 """Rows among which repeats are looked for; more are thinned evenly."""
 
@@ -31,12 +33,15 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     rows = rows[:: max(1, -(-len(rows) // MOST_ROWS))]
     state, owner = _states(history, half)[rows], block[rows]
     count = int(block.max()) + 1
+    whole = np.maximum(np.bincount(owner, minlength=count), 1)
+    moving = np.abs(state[:, history.chambers :]).max(1) > STILL
+    state, owner = state[moving], owner[moving]
     shared = np.zeros((count, count))
     # A row of one block and those of all blocks within reach of it, each block counted once.
     near = cKDTree(state).query_ball_point(state, ALIKE, p=np.inf)
     for own, some in zip(owner, near, strict=True):
         shared[own, np.unique(owner[some])] += 1.0
-    shared /= np.maximum(np.bincount(owner, minlength=count), 1)[:, None]
+    shared /= whole[:, None]
     alike = np.minimum(shared, shared.T) >= SHARE
     answer, found = np.full(count, -1), 0
     for first in range(count):
@@ -54,4 +59,4 @@ def _states(history: History, half: np.ndarray) -> np.ndarray:
     decay = decay.unsqueeze(2).expand(*signal.shape, len(TIMES_S))
     wide = signal.unsqueeze(-1)
     past = linear_scan(decay, (1.0 - decay) * wide, wide[:, 0].expand(-1, -1, len(TIMES_S)))
-    return history.rows(torch.cat([wide, wide - past], -1).flatten(2)).numpy()
+    return history.rows(torch.cat([signal, (wide - past).flatten(2)], -1)).numpy()

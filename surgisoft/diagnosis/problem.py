@@ -90,10 +90,10 @@ class Problem:
         return self.measured - self.predicted
 
     def by_motion(self, values: np.ndarray) -> np.ndarray:
-        """(..., M) sums of values (..., B) of the blocks over those that share a motion."""
-        answer = np.zeros((int(self.motion.max()) + 1, *values.shape[:-1]))
-        np.add.at(answer, self.motion, np.moveaxis(values, -1, 0))
-        return np.moveaxis(answer, 0, -1)
+        """(..., M) means of values (..., B) of the blocks over those that share a motion."""
+        sums = np.zeros((int(self.motion.max()) + 1, *values.shape[:-1]))
+        np.add.at(sums, self.motion, np.moveaxis(values, -1, 0))
+        return np.moveaxis(sums, 0, -1) / np.bincount(self.motion)
 
     def rows(self, tensor: Tensor) -> Tensor:
         """The fitted rows of a (R, T, ...) tensor."""

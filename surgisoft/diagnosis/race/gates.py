@@ -24,7 +24,8 @@ def family_p_values(gains: np.ndarray, group: np.ndarray | None = None, seed: in
     their number (Westfall & Young 1993, ch. 2, step minP). gains: (C, B) by block; group: (C,) ids.
     """
     rng = np.random.default_rng(seed)
-    seen = studentised(gains)
+    # The signs as they are come among the draws too: rounding must not set them below what is seen.
+    seen = studentised(gains) * (1.0 - 1e-9)
     group = np.arange(len(gains)) if group is None else np.asarray(group)
     signs = rng.choice([-1.0, 1.0], size=(FLIPS, gains.shape[1]))
     # The sum of squares does not change with the signs, so neither does what scales the mean.

@@ -129,6 +129,11 @@ class Race:
         """Squared error above the noise floor, mm^2."""
         return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
+    def size(self, losses: np.ndarray) -> float:
+        """Error that is left above the noise floor, in units of the surrogate's validated error."""
+        seen = np.isfinite(self.problem.residual).all(2).sum(0)
+        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.surrogate_mm))))
+
     def in_fit(self, effect: str) -> bool:
         """Whether the model was fitted with an effect and is off by no more than it was then.
 

@@ -5,37 +5,47 @@ both loads, cut after its second order:
 
     x_eff_i = x_i - sum_{j != i} (linear x_j + quadratic_ij x_j |x_j|),      x = load,
 
-or, where the neighbour takes a share of what the chamber pushes,
+or, where others take a share of what the chamber pushes (all of them, or the next or the previous
+one of chambers in a ring),
 
-    x_eff_i = x_i - sum_{j != i} (linear x_j + product_ij x_i x_j).
+    x_eff_i = x_i - sum_{j != i} linear x_j - product x_i sum_{j in who} x_j.
 """
 
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import unknown_name
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
+
+WHO = ("all", "next", "previous")
+"""Chambers that may take a share of what one pushes."""
 
 
 class Coupling(Memoryless):
     """Loss of push by the other chambers' loads."""
 
     stage = "material"
+    side_by_side = False  # a chamber loses in one way; products both ways round would be a twist
 
-    def __init__(self, facts: ArmFacts, pairs: bool = False, product: bool = False):
-        """pairs: a loss of second order of its own for each pair, not one for all; product: that
-        loss goes with both loads."""
+    def __init__(self, facts: ArmFacts, pairs: bool = False, who: str | None = None):
+        """pairs: a quadratic loss of its own for each pair, not one for all; who: one of WHO, a
+        loss in its place that goes with both loads."""
         super().__init__(facts)
+        if who is not None and who not in WHO:
+            raise unknown_name("kind of chambers", who, WHO)
         m = len(facts.low)
-        self.pairs, self.of_both = bool(pairs), bool(product)
+        self.pairs, self.who = bool(pairs), who
         self.linear = amplitude(1)
-        second = amplitude(m * (m - 1) if self.pairs else 1)
-        if self.of_both:
-            self.product = second
+        if who is None:
+            self.quadratic = amplitude(m * (m - 1) if self.pairs else 1)
+            place = (1 - torch.eye(m)).flatten().nonzero().flatten()
+            spread = torch.nn.functional.one_hot(place, m * m).float().view(-1, m, m)
+            spread = spread if self.pairs else spread.sum(0, keepdim=True)
         else:
-            self.quadratic = second
-        place = (1 - torch.eye(m)).flatten().nonzero().flatten()
-        spread = torch.nn.functional.one_hot(place, m * m).float().view(-1, m, m)
-        spread = spread if self.pairs else spread.sum(0, keepdim=True)
+            self.product = amplitude(1)
+            turned = {"next": -1, "previous": 1}
+            spread = 1 - torch.eye(m) if who == "all" else torch.eye(m).roll(turned[who], 0)
+            spread = spread.unsqueeze(0)
         self.register_buffer("spread", spread, persistent=False)
 
     def strengths(self) -> dict[str, nn.Parameter]:
@@ -44,33 +54,35 @@ class Coupling(Memoryless):
     @property
     def _second(self) -> str:
         """Name of the amplitudes of second order."""
-        return "product" if self.of_both else "quadratic"
+        return "quadratic" if self.who is None else "product"
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
         """One loss for all pairs, and one for each; none for a single chamber."""
         if len(facts.low) == 1:
             return []
-        return [cls(facts), cls(facts, pairs=True), cls(facts, pairs=True, product=True)]
+        who = WHO if len(facts.low) > 2 else WHO[:1]
+        return [cls(facts), cls(facts, pairs=True), *(cls(facts, who=some) for some in who)]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m)."""
         x = self.load(signal)
         lost = self.linear * (x.sum(-1, keepdim=True) - x)
         shares = torch.einsum("k,kij->ji", getattr(self, self._second), self.spread)
-        lost = lost + (x * (x @ shares) if self.of_both else (x * x.abs()) @ shares)
+        lost = lost + ((x * x.abs()) @ shares if self.who is None else x * (x @ shares))
         return signal - self.reach * lost
 
     def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
         x = self.load(signal).detach()
         linear = (x.sum(-1, keepdim=True) - x).unsqueeze(0)
-        second = torch.einsum("kij,...j->k...i", self.spread, x if self.of_both else x * x.abs())
-        if self.of_both:
+        other = x * x.abs() if self.who is None else x
+        second = torch.einsum("kij,...j->k...i", self.spread, other)
+        if self.who is not None:
             second = x * second
         return -self.reach * torch.cat([linear, second])
 
     def config(self) -> dict:
-        return {"pairs": self.pairs, "product": self.of_both}
+        return {"pairs": self.pairs, "who": self.who}
 
     def quantities(self) -> list[Quantity]:
         wall = "wide: at most half of the push is lost to one neighbour"

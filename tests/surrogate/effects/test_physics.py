@@ -169,11 +169,12 @@ def test_pairs_couple_one_way_each():
 
 
 def test_a_neighbour_takes_a_share_of_what_a_chamber_pushes():
-    """Chamber 1 loses 0.1 of its 0.5 to a full chamber 2, and chamber 2 0.3 of its 1 to 0.5."""
-    shares = [0.1, 0.0, 0.3, 0.0, 0.0, 0.5]
-    both = make_effect("coupling", RANGE, pairs=True, product=True)
-    answer = run(with_strength(both, product=shares), [[0.5, 1.0, 0.0]])[0].tolist()
-    assert answer == pytest.approx([0.5 - 0.1 * 0.5, 1.0 - 0.3 * 0.5, 0.0])
+    """A fifth of its own times the load of the next chamber, of the previous one, or of both."""
+    lost = {"next": [0.1, 0.08, 0.04], "previous": [0.04, 0.1, 0.08], "all": [0.14, 0.18, 0.12]}
+    for who, expected in lost.items():
+        coupled = with_strength(make_effect("coupling", RANGE, who=who), product=0.2)
+        answer = run(coupled, [[0.5, 1.0, 0.4]])[0].tolist()
+        assert answer == pytest.approx([0.5 - expected[0], 1.0 - expected[1], 0.4 - expected[2]])
 
 
 def test_play_loop_has_its_area():

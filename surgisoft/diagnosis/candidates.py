@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.surrogate.effects import Context, Effect, free_name, known_effects
+from surgisoft.surrogate.effects import (
+    ArmFacts,
+    Context,
+    Effect,
+    free_name,
+    known_effects,
+)
 from surgisoft.surrogate.model import ArmModel, context_of
 
 
@@ -138,18 +144,26 @@ def more_of(problem: Problem, signal: Signals, name: str) -> Candidate | None:
     return Candidate(name, effect, columns.movedim(0, -1).numpy(), more=True)
 
 
+def facts_of(problem: Problem) -> ArmFacts:
+    """What effects may know of the arm; what a room that was warm all along does is not drift."""
+    facts, room = problem.model.facts, problem.history.temperature_C
+    if facts.temperature_C is None and room is not None:
+        return replace(facts, temperature_C=float(room.nanmean()))
+    return facts
+
+
 def candidates(problem: Problem, names: list[str] | None = None) -> list[Candidate]:
     """Every known effect in each of its shapes, as columns."""
     model, signal = problem.model, signals(problem)
     points = problem.rows(signal.body)
-    answer, known = [], known_effects()
+    answer, known, facts = [], known_effects(), facts_of(problem)
     for name in names or known:
         more = more_of(problem, signal, name) if name in model.effects else None
         if more is None:
-            fresh = known[name].candidates(model.facts, points)
+            fresh = known[name].candidates(facts, points)
         else:
             answer.append(more)
-            fresh = known[name].further(model.facts, points)
+            fresh = known[name].further(facts, points)
         for effect in fresh:
             columns = columns_of(problem, signal, effect)
             answer.append(Candidate(name, copy.deepcopy(effect), columns))

@@ -115,7 +115,16 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
         length_mm=first.arm.length_mm,
         diameter_mm=first.arm.diameter_mm,
         gravity=None if first.gravity is None else tuple(first.gravity.tolist()),
+        temperature_C=_mean_temperature(recordings),
     )
+
+
+def _mean_temperature(recordings: list[Recording]) -> float | None:
+    """Mean temperature of the room, degrees Celsius; None where no recording knows it."""
+    room = [r.temp_C for r in recordings if r.temp_C is not None]
+    room = np.concatenate(room) if room else np.zeros(0)
+    room = room[np.isfinite(room)]
+    return float(room.mean()) if len(room) else None
 
 
 def outside_range(spec: ArmSpec, recordings: list[Recording]) -> list[str]:

@@ -35,6 +35,8 @@ class ArmSpec:
     """Outer diameter, mm."""
     gravity: tuple[float, float, float] | None = None
     """Unit vector of weight in the base frame, where the recordings say it."""
+    temperature_C: float | None = None
+    """Mean temperature of the room where the recordings were made, degrees Celsius, if known."""
 
     def __post_init__(self):
         for name in ("low", "high", "band", "idle"):

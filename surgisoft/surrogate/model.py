@@ -286,7 +286,9 @@ def arm_facts(spec: ArmSpec, rest_mm: Tensor) -> ArmFacts:
     """What effects may know of the arm whose key points at rest are rest_mm, (n, 3) in mm."""
     low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
     rest_mm = rest_mm.detach().cpu()
-    return ArmFacts(low, high, rest, rest_mm, spec.gravity, spec.length_mm, spec.unit)
+    return ArmFacts(
+        low, high, rest, rest_mm, spec.gravity, spec.length_mm, spec.unit, spec.temperature_C
+    )
 
 
 def context_of(history: History) -> Context:

@@ -66,11 +66,19 @@ class Shape:
     """Whether it was fitted to recordings; then its shape, too, may be a little another."""
 
 
-def shapes_of(model: ArmModel, reference: Design, names: list[str] | None = None) -> list[Shape]:
-    """Every shape of the named effects (default: all known) that a diagnosis tries on a model."""
+def shapes_of(
+    model: ArmModel,
+    reference: Design,
+    names: list[str] | None = None,
+    facts: ArmFacts | None = None,
+) -> list[Shape]:
+    """Every shape of the named effects (default: all known) that a diagnosis tries on a model.
+
+    facts: those of the arm as it was recorded, where they are not the model's own.
+    """
     known = known_effects()
     names = list(known) if names is None else list(names)
-    facts = model.facts
+    facts = model.facts if facts is None else facts
     points = reference.rows(reference.signals.body)
     answer = []
     for name in names:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from surgisoft.diagnosis.candidates import facts_of
 from surgisoft.diagnosis.isolability.designs import (
     PERIOD_S,
     Design,
@@ -76,7 +77,8 @@ def pose_question(
     Default: every known effect that changes anything on this arm.
     """
     reference = reference_design(model)
-    shapes = shapes_of(model, reference, rivals)
+    facts = None if problem is None else facts_of(problem)
+    shapes = shapes_of(model, reference, rivals, facts)
     if problem is None:
         shapes = _some_of_each(shapes)
     sizes = Sizes.of(reference, columns_on(reference, shapes), shapes)

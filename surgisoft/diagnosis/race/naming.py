@@ -8,9 +8,9 @@ CHANCE = 0.02
 LARGE = (0.2, 0.5, 0.07)
 """Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
 in some of them only), the share that makes it large, and its least log gain."""
-FAR = (2.0, 0.5, 0.75)
-"""The same where the error is far beyond the surrogate's own, which no chance can do: factor on the
-validated error, largest chance, and share."""
+FAR = (2.0, 0.8)
+"""Or, whatever its chance, where the error is far beyond the surrogate's own: factor on the
+validated error, and share. Few blocks are needed to show a support that is seldom met."""
 LEAST_GAIN = 0.25
 """Least share of the squared error above the floor that the first effect explains."""
 NEXT_GAIN = 0.15
@@ -82,10 +82,9 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
         if s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN:
             return True
         chance, large, least = LARGE
-        factor, far_chance, far_large = FAR
-        if race.size(race.losses()) >= factor and share >= far_large:
-            chance = far_chance
-        return bool(s.p_value <= chance and share >= large and log_gain >= least)
+        factor, most = FAR
+        far = race.size(race.losses()) >= factor and share >= most
+        return bool((far or s.p_value <= chance) and share >= large and log_gain >= least)
     if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
         return False
     least_gain, least_log, most = BESIDE

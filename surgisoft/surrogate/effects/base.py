@@ -38,6 +38,8 @@ class ArmFacts:
     """Length at rest, mm."""
     unit: str = "kPa"
     """Unit of the actuation."""
+    temperature_C: float | None = None
+    """Temperature of the room that the arm was measured in, degrees Celsius."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from surgisoft.surrogate.effects.base import (
 
 AROUND = 16
 """Directions of the support that a diagnosis tries."""
-DEPTHS = (0.5, 0.65, 0.8, 0.9)
+DEPTHS = (0.5, 0.7, 0.86, 0.96)
 """Quantiles of the body's excursion at which it puts the support."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
@@ -118,9 +118,9 @@ class Contact(Memoryless):
         length = self.length_mm
         offset = length * float(self.offset.detach())
         reach = "within the arm's reach"
-        share = "0: no support, 1: rigid (Wriggers 2006)"
+        share = "1: rigid (Wriggers 2006); next to nothing: no support"
         return [
-            Quantity("share", value_of(self.share), "", 0.0, 1.1, share),
+            Quantity("share", value_of(self.share), "", 0.08, 1.1, share),
             Quantity("azimuth_rad", value_of(self.azimuth), "rad", -10.0, 10.0, "any direction"),
             Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),

@@ -4,10 +4,12 @@ Folds, play and slack take up the first of the actuation, smoothly:
 
     x_eff = x - threshold x / sqrt(x^2 + width^2),      x = load.
 
-Far from rest the push is short by the threshold (Tao & Kokotovic 1996, ch. 2, the dead zone); near
-rest the slope is 1 - threshold / width, none at all where both are equal.
+with one threshold or one for each chamber. Far from rest the push is short by the threshold (Tao &
+Kokotovic 1996, ch. 2, the dead zone); near rest the slope is 1 - threshold / width, none at all
+where both are equal.
 """
 
+import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (
@@ -16,6 +18,7 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
+    value_of,
 )
 
 GRID = (0.04, 0.1, 0.25)
@@ -23,14 +26,15 @@ GRID = (0.04, 0.1, 0.25)
 
 
 class DeadZone(Memoryless):
-    """A smooth dead zone around rest, the same for all chambers."""
+    """A smooth dead zone around rest, the same for all chambers or one for each."""
 
     stage = "material"
 
-    def __init__(self, facts: ArmFacts, width: float = 0.1):
-        """Half width, as a share of full load."""
+    def __init__(self, facts: ArmFacts, width: float = 0.1, each: bool = False):
+        """Half width, as a share of full load; each: a threshold for each chamber."""
         super().__init__(facts)
-        self.threshold = amplitude(1)
+        self.each = bool(each)
+        self.threshold = amplitude(len(facts.low) if self.each else 1)
         self.log_width = logarithm(width)
 
     def strengths(self) -> dict[str, nn.Parameter]:
@@ -38,7 +42,8 @@ class DeadZone(Memoryless):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        return [cls(facts, width) for width in GRID]
+        each = (False, True) if len(facts.low) > 1 else (False,)
+        return [cls(facts, width, one) for one in each for width in GRID]
 
     def _lost(self, signal: Tensor) -> Tensor:
         x = self.load(signal)
@@ -49,15 +54,16 @@ class DeadZone(Memoryless):
         return signal + self.threshold * self._lost(signal)
 
     def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
-        return self._lost(signal).unsqueeze(0).detach()
+        lost = self._lost(signal).detach()
+        return torch.diag_embed(lost).movedim(-1, 0) if self.each else lost.unsqueeze(0)
 
     def config(self) -> dict:
-        return {}
+        return {"each": self.each}
 
     def quantities(self) -> list[Quantity]:
         unit, full = self.facts.unit, float(self.reach.mean())
         folds = "a chamber that pushes in most of its range"
-        threshold = full * float(self.threshold.detach())
+        threshold = value_of(full * self.threshold)
         width = full * float(self.log_width.detach().exp())
         return [
             Quantity(f"threshold_{unit}", threshold, unit, 0.0, 0.5 * full, folds),

@@ -37,11 +37,13 @@ from surgisoft.surrogate.rotation import rotate
 KINDS = ("base", "actuation", "temperature")
 TEN_MINUTES = 600.0
 """Time at which the amplitudes are given, s."""
+ROOM_C = 22.0
+"""T_0 where nobody knows it, degrees Celsius."""
 TEN_KELVIN = 10.0
 """Change of temperature at which the amplitudes are given, K."""
-GRID = (60.0, 250.0, 1000.0, 20000.0)
+GRID = (200.0, 1000.0, 20000.0)
 """Times tau of the base that a diagnosis tries, s."""
-FEW = (250.0, 20000.0)
+FEW = (1000.0, 20000.0)
 """The same of the actuation."""
 
 
@@ -49,18 +51,22 @@ class Drift(Effect):
     """A yielding holder, or gains and offsets that follow the time or the temperature."""
 
     stage = "body"
+    side_by_side = False  # a quick drift less a slow one would be none: an error from the start
 
     def __init__(
         self,
         facts: ArmFacts,
         kind: str = "base",
         tau_s: float = 1000.0,
-        reference_C: float = 22.0,
+        reference_C: float | None = None,
     ):
-        """kind: one of KINDS; tau of base and actuation, s; T_0, degrees Celsius."""
+        """kind: one of KINDS; tau of base and actuation, s; T_0, degrees Celsius (default: that of
+        the room in which the arm was measured)."""
         super().__init__(facts)
         if kind not in KINDS:
             raise unknown_name("kind of drift", kind, KINDS)
+        if reference_C is None:
+            reference_C = ROOM_C if facts.temperature_C is None else facts.temperature_C
         self.kind, self.reference_C = kind, float(reference_C)
         if kind == "base":
             self.turn = amplitude(3)
@@ -152,7 +158,7 @@ class Drift(Effect):
             return [
                 Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
                 Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
-                Quantity("tau_s", tau, "s", 60.0, 1e6, "quicker is a misalignment from the start"),
+                Quantity("tau_s", tau, "s", 120.0, 1e6, "quicker is a misalignment"),
             ]
         if self.kind == "actuation":
             part = "a regulator or wall that changes a little, not one that fails"
@@ -160,7 +166,7 @@ class Drift(Effect):
             return [
                 Quantity("gain_in_10_min_share", value_of(self.gain), "", -0.4, 0.4, part),
                 Quantity("offset_in_10_min_share", value_of(self.offset), "", -0.3, 0.3, part),
-                Quantity("tau_s", tau, "s", 60.0, 1e6, "quicker is a creep"),
+                Quantity("tau_s", tau, "s", 300.0, 1e6, "quicker is another gain from the start"),
             ]
         rubber = "wide: an ideal rubber has 3 % in 10 K (modulus ~ T, Treloar 1975)"
         return [

@@ -111,9 +111,10 @@ class Inertia(Effect):
 
     def quantities(self) -> list[Quantity]:
         soft = "wide: first modes of soft arms of centimetres to a metre"
+        swings = "more hardly swings: it looks like viscosity"
         damping = value_of(self.damping_logit.sigmoid())
         return [
             Quantity("share", value_of(self.share), "", 0.0, 1.2, "1: all of the arm swings"),
             Quantity("frequency_Hz", value_of(self.log_frequency.exp()), "Hz", 0.1, 50.0, soft),
-            Quantity("damping_ratio", damping, "", 0.005, 0.99, soft),
+            Quantity("damping_ratio", damping, "", 0.005, 0.5, swings),
         ]

@@ -7,7 +7,8 @@ arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
     h(q) = (exp(k q) - 1) / (exp(k) - 1),
     B^2 = sum_i (x_i - mean x)^2 m / (m - 1),
 
-with B = 1 where one chamber alone is fully loaded. A has ones on its diagonal and the share of the
+with B = 1 where one chamber alone is fully loaded; of four chambers, which stand in a ring, opposed
+ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A has ones on its diagonal and the share of the
 other chambers beside them: a chamber that bends the arm shortens the wall on the other side.
 """
 
@@ -58,7 +59,11 @@ class Stiffening(Memoryless):
         """Two (..., m) shifts of the actuation at strength one: own and bending."""
         x, k = self.load(signal), self.log_steepness.exp()
         m = x.shape[-1]
-        bend = (x - x.mean(-1, keepdim=True)).square().sum(-1, keepdim=True) * m / max(m - 1, 1)
+        if m == 4:
+            bend = (x[..., :2] - x[..., 2:]).square().sum(-1, keepdim=True)
+        else:
+            away = x - x.mean(-1, keepdim=True)
+            bend = away.square().sum(-1, keepdim=True) * m / max(m - 1, 1)
 
         def lost(load: Tensor, q: Tensor) -> Tensor:
             # A recording beyond the fitted range must not blow up.

@@ -18,7 +18,7 @@ app = typer.Typer(
 
 MANY = {
     *("--between", "--data", "--effect", "--effect-file", "--effects", "--hidden", "--policy"),
-    *("--reference", "--strength", "--valid"),
+    *("--reference", "--strength", "--valid", "--without"),
 }
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 

@@ -26,6 +26,13 @@ def diagnose(
             "what the network never learned; without them what the model keeps of its fit.",
         ),
     ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="EFFECT...",
+            help="Effects that cannot be, because they were taken off the bench, such as contact.",
+        ),
+    ] = None,
     effect_files: EffectFiles = None,
 ) -> None:
     """Diagnose a model: name the physical effect that it is missing, or say why not.
@@ -49,7 +56,9 @@ def diagnose(
     torch.set_num_threads(1)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
-        found = diagnose_model(arm, measured, lambda text: tell(next(stages), 5, text), before)
+        found = diagnose_model(
+            arm, measured, lambda text: tell(next(stages), 5, text), before, without or ()
+        )
     warn_outside(arm, measured)
     if json_file:
         write_json(json_file, found.to_json())

@@ -87,7 +87,8 @@ def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> No
         print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
     # A change that takes something away speaks by the new recording alone.
     old = "" if answer.by_hand else "".join(f" {path}" for path in recordings)
-    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet")
+    taken = f" --without {' '.join(answer.removes)}" if answer.by_hand else ""
+    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}")
     for pair in sorted(answer.pairs, key=lambda pair: pair.after):
         a, b = pair.effects
         print(

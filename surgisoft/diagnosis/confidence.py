@@ -34,4 +34,4 @@ def confidence(numbers: dict) -> float:
     odds = sum(WEIGHTS[name] * value for name, value in values.items())
     odds += IMITATED.get(numbers["steps"][0][0], 0.0)
     chance = 1.0 / (1.0 + math.exp(-odds))
-    return min(chance, AMBIGUOUS) if numbers["named"] == 1 and numbers["rivals"] else chance
+    return min(chance, AMBIGUOUS) if numbers["rivals"] else chance

@@ -8,7 +8,7 @@
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +33,10 @@ from surgisoft.diagnosis.verdict import (
     Verdict,
     sentence_of,
 )
+from surgisoft.diagnosis.weaknesses import weaknesses
+from surgisoft.errors import unknown_name
 from surgisoft.measurement.recording import Recording
+from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
@@ -96,7 +99,7 @@ class Findings:
     next: list[Standing]
     """The effects that did not pass on top of those, the best first."""
     rivals: list[str]
-    """Effects that explain the data about as well as the first."""
+    """Effects that explain the data about as well as the first, or as one of several."""
     unique: dict[str, float]
     box: BlackBox
     static: StaticError
@@ -115,9 +118,11 @@ def diagnose(
     recordings: list[Recording],
     progress: Progress | None = None,
     reference: list[Recording] | KnownError | None = None,
+    without: Collection[str] = (),
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
+    without: effects that cannot be, such as a contact on a bench without anything to lean on.
     reference: recordings from before something changed, or what the model's folder keeps of those
     of its fit; where given, the question is what has changed since.
     """
@@ -128,7 +133,12 @@ def diagnose(
     if reference is not None:
         problem = with_reference(problem, reference)
     report("columns of the effects")
-    said = answer(find(problem, candidates(problem), report))
+    names = known_effects()
+    for name in without:
+        if name not in names:
+            raise unknown_name("effect", name, names)
+    tried = candidates(problem, [name for name in names if name not in without])
+    said = answer(find(problem, tried, report))
     if said.verdict.kind == "unknown_effect":
         said = with_axis(said, model, recordings)
     return replace(said, seconds=time.perf_counter() - begin)
@@ -196,12 +206,23 @@ def _loose(
 
 
 def _rivals(race: Race, first: list[Standing], named: list[Standing]) -> list[str]:
-    """Effects that would do about as well in the place of the first one named."""
-    if not named:
-        return []
-    best, (of_gain, of_left) = named[0], NEAR_TIE
+    """Effects that would do about as well in the place of one that is named, beside the others."""
+    if len(named) == 1:
+        return _rivals_of(race, first, named[0])
     answer = []
-    for other in first:
+    for one in named:
+        others = [other for other in named if other is not one]
+        found = race.standings(picked_by(others), tuple(other.effect for other in others))
+        own = next((standing for standing in found if standing.effect == one.effect), None)
+        answer += [] if own is None else _rivals_of(race, found, own)
+    return list(dict.fromkeys(answer))
+
+
+def _rivals_of(race: Race, found: list[Standing], best: Standing) -> list[str]:
+    """Effects that explain about as much as one, all on top of the same base."""
+    of_gain, of_left = NEAR_TIE
+    answer = []
+    for other in found:
         if other.effect == best.effect or other.gain < RIVAL_GAIN * best.gain:
             continue
         pair = race.problem.by_motion(np.stack([-best.log_gain, -other.log_gain]))
@@ -230,6 +251,8 @@ def answer(found: Findings) -> Diagnosis:
     )
     near = [s.effect for s in found.first[:1] if s.gain >= NEAR]
     sentence = sentence_of(kind, effects, levels, reached, sure, near[0] if near else None)
+    if kind == "several" and found.rivals:
+        sentence += f"; {' or '.join(found.rivals)} would do as well in the place of one of them"
     plan = None
     if kind == "ambiguous":
         # Imported here: it predicts every experiment of the catalogue, which takes seconds.
@@ -240,9 +263,9 @@ def answer(found: Findings) -> Diagnosis:
         verdict=Verdict(kind, effects, sentence),
         error_mm=levels,
         ranking=ranking,
-        ambiguous_with=tuple(found.rivals) if kind == "ambiguous" else (),
+        ambiguous_with=tuple(found.rivals) if kind in ("ambiguous", "several") else (),
         next_experiment=plan,
-        checks=tuple(_checks(found)),
+        checks=tuple(weaknesses(problem)),
         statistics=numbers | {"blocks": len(counts)},
     )
 
@@ -367,23 +390,3 @@ def _ranked(found: Findings, standing: Standing, sure: float) -> Ranked:
         log_gain=float(standing.log_gain.mean()),
         parameters=race.parameters(standing),
     )
-
-
-def _checks(found: Findings) -> list[str]:
-    """What is weak about the data."""
-    problem, answer = found.problem, []
-    if problem.floor_source == "second differences":
-        answer.append(
-            "the noise is not stated and no holds show it: it was taken from second differences "
-            "in time; state noise_mm in the sidecar for a better floor"
-        )
-    blocks, motions = len(problem.motion), int(problem.motion.max()) + 1
-    if 2 * motions <= blocks:
-        answer.append(
-            f"the recordings repeat themselves: their {blocks} blocks of time show {motions} "
-            "different motions, and each counts once; record other paths and speeds"
-        )
-    missing = float(np.isnan(problem.measured).mean())
-    if missing > 0.2:
-        answer.append(f"{100 * missing:.0f} % of the key points are missing")
-    return answer

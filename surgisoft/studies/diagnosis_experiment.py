@@ -48,7 +48,8 @@ def settle(
     """Record the recommended experiment on the same robot, and diagnose again."""
     advice = recommend(pose(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
     new = record_experiment(case, SETTINGS[advice.setting], advice.protocol)
-    said = diagnose(model, [new] if advice.by_hand else [recording, new], reference=known)
+    some = [new] if advice.by_hand else [recording, new]
+    said = diagnose(model, some, reference=known, without=advice.removes)
     left = effect_left(advice, said)
     named = [row.effect for row in said.ranking]
     return Settled(

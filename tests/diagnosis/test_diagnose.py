@@ -1,6 +1,7 @@
 """The answer on robots whose truth is known and has other forms than the model's effects."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,3 +139,54 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
     first = [s for s in found.first if s.effect != "misalignment"]
     both = module.replace(found, first=first, named=[*found.named, second])
     assert [row.effect for row in module.answer(both).ranking] == ["creep", "misalignment"]
+
+
+def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):
+    said = diagnose(default_arm(), [recorded([("misalignment", 1.0)])], without=["misalignment"])
+    assert "misalignment" not in [row.effect for row in said.ranking]
+    assert "misalignment" not in said.verdict.effects
+    save_recording(recorded(points=1000), tmp_path / "x.parquet")
+    files = ["default", str(tmp_path / "x.parquet")]
+    assert run(["diagnose", *files, "--without", "friction", "contact"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "friction" in error
+    assert "hysteresis" in error
+
+
+def test_what_is_weak_about_the_data_is_told(found):
+    """Loads that the fit never saw, and an arm that shakes while it is held."""
+    from surgisoft.diagnosis.problem import pose, with_reference
+    from surgisoft.diagnosis.weaknesses import weaknesses
+
+    model, recording = default_arm(), recorded()
+    problem = with_reference(pose(model, [recording]), load_known_error("default"))
+    assert weaknesses(problem) == []
+    away = replace(problem, pressure=np.full_like(problem.pressure, 3.0))
+    assert "far from those" in weaknesses(away)[0]
+    shaken = replace(problem, noise_mm=problem.noise_mm + 9.0, floor_source="holds")
+    assert "shakes the arm" in weaknesses(shaken)[0]
+
+
+def test_rivals_of_one_of_several_are_told():
+    """Beside b a third effect does as well as a does; beside a none does as well as b."""
+    from types import SimpleNamespace
+
+    from surgisoft.diagnosis.diagnose import _rivals
+    from surgisoft.diagnosis.race.ranking import Option, Standing
+
+    def standing(effect, number, gain):
+        log_gain = gain + 0.05 * np.random.default_rng(number).normal(size=40)
+        return Standing(effect, Option(effect, (number,), 0), log_gain, log_gain, 0.001, gain)
+
+    a, b, c, d = (
+        standing(n, k, g)
+        for k, (n, g) in enumerate(zip("abcd", (0.6, 0.5, 0.595, 0.3), strict=True))
+    )
+    beside = {(1,): [a, c, d], (0,): [b, d]}
+    race = SimpleNamespace(
+        standings=lambda base, without: beside[base],
+        problem=SimpleNamespace(by_motion=lambda values: values),
+    )
+    assert _rivals(race, [], [a, b]) == ["c"]
+    assert _rivals(race, [a, c, d], [a]) == ["c"]
+    assert _rivals(race, [], []) == []

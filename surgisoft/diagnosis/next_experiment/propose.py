@@ -82,7 +82,12 @@ class Recommendation:
     @property
     def by_hand(self) -> bool:
         """Whether it takes a change of the bench that the virtual rig has no option for."""
-        return bool(SETTINGS[self.setting].removes)
+        return bool(self.removes)
+
+    @property
+    def removes(self) -> tuple[str, ...]:
+        """Effects that cannot be there any more once the bench is changed."""
+        return SETTINGS[self.setting].removes
 
     @property
     def experiment(self) -> Experiment:

@@ -29,6 +29,9 @@ AROUND = 16
 """Directions of the support that a diagnosis tries."""
 DEPTHS = (0.5, 0.7, 0.86, 0.96)
 """Quantiles of the body's excursion at which it puts the support."""
+LEAST_SHARE = 0.08
+"""Least share of a support that is there. One that yields more is met all the time and looks like
+a weight, or like a stiffer wall."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
 support, and to push it back would take no bounded bending."""
@@ -118,9 +121,10 @@ class Contact(Memoryless):
         length = self.length_mm
         offset = length * float(self.offset.detach())
         reach = "within the arm's reach"
-        share = "1: rigid (Wriggers 2006); next to nothing: no support"
+        share = "1: rigid (Wriggers 2006); less than the least one: no support"
+        least = LEAST_SHARE if float(self.share.detach()) else 0.0
         return [
-            Quantity("share", value_of(self.share), "", 0.08, 1.1, share),
+            Quantity("share", value_of(self.share), "", least, 1.1, share),
             Quantity("azimuth_rad", value_of(self.azimuth), "rad", -10.0, 10.0, "any direction"),
             Quantity("rise_rad", value_of(self.rise), "rad", -1.6, 1.6, "any direction"),
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),

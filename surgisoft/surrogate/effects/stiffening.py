@@ -8,8 +8,8 @@ arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
     B^2 = sum_i (x_i - mean x)^2 m / (m - 1),
 
 with B = 1 where one chamber alone is fully loaded; of four chambers, which stand in a ring, opposed
-ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A has ones on its diagonal and the share of the
-other chambers beside them: a chamber that bends the arm shortens the wall on the other side.
+ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A has ones on its diagonal and the share
+of the other chambers beside them: a chamber that bends the arm shortens the wall on the other side.
 """
 
 import torch

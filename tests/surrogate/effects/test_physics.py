@@ -1,6 +1,7 @@
 """Each effect against a closed form that it was not written with."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,6 +143,33 @@ def test_stiffening_takes_its_share_at_full_load_and_starts_as_a_cubic():
     assert float(answer[1]) == pytest.approx(0.5 * (1 - 0.3 * 0.25), abs=1e-3)
     alike = run(with_strength(make_effect("stiffening", RANGE), bend=0.1), torch.ones(1, 3))
     assert torch.allclose(alike, torch.ones(1, 3))
+
+
+def test_opposed_chambers_of_four_bend_nothing_and_neighbours_add_up():
+    """Losses of a nearly cubic spring: 0.1 x B^2 with B^2 = 0, and 1.25 for loads of 1 and 0.5."""
+    four = ArmFacts(torch.zeros(4), torch.full((4,), 50.0), torch.zeros(4), torch.zeros(1, 3))
+    stiff = with_strength(make_effect("stiffening", four, steepness=0.001), bend=0.1)
+    x = torch.tensor([[[50.0, 0.0, 50.0, 0.0], [50.0, 25.0, 0.0, 0.0]]])
+    answer = stiff.apply(x, stiff.scan(stiff.rest(x[:, 0]), x, Context(torch.zeros(1, 2))))[0] / 50
+    assert answer[0].tolist() == pytest.approx([1.0, 0.0, 1.0, 0.0])
+    assert answer[1].tolist() == pytest.approx([1 - 0.125, 0.5 - 0.0625, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_dead_zone_of_one_chamber_leaves_the_others():
+    zone = make_effect("dead_zone", RANGE, width=0.02, each=True)
+    answer = run(with_strength(zone, threshold=[0.0, 0.1, 0.0]), [[0.5, 0.5, 0.5]])[0].tolist()
+    assert answer == pytest.approx([0.5, 0.4, 0.5], abs=1e-3)
+
+
+def test_a_room_that_is_as_warm_as_in_the_fit_changes_nothing():
+    warm = with_strength(
+        make_effect("drift", replace(RANGE, temperature_C=25.0), kind="temperature"), gain=0.1
+    )
+    assert warm.reference_C == 25.0
+    x, room = torch.full((1, 2, 3), 25.0), torch.tensor([[25.0, 35.0]])
+    seen = Context(torch.ones(1, 2), None, room)
+    answer = warm.apply(x, warm.scan(warm.rest(x[:, 0]), x, seen))[0, :, 0]
+    assert answer.tolist() == pytest.approx([25.0, 27.5])
 
 
 def test_dead_zone_is_flat_at_rest_and_short_by_the_threshold_beyond():

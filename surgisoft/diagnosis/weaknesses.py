@@ -5,9 +5,10 @@ from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.problem import Problem
 
-FAR_FROM_FIT, FAR_ROWS = 2.0, 0.1
+FAR_FROM_FIT, LEAST_FAR, FAR_ROWS = 2.0, 0.2, 0.1
 """Factor on the distance that nearly all actuations of the fit keep from their nearest, from which
-another is far from them, and the share of such rows that is told."""
+another is far from them, the least such distance in half ranges, and the share of such rows that is
+told."""
 
 
 def _far_from_fit(problem: Problem) -> float:
@@ -18,7 +19,7 @@ def _far_from_fit(problem: Problem) -> float:
     tree = cKDTree(known.pressure)
     own = tree.query(known.pressure, k=2, p=np.inf)[0][:, 1]
     apart = tree.query(problem.pressure, p=np.inf)[0]
-    return float(np.mean(apart > FAR_FROM_FIT * np.quantile(own, 0.97)))
+    return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, 0.97), LEAST_FAR)))
 
 
 def weaknesses(problem: Problem) -> list[str]:

@@ -75,6 +75,8 @@ CLOSE_GAIN = 0.6
 again: to first order and on a grid a large effect loses some of what it explains."""
 FAR = 2.0
 """Factor on the validated error that is left from which something is missing, whatever it is."""
+UNTENABLE = 0.25
+"""Confidence in the one effect that is named below which it is not."""
 NEAREST = 0.25
 """Most confidence in the effect that comes nearest to an unknown one."""
 LEAST_MOTIONS = 10
@@ -242,6 +244,8 @@ def answer(found: Findings) -> Diagnosis:
     numbers = statistics(found)
     kind, effects = _kind(found, numbers)
     sure = confidence(numbers)
+    if kind == "identified" and sure < UNTENABLE:
+        kind, effects = _unnamed(numbers), ()
     if kind == "unknown_effect":
         sure = min(sure, NEAREST)
     levels = ErrorLevels(before, floor, min(reached, found.box.rmse_mm, before))
@@ -291,21 +295,24 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
         return ("several" if len(names) > 1 else "identified"), names
+    return _unnamed(numbers), ()
+
+
+def _unnamed(numbers: dict) -> Kind:
+    """The kind of an answer that names no effect."""
     if numbers["before_over_floor"] >= TRAINED:
+        beyond = numbers["left_size"] >= LEAST_LEFT
         box = numbers["box_share"] >= UNKNOWN_SHARE and _sure_of_box(numbers)
         far = numbers["left_size"] >= FAR
         if beyond and (box or far or numbers["static_size"] >= OFF_SIZE):
-            return "unknown_effect", ()
+            return "unknown_effect"
         if numbers["static_share"] >= 0.5:
-            return "surrogate_undertrained", ()
-    return "nothing_missing", ()
+            return "surrogate_undertrained"
+    return "nothing_missing"
 
 
 def _imitated(found: Findings, numbers: dict) -> bool:
-    """Whether the named effects only stand for something else.
-
-    They explain too little and leave much, or a black box explains more, or other forms of them do.
-    """
+    """Whether the named effects explain too little, or a black box or looser forms far more."""
     explained = numbers["explained_above_floor"]
     further = found.next[0].gain if found.next else 0.0
     together = explained + max(further, 0.0) * (1.0 - explained)

@@ -84,3 +84,26 @@ def test_what_is_fitted_is_plausible_small_and_new(lagging):
     twice = next(c for c in fitted if c.name == "line_lag")
     half = twice.with_amplitudes(np.array([0.5]))
     assert half.share.item() == pytest.approx(0.5 * twice.effect.share.item())
+
+
+def ramps_from_rest(rows: int) -> np.ndarray:
+    """(rows, 3) some of the chambers up to a load and back to rest, again and again, in 0 to 1."""
+    rng, answer = np.random.default_rng(0), []
+    while len(answer) < rows:
+        top = rng.uniform(0.3, 0.9) * (rng.random(3) < 0.6)
+        way = np.concatenate([np.linspace(0, 1, 60), np.linspace(1, 0, 60)])
+        answer += list(way[:, None] * top)
+    return np.array(answer[:rows])
+
+
+def test_loops_do_not_stand_for_what_the_actuation_explains():
+    """A gain, on ramps that all begin at rest: loops explain it, and are refused; a backlash not."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + ramps_from_rest(3600) * (high - low)
+    behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
+    for pressure, allowed in ((0.94 * commands, False), (behind, True)):
+        problem = pose(default_arm(), [made(commands, pressure)])
+        race = Race.of(problem, candidates(problem, ["hysteresis"]))
+        best = min(race.options["hysteresis"], key=lambda way: race.losses(way.picked).sum())
+        assert race.losses(best.picked).sum() < 0.2 * race.losses().sum()
+        assert race.plausible(best) == allowed

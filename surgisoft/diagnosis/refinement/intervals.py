@@ -63,7 +63,7 @@ def values_text(value: float | list) -> str:
     """A value or nested values in short."""
     flat = np.asarray(value, float).ravel()
     if flat.size > MOST_VALUES:
-        return f"{flat.size} values from {flat.min():.3g} to {flat.max():.3g}"
+        return f"{flat.size} values, least {flat.min():.3g}, largest {flat.max():.3g}"
     text = ", ".join(f"{number:.4g}" for number in flat)
     return text if flat.size == 1 else f"[{text}]"
 

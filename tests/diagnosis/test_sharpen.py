@@ -97,7 +97,7 @@ def ramps_from_rest(rows: int) -> np.ndarray:
 
 
 def test_loops_do_not_stand_for_what_the_actuation_explains():
-    """A gain, on ramps that all begin at rest: loops explain it, and are refused; a backlash not."""
+    """A gain, on ramps that begin at rest: loops explain it, and are refused; a backlash not."""
     low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
     commands = low + ramps_from_rest(3600) * (high - low)
     behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)

@@ -20,6 +20,8 @@ BESIDE = (0.3, 0.15, 0.75)
 alone beside what the first one does alone, for it must not be that one's shadow."""
 NEARLY_ALL = 0.8
 """Or: share of what the effects before it left that no shadow explains."""
+SMALL = 0.6
+"""The same where the whole error is within the surrogate's validated one."""
 LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""
 MOST_EFFECTS = 3
@@ -79,11 +81,13 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     if not named:
         if race.in_fit(s.effect):
             return False
-        if s.p_value <= CHANCE and share >= LEAST_GAIN and log_gain >= LEAST_LOG_GAIN:
+        size = race.size(race.losses())
+        enough = LEAST_GAIN if size >= 1.0 else SMALL
+        if s.p_value <= CHANCE and share >= enough and log_gain >= LEAST_LOG_GAIN:
             return True
         chance, large, least = LARGE
         factor, most = FAR
-        far = race.size(race.losses()) >= factor and share >= most
+        far = size >= factor and share >= most
         return bool((far or s.p_value <= chance) and share >= large and log_gain >= least)
     if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
         return False

@@ -5,7 +5,8 @@ like a Kelvin-Voigt element under a constant load (Findley 1976, ch. 5),
 
     g(t) = (1 - exp(-t / tau)) / (1 - exp(-600 s / tau)),      q = R(g turn) p + g shift,
 
-so that `turn` and `shift` are those after ten minutes, and a tau of hours is a steady drift.
+or, where many such elements yield one after the other, with (t / tau)^power for t / tau (Kohlrausch
+1854), so that `turn` and `shift` are those after ten minutes, and a tau of hours is a steady drift.
 
 `actuation`: sensors and regulators of the chambers, or their walls, change in the same way,
 
@@ -44,7 +45,9 @@ TEN_KELVIN = 10.0
 GRID = (200.0, 1000.0, 20000.0)
 """Times tau of the base that a diagnosis tries, s."""
 FEW = (1000.0, 20000.0)
-"""The same of the actuation."""
+"""The same of the actuation, and of a base that yields with a power of the time."""
+POWER = 0.5
+"""That power."""
 
 
 class Drift(Effect):
@@ -59,9 +62,10 @@ class Drift(Effect):
         kind: str = "base",
         tau_s: float = 1000.0,
         reference_C: float | None = None,
+        power: float | None = None,
     ):
         """kind: one of KINDS; tau of base and actuation, s; T_0, degrees Celsius (default: that of
-        the room in which the arm was measured)."""
+        the room in which the arm was measured); power of the time, 1 where None."""
         super().__init__(facts)
         if kind not in KINDS:
             raise unknown_name("kind of drift", kind, KINDS)
@@ -78,6 +82,7 @@ class Drift(Effect):
             self.offset = amplitude(chambers)
         if kind != "temperature":
             self.log_tau = logarithm(tau_s)
+            self.log_power = None if power is None else logarithm(power)
 
     def strengths(self) -> dict[str, nn.Parameter]:
         if self.kind == "base":
@@ -87,7 +92,8 @@ class Drift(Effect):
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
         timed = [("base", tau) for tau in GRID] + [("actuation", tau) for tau in FEW]
-        return [*(cls(facts, *each) for each in timed), cls(facts, "temperature")]
+        slow = [cls(facts, "base", tau, power=POWER) for tau in FEW]
+        return [*(cls(facts, *each) for each in timed), *slow, cls(facts, "temperature")]
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, 1) elapsed time, s, or warming over T_0, K: none."""
@@ -118,7 +124,11 @@ class Drift(Effect):
     def grown(self, elapsed_s: Tensor) -> Tensor:
         """Share of the drift after ten minutes that has come about after a time, s."""
         tau = self.log_tau.exp()
-        return torch.expm1(-elapsed_s / tau) / torch.expm1(-TEN_MINUTES / tau)
+        if self.log_power is None:
+            return torch.expm1(-elapsed_s / tau) / torch.expm1(-TEN_MINUTES / tau)
+        power = self.log_power.exp()
+        grown = torch.expm1(-((elapsed_s / tau).clamp(min=1e-9) ** power))
+        return grown.where(elapsed_s > 0, 0 * grown) / torch.expm1(-((TEN_MINUTES / tau) ** power))
 
     def _share(self, memory: Tensor) -> Tensor:
         """(..., 1) share of the change of the actuation after ten minutes, or in 10 K."""
@@ -149,16 +159,21 @@ class Drift(Effect):
             return torch.cat([torch.diag_embed(gain).movedim(-1, 0), offsets])
 
     def config(self) -> dict:
-        return {"kind": self.kind, "reference_C": self.reference_C}
+        power = None
+        if self.kind != "temperature" and self.log_power is not None:
+            power = float(self.log_power.detach().exp())
+        return {"kind": self.kind, "reference_C": self.reference_C, "power": power}
 
     def quantities(self) -> list[Quantity]:
         if self.kind == "base":
             held = "a holder that yields a little, not one that has come loose"
             tau = value_of(self.log_tau.exp())
+            power = 1.0 if self.log_power is None else value_of(self.log_power.exp())
             return [
                 Quantity("turn_in_10_min_rad", value_of(self.turn), "rad", -0.2, 0.2, held),
                 Quantity("shift_in_10_min_mm", value_of(self.shift), "mm", -10.0, 10.0, held),
                 Quantity("tau_s", tau, "s", 120.0, 1e6, "quicker is a misalignment"),
+                Quantity("power", power, "", 0.3, 1.2, "Findley 1976, ch. 5: creep of plastics"),
             ]
         if self.kind == "actuation":
             part = "a regulator or wall that changes a little, not one that fails"

@@ -184,7 +184,7 @@ def draw(outcomes: list[Outcome], folder: Path) -> Path:
             axis.annotate(f" {rows.sum()}", (sure[rows].mean(), share), fontsize=8)
     axis.set_xlabel("confidence of the first effect named")
     axis.set_ylabel("share that is right (95 % interval)")
-    axis.set_ylim(0, 1.02)
+    axis.set_ylim(-0.04, 1.08)
     axis.legend(frameon=False)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "diagnosis_reliability.png"

@@ -36,6 +36,9 @@ class Table:
     def in_fit(self, effect):
         return False
 
+    def size(self, losses):
+        return 3.0
+
     def standings(self, base=(), without=()):
         answer = []
         for place, name in enumerate(NAMES):
@@ -76,6 +79,14 @@ def test_an_effect_of_the_fit_is_not_named_for_what_the_fit_left(table, monkeypa
     assert "blend" not in [s.effect for s in named]
     monkeypatch.setattr(table, "in_fit", lambda effect: True)
     assert naming.name_effects(table, table.standings())[0] == []
+
+
+def test_an_error_within_the_validated_one_needs_more_to_be_named(table, monkeypatch):
+    """Two fifths of the error are enough where it is large, not where the surrogate's is larger."""
+    part = replace(table.standings()[0], losses=table.losses() * 0.6 + 0.4 / 40)
+    assert naming.passes(table, [part], [], part)
+    monkeypatch.setattr(table, "size", lambda losses: 0.7)
+    assert not naming.passes(table, [part], [], part)
 
 
 def test_what_a_form_leaves_behind_is_no_further_effect(table, monkeypatch):

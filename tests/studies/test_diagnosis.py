@@ -145,9 +145,9 @@ def test_an_ambiguous_robot_gets_its_experiment_and_the_outcome_is_kept(
     case = replace(CLEAN, hidden=(("creep", 1.0),), excitation="poor")
     asked = []
 
-    def unsure(model, recordings, reference):
+    def unsure(model, recordings, reference, without=()):
         asked.append(len(recordings))
-        found = diagnose(model, recordings, reference=reference)
+        found = diagnose(model, recordings, reference=reference, without=without)
         if len(recordings) > 1:
             return found
         return replace(found, verdict=Verdict("ambiguous", ("drift", "creep"), ""))

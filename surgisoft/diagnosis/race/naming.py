@@ -20,7 +20,7 @@ BESIDE = (0.3, 0.15, 0.75)
 alone beside what the first one does alone, for it must not be that one's shadow."""
 NEARLY_ALL = 0.8
 """Or: share of what the effects before it left that no shadow explains."""
-SMALL = 0.6
+SMALL = 0.5
 """The same where the whole error is within the surrogate's validated one."""
 LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""

@@ -1,5 +1,7 @@
 """A sweep that is played again is no further evidence."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ import torch
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.motions import motions
 from surgisoft.diagnosis.problem import folds, pose
+from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.surrogate.history import pack
 from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
 
@@ -58,6 +61,16 @@ def test_copies_are_left_out_of_a_fit_together():
     assert part[:4].tolist() == part[4:].tolist()
     assert len(set(part)) >= 2
     assert len(set(folds(np.zeros(12, int)))) >= 2
+
+
+def test_six_motions_are_six_witnesses_however_often_they_come():
+    """Gains of one sign in six motions: one in 2^6 by chance, not one in 2^96 for their copies."""
+    rows = sweep(1.0, 16)
+    problem = pose(still_model(), [recording(0 * rows[:, 0], rows)], part="open")
+    six = replace(problem, motion=np.tile(np.arange(6), 16))
+    gains = np.tile([0.5, 0.4, 0.6, 0.3, 0.5, 0.4], 16)[None]
+    assert family_p_values(gains)[0] < 0.001
+    assert family_p_values(six.by_motion(gains))[0] == pytest.approx(2.0**-6, abs=0.006)
 
 
 def bumpy(rows: np.ndarray) -> np.ndarray:

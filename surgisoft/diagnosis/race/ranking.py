@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -93,7 +94,7 @@ class Race:
     cache: dict = field(default_factory=dict)
     """Losses by columns."""
     fitted: dict = field(default_factory=dict)
-    """Effects at their strengths by shape and base, and a basis of cubics of the actuation."""
+    """Effects at their strengths by shape and base."""
 
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "Race":
@@ -190,14 +191,15 @@ class Race:
         amplitudes = self.validation.amplitudes(base + way.picked)[len(base) :]
         part = (self.columns[..., list(way.picked)] @ amplitudes).reshape(len(self.columns), -1)
         part = part - part.mean(axis=0)
-        if "static" not in self.fitted:
-            x = self.problem.pressure
-            pairs = (x[:, :, None] * x[:, None, :])[:, *np.triu_indices(x.shape[1])]
-            self.fitted["static"] = np.linalg.qr(np.hstack([np.ones((len(x), 1)), x, pairs, x**3]))[
-                0
-            ]
-        known = self.fitted["static"].T @ part
+        known = self._cubics.T @ part
         return float(np.square(known).sum() / max(np.square(part).sum(), 1e-30))
+
+    @cached_property
+    def _cubics(self) -> np.ndarray:
+        """(S, F) orthonormal basis of the cubics of the actuation."""
+        x = self.problem.pressure
+        pairs = (x[:, :, None] * x[:, None, :])[:, *np.triu_indices(x.shape[1])]
+        return np.linalg.qr(np.hstack([np.ones((len(x), 1)), x, pairs, x**3]))[0]
 
     def freest(self, standing: Standing) -> tuple[int, ...]:
         """An effect's columns; beside a fitted one those of the grid that do best with it."""

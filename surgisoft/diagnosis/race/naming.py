@@ -81,13 +81,12 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     if not named:
         if race.in_fit(s.effect):
             return False
-        size = race.size(race.losses())
-        enough = LEAST_GAIN if size >= 1.0 else SMALL
+        enough = LEAST_GAIN if race.whole_size >= 1.0 else SMALL
         if s.p_value <= CHANCE and share >= enough and log_gain >= LEAST_LOG_GAIN:
             return True
         chance, large, least = LARGE
         factor, most = FAR
-        far = size >= factor and share >= most
+        far = race.size(race.losses()) >= factor and share >= most
         return bool((far or s.p_value <= chance) and share >= large and log_gain >= least)
     if s.p_value > CHANCE or log_gain < LEAST_LOG_GAIN:
         return False

@@ -168,7 +168,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     close = _close(first, named)
     if close:
         report(f"shapes of {' and '.join(standing.effect for standing in close)}")
-        race = Race.of(problem, [*some, *sharpened(problem, race, close)])
+        race = race.extended(sharpened(problem, race, close))
         first = race.standings()
         named, following = name_effects(race, first)
     base = picked_by(named)

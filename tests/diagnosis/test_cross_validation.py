@@ -85,3 +85,18 @@ def test_features_have_the_discrepancys_covariance():
     x, d = rng.uniform(-1, 1, (60, 3)), rng.choice([-1.0, 1.0], (60, 3))
     features = cross_validation.static_features(x, d, number=60)
     assert features @ features.T == pytest.approx(cross_validation.kernel(x, d, x, d), abs=1e-4)
+
+
+def test_further_columns_are_as_if_they_had_been_there(data):
+    features, residual, columns, *rest = data
+    size = np.array([0.3, 0.5]), np.array([0.1, 0.1])
+    whole = CrossValidation.of(*data, *size)
+    found = CrossValidation.of(features, residual, columns[..., :1], *rest, *size)
+    first = found.losses([0])
+    found = found.extended(columns[..., 1:])
+    assert found.columns == COLUMNS
+    assert found.losses([0]) == pytest.approx(first, abs=0)
+    np.testing.assert_allclose(found.grams, whole.grams, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.judged, whole.judged, rtol=1e-4, atol=1e-4)
+    assert found.losses([0, 1, 2]) == pytest.approx(whole.losses([2, 1, 0]), rel=1e-4)
+    assert found.amplitudes([2, 0]) == pytest.approx(whole.amplitudes([0, 2])[::-1], rel=1e-3)

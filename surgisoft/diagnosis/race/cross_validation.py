@@ -3,10 +3,11 @@
 The residual of a model is explained by a flexible function of actuation and direction (the
 surrogate's own error, free in every output) and by columns, each with one amplitude. Both are
 linear, so everything that a set of columns can do on held-out blocks follows from a few matrices
-that are computed once: trying a set costs a small linear solve.
+that are computed once: trying a set costs a small linear solve. Of rows and columns that are left
+out of a fold's fit, products are taken once and subtracted from those of all.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import linalg
@@ -37,27 +38,117 @@ def static_features(x, d, number: int = INDUCING, seed: int = 0) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Fold:
-    """One split into rows to fit and blocks to judge."""
+class Basis:
+    """The static part's fit to the rows of a fold, of key points that were measured together."""
 
-    gram: np.ndarray
-    """(1 + K, 1 + K) products of residual and columns over the fitted rows, static part out."""
-    judged: np.ndarray
-    """(b, 1 + K, 1 + K) the same of what the static part leaves on each judged block."""
-    blocks: np.ndarray
-    """(b,) which blocks those are."""
+    points: np.ndarray
+    """(p,) which key points."""
+    values: np.ndarray
+    """(F,) eigenvalues of the features' products over the fitted rows."""
+    vectors: np.ndarray
+    """(F, F) their eigenvectors, in columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Rows that are fitted and judged in turn, and what no column changes about it."""
+
+    features: np.ndarray
+    """(S, F) features of the static part."""
+    residual: np.ndarray
+    """(S, n, 3) what is to be explained, mm; 0 where missing."""
+    seen: np.ndarray
+    """(S, n) which key points were measured."""
+    block: np.ndarray
+    """(S,) block of each row; rows that are never judged come last."""
+    fold: np.ndarray
+    """(B,) fold of each judged block, from 0."""
+    held: list[np.ndarray]
+    """The rows that each fold judges."""
+    ridges: np.ndarray
+    """(L, n) ridge on the static part of each key point, for each of PERSISTENCE."""
+    bases: list[list[Basis]]
+    """The static fits of each fold."""
+
+    @classmethod
+    def of(cls, features, residual, block, fold, surrogate_mm, noise_mm) -> "Split":
+        """As `CrossValidation.of`."""
+        seen = np.isfinite(residual).all(2)
+        residual = np.where(seen[..., None], residual, 0.0).astype(np.float32)
+        features = features.astype(np.float32)
+        mean = np.square(residual, dtype=float).sum((0, 2)) / np.maximum(seen.sum(0), 1)
+        prior = np.maximum(surrogate_mm, 0.1 * noise_mm) ** 2 * ROOM**2
+        ridges = np.array([(noise_mm**2 + rows * mean) / prior for rows in PERSISTENCE])
+        judged = np.unique(fold[fold != FITTED], return_inverse=True)[1]
+        owner = np.append(judged, FITTED)[np.minimum(block, len(judged))]
+        held = [np.flatnonzero(owner == number) for number in range(judged.max() + 1)]
+        groups, which = np.unique(seen, axis=1, return_inverse=True)
+        alike = [np.flatnonzero(which.reshape(-1) == g) for g in range(groups.shape[1])]
+        bases: list[list[Basis]] = []
+        for number in range(len(held)):
+            some = [features[(owner != number) & seen[:, points[0]]] for points in alike]
+            found = [linalg.eigh(rows.T @ rows, check_finite=False) for rows in some]
+            bases.append([Basis(p, *pair) for p, pair in zip(alike, found, strict=True)])
+        return cls(features, residual, seen, block, judged, held, ridges, bases)
+
+    @property
+    def rows(self) -> int:
+        """Rows that are judged."""
+        return int(np.searchsorted(self.block, len(self.fold)))
+
+    def turned(self, field: np.ndarray, known: np.ndarray | None = None) -> list[np.ndarray]:
+        """For each fold (F, n, 3, C) products of the static part's basis and a field (rows, n, 3,
+        C), over the fitted rows; known: (S - rows, n, 3) its first column on the other ones."""
+        flat = field.reshape(self.rows, -1)
+        parts = [self.features[rows].T @ flat[rows] for rows in self.held]
+        parts = [part.reshape(-1, *field.shape[1:]) for part in parts]
+        whole = np.sum(parts, axis=0)
+        if known is not None:
+            whole[..., 0] += np.tensordot(self.features[self.rows :], known, (0, 0))
+        answer = []
+        for part, bases in zip(parts, self.bases, strict=True):
+            left = whole - part
+            for basis in bases:
+                some = left[:, basis.points]
+                turned = basis.vectors.T @ some.reshape(len(some), -1)
+                left[:, basis.points] = turned.reshape(some.shape)
+            answer.append(left)
+        return answer
+
+    def shrunk(self, turned: np.ndarray, number: int, level: int) -> np.ndarray:
+        """The same of a fold over the ridge of a level: the static part's coefficients."""
+        answer = np.empty_like(turned)
+        for basis in self.bases[number]:
+            ridge = self.ridges[level, basis.points]
+            weight = np.maximum(basis.values, 0.0)[:, None] + ridge
+            answer[:, basis.points] = turned[:, basis.points] / weight[..., None, None]
+        return answer
+
+    def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
+        """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it judges."""
+        rows = self.held[number]
+        answer = field[rows].copy()
+        for basis in self.bases[number]:
+            own = self.features[rows] @ basis.vectors
+            part = own @ shrunk[:, basis.points].reshape(len(shrunk), -1)
+            answer[:, basis.points] -= part.reshape(len(rows), len(basis.points), *field.shape[2:])
+        answer[~self.seen[rows]] = 0.0
+        return answer
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
     """Held-out errors of sets of columns."""
 
-    levels: list[list[Fold]]
-    """The folds for each of PERSISTENCE."""
-    counts: np.ndarray
-    """(B,) measured key points in each block."""
-    columns: int
-    """K."""
+    split: Split
+    field: np.ndarray
+    """(rows, n, 3, 1 + K) residual and columns, mm; 0 where missing."""
+    grams: np.ndarray
+    """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
+    judged: np.ndarray
+    """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each judged block."""
+    cache: dict = field(default_factory=dict)
+    """Held-out sums of squares and amplitudes by columns."""
 
     @classmethod
     def of(
@@ -70,94 +161,132 @@ class CrossValidation:
         surrogate_mm: np.ndarray,
         noise_mm: np.ndarray,
     ) -> "CrossValidation":
-        """features (S, F), residual (S, n, 3) and columns (S, n, 3, K) in mm, NaN where missing.
+        """features (S, F), residual (S, n, 3) in mm, NaN where missing, and columns (rows, n, 3, K)
+        of the rows that are judged.
 
         block: (S,) block of each row; fold: (B,) fold of each block, blocks of the fold FITTED
-        last; surrogate_mm and noise_mm: (n,) RMS errors of each key point's distance.
+        last, on which no column does anything; surrogate_mm and noise_mm: (n,) RMS errors of each
+        key point's distance.
         """
-        seen = np.isfinite(residual).all(2)
-        field = np.concatenate([residual[..., None], columns], axis=3).astype(np.float32)
-        square = np.where(seen, np.square(residual).sum(2), 0.0)
-        mean = square.sum(0) / np.maximum(seen.sum(0), 1)
-        prior = np.maximum(surrogate_mm, 0.1 * noise_mm) ** 2 * ROOM**2
-        ridges = [(noise_mm**2 + rows * mean) / prior for rows in PERSISTENCE]
-        levels: list[list[Fold]] = [[] for _ in ridges]
-        judged = int((fold != FITTED).sum())
-        for number in np.unique(fold[:judged]):
-            where = np.flatnonzero(fold == number)
-            parts = _split(features.astype(np.float32), field, seen, fold[block] == number, block)
-            for level, ridge in zip(levels, ridges, strict=True):
-                level.append(_fold(parts, ridge, where, field.shape[3]))
-        counts = np.bincount(block, weights=seen.sum(1), minlength=len(fold))[:judged]
-        return cls(levels, counts, field.shape[3] - 1)
+        split = Split.of(features, residual, block, fold, surrogate_mm, noise_mm)
+        return cls.on(split, columns)
 
-    def losses(self, picked: list[int] | np.ndarray = ()) -> np.ndarray:
+    @classmethod
+    def on(cls, split: Split, columns: np.ndarray) -> "CrossValidation":
+        """The same with columns (rows, n, 3, K) on a split."""
+        first = split.residual[: split.rows, ..., None]
+        both = np.concatenate([first, _masked(split, columns)], axis=3)
+        known = split.residual[split.rows :]
+        turned = split.turned(both, known)
+        grams, judged = _products(split, both, turned, both, turned)
+        grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
+        return cls(split, both, grams, judged)
+
+    def of_other(self, columns: np.ndarray) -> "CrossValidation":
+        """The same with other columns (rows, n, 3, K)."""
+        return CrossValidation.on(self.split, columns)
+
+    def extended(self, columns: np.ndarray) -> "CrossValidation":
+        """The same with further columns (rows, n, 3, K') behind those that it has."""
+        more = _masked(self.split, columns)
+        both = np.concatenate([self.field, more], axis=3)
+        turned = self.split.turned(more)
+        known = self.split.residual[self.split.rows :]
+        old = self.split.turned(self.field, known)
+        whole = [np.concatenate(pair, axis=3) for pair in zip(old, turned, strict=True)]
+        beside = _products(self.split, both, whole, more, turned)
+        grams, judged = (
+            _bordered(*pair) for pair in zip((self.grams, self.judged), beside, strict=True)
+        )
+        return CrossValidation(self.split, both, grams, judged, dict(self.cache))
+
+    @property
+    def columns(self) -> int:
+        """Number of columns, K."""
+        return self.field.shape[3] - 1
+
+    @property
+    def counts(self) -> np.ndarray:
+        """(B,) measured key points in each block."""
+        rows = self.split.rows
+        weights = self.split.seen[:rows].sum(1)
+        return np.bincount(self.split.block[:rows], weights, minlength=len(self.split.fold))
+
+    def losses(self, picked: list[int] | tuple[int, ...] | np.ndarray = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances of each block, mm^2, with the picked columns."""
-        index = np.asarray(picked, int) + 1
-        ridges = RIDGES if len(index) > 1 else RIDGES[:1]
-        tried = np.concatenate([self._losses(folds, index, ridges) for folds in self.levels])
+        columns = np.unique(np.asarray(picked, int))
+        tried, _ = self._solved(columns)
+        ridges = len(RIDGES) if len(columns) > 1 else 1
+        tried = tried[:, :ridges].reshape(-1, tried.shape[2])
         return tried[tried.sum(axis=1).argmin()]
 
-    def _losses(self, folds: list[Fold], index: np.ndarray, ridges: tuple[float, ...]):
-        """(r, B) held-out sums of squares with each of r ridges."""
-        answer = np.zeros((len(ridges), len(self.counts)))
-        rows = np.concatenate([[0], index])
-        for fold in folds:
-            part = fold.judged[:, rows[:, None], rows[None]]
-            for number, ridge in enumerate(ridges):
-                mix = np.concatenate([[1.0], -_amplitudes(fold.gram, index, ridge)])
-                answer[number, fold.blocks] = part @ mix @ mix
-        return answer
-
-    def amplitudes(self, picked: list[int] | np.ndarray) -> np.ndarray:
+    def amplitudes(self, picked: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
         """(k,) amplitudes of the picked columns, mean over the folds."""
-        index = np.asarray(picked, int) + 1
-        tried = np.array([self._losses(f, index, RIDGES).sum(axis=1) for f in self.levels])
-        level, ridge = np.unravel_index(tried.argmin(), tried.shape)
-        some = [_amplitudes(fold.gram, index, RIDGES[ridge]) for fold in self.levels[level]]
-        return np.mean(some, axis=0)
+        columns, where = np.unique(np.asarray(picked, int), return_inverse=True)
+        tried, amplitudes = self._solved(columns)
+        sums = tried.sum(axis=2)
+        level, ridge = np.unravel_index(sums.argmin(), sums.shape)
+        return amplitudes[level, ridge].mean(axis=0)[where]
+
+    def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """((L, r, B) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge."""
+        key = columns.tobytes()
+        if key not in self.cache:
+            rows = np.concatenate([[0], columns + 1])
+            amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
+            mix = np.insert(-amplitudes, 0, 1.0, axis=-1)[:, :, self.split.fold]
+            part = self.judged[:, :, rows[:, None], rows].astype(float)
+            losses = (mix * (part[:, None] @ mix[..., None])[..., 0]).sum(axis=-1)
+            self.cache[key] = losses, amplitudes
+        return self.cache[key]
 
 
-def _split(features, field, seen, held, block) -> list[tuple]:
-    """What the static fit of each key point needs, for any ridge."""
-    answer, known = [], {}
-    for k in range(field.shape[1]):
-        fit, test = ~held & seen[:, k], held & seen[:, k]
-        if not fit.any():
-            continue
-        key = fit.tobytes()
-        if key not in known:
-            known[key] = linalg.eigh(features[fit].T @ features[fit], check_finite=False)
-        values, vectors = known[key]
-        flat = field[fit, k].reshape(int(fit.sum()), -1)
-        turned = vectors.T @ (features[fit].T @ flat)
-        own = flat.reshape(-1, field.shape[3])
-        gram = (own.T @ own).astype(np.float64)
-        tested = field[test, k].reshape(int(test.sum()), 3 * field.shape[3])
-        answer.append((k, values, turned, gram, features[test] @ vectors, tested, block[test]))
-    return answer
+def _masked(split: Split, columns: np.ndarray) -> np.ndarray:
+    """Columns (rows, n, 3, K) in single precision, 0 where nothing was measured."""
+    return np.where(split.seen[: split.rows, :, None, None], columns, 0.0).astype(np.float32)
 
 
-def _fold(parts: list[tuple], ridge: np.ndarray, where: np.ndarray, count: int) -> Fold:
-    """One fold with a ridge (n,) on the static part of each key point."""
-    gram, judged = np.zeros((count, count)), np.zeros((len(where), count, count))
-    for k, values, turned, own, outside, tested, block in parts:
-        shrunk = (turned / (np.maximum(values, 0.0) + ridge[k])[:, None]).astype(np.float32)
-        left = turned.reshape(-1, count).T @ shrunk.reshape(-1, count)
-        gram += own - left
-        away = (tested - outside @ shrunk).reshape(len(tested), 3, count)
-        for i, b in enumerate(where):
-            part = away[block == b].reshape(-1, count)
-            judged[i] += part.T @ part
-    return Fold(gram, judged, where)
+def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
+    """(grams, judged) of the columns of two fields (rows, n, 3, A or B), as in CrossValidation."""
+    levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
+    parts = np.array([_product(a[rows], b[rows]) for rows in split.held], float)
+    grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
+    judged = np.empty((levels, len(split.fold), *size), np.float32)
+    for number, rows in enumerate(split.held):
+        for level in range(levels):
+            mine = split.shrunk(turned_b[number], number, level)
+            grams[level, number] -= _product(turned_a[number], mine)
+            right = split.away(b, mine, number)
+            left = right
+            if a is not b:
+                left = split.away(a, split.shrunk(turned_a[number], number, level), number)
+            for one in np.unique(split.block[rows]):
+                own = split.block[rows] == one
+                judged[level, one] = _product(left[own], right[own])
+    return grams, judged
 
 
-def _amplitudes(gram: np.ndarray, index: np.ndarray, ridge: float) -> np.ndarray:
-    """(k,) least-squares amplitudes of the columns at an index."""
-    if not len(index):
-        return np.zeros(0)
-    normal = gram[index[:, None], index[None]]
-    normal = 0.5 * (normal + normal.T)
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-30)))
-    scaled = normal / size[:, None] / size[None] + ridge * np.eye(len(index))
-    return np.linalg.solve(scaled, gram[index, 0] / size) / size
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(A, B) products of the last axes of two fields of the same rows."""
+    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+
+
+def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """(..., C, C) symmetric matrices from (..., A, A) and their last columns (..., C, C - A)."""
+    first = inner.shape[-1]
+    below = np.swapaxes(border[..., :first, :], -1, -2)
+    return np.concatenate([np.concatenate([inner, below], axis=-2), border], axis=-1)
+
+
+def _amplitudes(gram: np.ndarray) -> np.ndarray:
+    """(L, r, folds, k) least-squares amplitudes with each of r RIDGES, from (L, folds, 1 + k, 1 + k)
+    products of the residual and the columns."""
+    normal, right = gram[..., 1:, 1:], gram[..., 1:, 0]
+    normal = 0.5 * (normal + np.swapaxes(normal, -1, -2))
+    power = np.diagonal(normal, axis1=-2, axis2=-1)
+    least = np.maximum(power.max(axis=-1, initial=0.0, keepdims=True), 1e-30)
+    size = np.sqrt(np.maximum(power, 1e-12 * least))
+    scaled = normal / size[..., :, None] / size[..., None, :]
+    ridge = np.array(RIDGES)[:, None, None, None] * np.eye(normal.shape[-1])
+    answer = np.linalg.solve(scaled[:, None] + ridge, (right / size)[:, None, ..., None])
+    return answer[..., 0] / size[:, None]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.diagnosis.race.gates import family_p_values
-from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by, validation_of
+from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 
 WRONG, ALL_WRONG = 0.015, 0.03
 """Least product of what goes when a form is let loose, as a share of the error above the floor, and
@@ -61,7 +61,7 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
     tried = []
     for named in ways:
         columns = _loose_columns(race, named)
-        tried.append(validation_of(race.problem, columns).losses(range(columns.shape[3])))
+        tried.append(race.validation.of_other(columns).losses(range(columns.shape[3])))
     best = min(tried, key=np.sum)
     beyond = [_beyond(race, picked_by(named), best, len(ways)) for named in ways]
     return min(beyond, key=lambda one: one.worth)
@@ -89,7 +89,7 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     picked = further.option.picked
     columns = [_loose_columns(race, named), race.columns[..., list(picked)]]
     together = np.concatenate(columns, axis=3)
-    validation, total = validation_of(race.problem, together), together.shape[3]
+    validation, total = race.validation.of_other(together), together.shape[3]
     before, after = (validation.losses(range(n)) for n in (total - len(picked), total))
     log_gain, chance = _fall(race, before, after)
     gain = float((before.sum() - after.sum()) / race.excess(before))

@@ -1,14 +1,19 @@
 """Which effects explain what is left, alone and beside others, on held-out blocks."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.cross_validation import FITTED, CrossValidation, static_features
+from surgisoft.diagnosis.race.cross_validation import (
+    FITTED,
+    CrossValidation,
+    Split,
+    static_features,
+)
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.surrogate.effects import Effect, Quantity
 
@@ -78,6 +83,14 @@ def _score(log_gain: np.ndarray, option: Option) -> float:
     return float(log_gain.mean()) * (1.0 - PRICE * min(len(option.picked), 100))
 
 
+def _ways(candidates: Sequence[Candidate], number: int = 0, first: int = 0) -> Iterator[Option]:
+    """One option for each candidate, these being numbered and having columns from those given."""
+    for candidate in candidates:
+        end = first + candidate.columns.shape[3]
+        yield Option(candidate.name, tuple(range(first, end)), number)
+        number, first = number + 1, end
+
+
 @dataclass(frozen=True, eq=False)
 class Race:
     """All candidates of a problem and their held-out errors."""
@@ -91,40 +104,47 @@ class Race:
     """(S, n, 3, K) all columns, mm."""
     floor: np.ndarray
     """(B,) sum of squared noise in each block, mm^2."""
-    cache: dict = field(default_factory=dict)
-    """Losses by columns."""
     fitted: dict = field(default_factory=dict)
     """Effects at their strengths by shape and base."""
 
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "Race":
         """Prepare the race; afterwards every set of effects is cheap to try."""
-        columns = [c.columns for c in candidates]
-        residual = problem.residual
-        columns = np.concatenate([np.zeros((*residual.shape, 0)), *columns], axis=3)
-        validation = validation_of(problem, columns)
+        columns = np.concatenate(
+            [np.zeros((*problem.residual.shape, 0)), *(c.columns for c in candidates)], axis=3
+        )
+        validation = CrossValidation.on(split_of(problem), columns)
         options: dict[str, list[Option]] = {}
-        first = 0
-        for number, candidate in enumerate(candidates):
-            count = candidate.columns.shape[3]
-            picked = tuple(range(first, first + count))
-            options.setdefault(candidate.name, []).append(Option(candidate.name, picked, number))
-            first += count
+        for way in _ways(candidates):
+            options.setdefault(way.effect, []).append(way)
         for name, ways in options.items():
             # Beside more of an effect that the model has, one further shape of it is enough.
-            grid = [way for way in ways if not candidates[way.shape].fitted]
             own = any(candidates[way.shape].more for way in ways)
-            if len(grid) > 1 and not own and candidates[grid[0].shape].effect.side_by_side:
-                ways.append(Option(name, sum((way.picked for way in grid), ()), None))
+            if len(ways) > 1 and not own and candidates[ways[0].shape].effect.side_by_side:
+                ways.append(Option(name, sum((way.picked for way in ways), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(problem, candidates, validation, options, columns, validation.counts * noise)
 
+    def extended(self, more: list[Candidate]) -> "Race":
+        """The race with further shapes of its effects; what is known of the others is kept."""
+        if not more:
+            return self
+        columns = np.concatenate([c.columns for c in more], axis=3)
+        options = {name: list(ways) for name, ways in self.options.items()}
+        for way in _ways(more, len(self.candidates), self.columns.shape[3]):
+            options.setdefault(way.effect, []).append(way)
+        return replace(
+            self,
+            candidates=[*self.candidates, *more],
+            validation=self.validation.extended(columns),
+            options=options,
+            columns=np.concatenate([self.columns, columns], axis=3),
+            fitted=dict(self.fitted),
+        )
+
     def losses(self, picked: tuple[int, ...] = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances, mm^2, with the picked columns."""
-        key = tuple(sorted(set(picked)))
-        if key not in self.cache:
-            self.cache[key] = self.validation.losses(key)
-        return self.cache[key]
+        return self.validation.losses(picked)
 
     def rmse_mm(self, losses: np.ndarray) -> float:
         """RMS distance of a key point, mm."""
@@ -250,10 +270,10 @@ class Race:
         return {} if effect is None else {q.name: q.value for q in effect.quantities()}
 
 
-def validation_of(problem: Problem, columns: np.ndarray) -> CrossValidation:
-    """Held-out errors with columns (S, n, 3, K).
+def split_of(problem: Problem) -> Split:
+    """Which rows are fitted and judged in turn; those of a reference are fitted and never judged.
 
-    Rows of a reference are fitted and never judged; no effect acts on them.
+    No effect acts on the latter.
     """
     pressure, direction, residual = problem.pressure, problem.direction, problem.residual
     block, fold = problem.block, problem.fold
@@ -261,16 +281,9 @@ def validation_of(problem: Problem, columns: np.ndarray) -> CrossValidation:
     if known is not None:
         pressure = np.concatenate([pressure, known.pressure])
         direction = np.concatenate([direction, known.direction])
-        residual = np.concatenate([residual, known.residual])
-        nothing = np.zeros((*known.residual.shape, columns.shape[3]), columns.dtype)
-        columns = np.concatenate([columns, nothing])
+        residual = np.concatenate([residual, KNOWN_WEIGHT * known.residual])
         block = np.concatenate([block, np.full(len(known.residual), len(fold))])
         fold = np.append(fold, FITTED)
     features = static_features(pressure, direction)
-    if known is not None:
-        first = len(problem.block)
-        features[first:] *= KNOWN_WEIGHT
-        residual[first:] *= KNOWN_WEIGHT
-    return CrossValidation.of(
-        features, residual, columns, block, fold, problem.surrogate_mm, problem.noise_mm
-    )
+    features[len(problem.block) :] *= KNOWN_WEIGHT
+    return Split.of(features, residual, block, fold, problem.surrogate_mm, problem.noise_mm)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.race import cross_validation
-from surgisoft.diagnosis.race.cross_validation import PERSISTENCE, RIDGES, ROOM, CrossValidation
+from surgisoft.diagnosis.race.cross_validation import RIDGES, CrossValidation
+from surgisoft.diagnosis.race.discrepancy import kernel
+from surgisoft.diagnosis.race.split import PERSISTENCE, ROOM, static_features
 
 ROWS, POINTS, COLUMNS, BLOCKS = 120, 2, 3, 10
 
@@ -83,8 +84,8 @@ def test_the_right_column_has_its_amplitude(data):
 def test_features_have_the_discrepancys_covariance():
     rng = np.random.default_rng(1)
     x, d = rng.uniform(-1, 1, (60, 3)), rng.choice([-1.0, 1.0], (60, 3))
-    features = cross_validation.static_features(x, d, number=60)
-    assert features @ features.T == pytest.approx(cross_validation.kernel(x, d, x, d), abs=1e-4)
+    features = static_features(x, d, number=60)
+    assert features @ features.T == pytest.approx(kernel(x, d, x, d), abs=1e-4)
 
 
 def test_further_columns_are_as_if_they_had_been_there(data):

@@ -6,8 +6,9 @@ import numpy as np
 
 from surgisoft.diagnosis.comparing.features import features, memory_of
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.cross_validation import CrossValidation, static_features
+from surgisoft.diagnosis.race.cross_validation import CrossValidation
 from surgisoft.diagnosis.race.gates import family_p_values
+from surgisoft.diagnosis.race.split import static_features
 
 SIZES = (0.3, 0.05)
 """Sizes of the black box's features, beside those of the surrogate's error, that are tried."""

@@ -8,13 +8,9 @@ import numpy as np
 
 from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.cross_validation import (
-    FITTED,
-    CrossValidation,
-    Split,
-    static_features,
-)
+from surgisoft.diagnosis.race.cross_validation import CrossValidation
 from surgisoft.diagnosis.race.gates import family_p_values
+from surgisoft.diagnosis.race.split import FITTED, Split, static_features
 from surgisoft.surrogate.effects import Effect, Quantity
 
 KNOWN_WEIGHT = 3.0

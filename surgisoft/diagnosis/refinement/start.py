@@ -8,7 +8,8 @@ import torch
 
 from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.cross_validation import CrossValidation, static_features
+from surgisoft.diagnosis.race.cross_validation import CrossValidation
+from surgisoft.diagnosis.race.split import static_features
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 

@@ -34,6 +34,9 @@ LOCKED_SHARE = 0.25
 RUNS_TO_LOCK = 4
 """Fewest runs of a recording of which whole runs are locked away."""
 
+LEAST_OWN = 0.3
+"""Least share of a validated error that is the model's own, whatever its noise is taken for."""
+
 Part = Literal["open", "locked", "all"]
 
 
@@ -106,6 +109,21 @@ class Problem:
         return replace(self, model=model, predicted=predicted)
 
 
+def own_error(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
+    """(n,) validated RMS error of each key point, mm, without the noise of its validation.
+
+    noise_mm: (n,) what that noise is taken for where the model does not say it.
+    """
+    spec, told = model.spec, model.validation
+    validated = np.array(
+        [value or 0.0 for value in told.get("per_key_point_mm", [])]
+        or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
+    )
+    stated = told.get("noise_mm")
+    noise = noise_mm if stated is None else np.full(len(validated), np.sqrt(3.0) * stated)
+    return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_OWN * validated) ** 2))
+
+
 def locked_rows(recordings: list[Recording]) -> np.ndarray:
     """(N,) bool: the rows of all recordings, one after another, that are locked away."""
     answer = []
@@ -146,10 +164,6 @@ def pose(
     pressure = history.rows(history.pressure).double().numpy()
     places = np.where(np.isin(block, names), np.searchsorted(names, block), -1)
     motion = motions(history, half, places)
-    validated = np.array(
-        [value or 0.0 for value in model.validation.get("per_key_point_mm", [])]
-        or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
-    )
     noise, source = noise_of(recordings, measured)
     return Problem(
         model=model,
@@ -163,7 +177,7 @@ def pose(
         block=kept,
         motion=motion,
         fold=folds(motion),
-        surrogate_mm=np.sqrt(np.maximum(validated**2 - noise**2, (0.3 * validated) ** 2)),
+        surrogate_mm=own_error(model, noise),
         noise_mm=noise,
         floor_source=source,
     )

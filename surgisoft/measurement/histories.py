@@ -1,9 +1,12 @@
 """Recordings as the tensors that arm models are fitted to and judged on."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.noise import known_noise
 from surgisoft.measurement.recording import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History, pack
@@ -65,7 +68,8 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
     if all(room.isnan().all() for room in warmth):
         warmth = None
-    return pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood)
+    packed = pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood)
+    return replace(packed, noise_mm=known_noise(recordings))
 
 
 def actuation_noise(recording: Recording, actuation: str = "measured") -> np.ndarray:

@@ -169,6 +169,8 @@ def fit(
             _stage(candidate, name, epochs, config, data, result, progress)
         rows = data.judging_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
+    if data.judge.noise_mm is not None:
+        result.model.validation["noise_mm"] = data.judge.noise_mm
     if not math.isfinite(result.model.validation["rmse_mm"]):
         raise InputError("the fit did not come to a finite error; check the recordings' key points")
     for number, value in enumerate(result.model.validation["per_key_point_mm"]):

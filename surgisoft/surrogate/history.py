@@ -27,6 +27,8 @@ class History:
     stood: Tensor | None = None
     """(R, m) float32 measured actuation at which the arm stood when each run's recording began, in
     the arm's unit; NaN, or None for all, where runs begin at rest."""
+    noise_mm: float | None = None
+    """Standard deviation of one coordinate of the key points, mm, where it is known."""
 
     @property
     def runs(self) -> int:
@@ -66,6 +68,7 @@ class History:
             self.noise,
             None if self.temperature_C is None else self.temperature_C[runs, :length],
             None if self.stood is None else self.stood[runs],
+            self.noise_mm,
         )
 
     def to(self, device) -> "History":
@@ -78,6 +81,7 @@ class History:
             self.noise,
             None if self.temperature_C is None else self.temperature_C.to(device),
             None if self.stood is None else self.stood.to(device),
+            self.noise_mm,
         )
 
 

@@ -7,17 +7,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.bootstrap import blocks, folds
+from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recording import Recording
 
 if TYPE_CHECKING:
     from surgisoft.diagnosis.residuals import Residuals
 
-LEAST_HOLD_S = 1.0
-"""Shortest hold whose scatter is taken for noise, s."""
-LEAST_HOLD_ROWS = 8
-"""Fewest rows of such a hold."""
-LEAST_HOLDS = 5
-"""Fewest holds that give an estimate."""
 ALIKE = 0.02
 """How far actuation and its past may differ, as a share of the range, to count as the same."""
 APART_S = 10.0
@@ -43,22 +38,20 @@ class Floor:
 def noise_floor(recordings: list[Recording]) -> Floor:
     """The floor of some recordings together: what the lab states, else the scatter in holds.
 
-    The sidecar states one coordinate's standard deviation; a distance has three of them. The
-    scatter in holds (after a straight line is taken out) misses noise slower than a hold.
+    A distance has three coordinates' noise.
     """
-    if all(recording.noise_mm is not None for recording in recordings):
-        square = [3 * recording.noise_mm**2 for recording in recordings]
-        weight = [recording.samples for recording in recordings]
-        return Floor(float(np.sqrt(np.average(square, weights=weight))), "sidecar")
+    stated = stated_noise(recordings)
+    if stated is not None:
+        return Floor(float(np.sqrt(3.0) * stated), "sidecar")
     return hold_floor(recordings)
 
 
 def hold_floor(recordings: list[Recording]) -> Floor:
     """The floor from the scatter in holds alone."""
-    variances = [v for recording in recordings for v in _hold_variances(recording)]
-    if len(variances) >= LEAST_HOLDS:
-        return Floor(float(np.sqrt(np.median(variances))), "holds")
-    return Floor(None, "unknown")
+    found = hold_noise(recordings)
+    if found is None:
+        return Floor(None, "unknown")
+    return Floor(float(np.sqrt(3.0) * found), "holds")
 
 
 def repeat_floor(rest: "Residuals") -> Floor:
@@ -97,34 +90,3 @@ def repeat_floor(rest: "Residuals") -> Floor:
     if len(half_square) < LEAST_PAIRS * rest.spec.key_points or len(places) < LEAST_PLACES:
         return Floor(None, "unknown")
     return Floor(float(np.sqrt(half_square.mean())), "repeats")
-
-
-def _hold_variances(recording: Recording) -> list[float]:
-    """Variance of the distance (mm^2), mean over key points, in each hold's second half."""
-    if recording.kind == "settled":
-        return []
-    signal = recording.measured if recording.commanded is None else recording.commanded
-    span = np.ptp(signal, axis=0)
-    still = (np.abs(np.diff(signal, axis=0)) <= 1e-3 * np.where(span > 0, span, 1)).all(1)
-    still &= np.diff(recording.run) == 0
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
-    answer = []
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        begin = (begin + end + 1) // 2
-        time = recording.t_s[begin : end + 1]
-        if len(time) >= LEAST_HOLD_ROWS and time[-1] - time[0] >= LEAST_HOLD_S:
-            value = _scatter(time, recording.key_points_mm[begin : end + 1])
-            if value is not None:
-                answer.append(value)
-    return answer
-
-
-def _scatter(time: np.ndarray, points: np.ndarray) -> float | None:
-    """Mean over key points of the summed variance (mm^2) about a straight line in time."""
-    flat = points.reshape(len(points), -1)
-    flat = flat[:, ~np.isnan(flat).any(0)]
-    if flat.shape[1] < 3:
-        return None
-    design = np.stack([np.ones_like(time), time - time.mean()], 1)
-    rest = flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]
-    return float(3 * rest.var(axis=0, ddof=2).mean())

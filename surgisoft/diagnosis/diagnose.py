@@ -290,7 +290,8 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
     names = tuple(standing.effect for standing in found.named)
     beyond = numbers["left_size"] >= LEAST_LEFT
     if names:
-        if beyond and _imitated(found, numbers):
+        wrong = found.loose is not None and found.loose.wrong
+        if wrong or (beyond and _imitated(found, numbers)):
             return "unknown_effect", ()
         if found.rivals and len(names) == 1:
             return "ambiguous", (names[0], *found.rivals)
@@ -312,7 +313,7 @@ def _unnamed(numbers: dict) -> Kind:
 
 
 def _imitated(found: Findings, numbers: dict) -> bool:
-    """Whether the named effects explain too little, or a black box or looser forms far more."""
+    """Whether the named effects explain too little, or a black box far more."""
     explained = numbers["explained_above_floor"]
     further = found.next[0].gain if found.next else 0.0
     together = explained + max(further, 0.0) * (1.0 - explained)
@@ -324,9 +325,7 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     if together < EXPLAINED and sure and beaten >= MISSED_SHARE:
         return True
     share, log_gain = BETTER_BOX
-    if sure and beaten >= share and numbers["box_log_gain"] >= log_gain:
-        return True
-    return found.loose is not None and found.loose.wrong
+    return sure and beaten >= share and numbers["box_log_gain"] >= log_gain
 
 
 def _sure_of_box(numbers: dict) -> bool:

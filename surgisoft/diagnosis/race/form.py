@@ -7,10 +7,12 @@ directions and of the place along the body. Only what a further effect explains 
 own. (The discrepancy term of Kennedy & O'Hagan 2001, here for the form of an effect.)
 
 Where effects that are let loose explain much more than they do as they are, their form is not that
-of what is missing: they are its nearest relatives only, and something unknown is missing.
+of what is missing: they are its nearest relatives only, and something unknown is missing. So it is
+where they explain much more with a strength of their own in every part of the time.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +20,19 @@ import numpy as np
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 
-WRONG, ALL_WRONG = 0.015, 0.03
+WRONG, ALL_WRONG = 0.015, 0.02
 """Least product of what goes when a form is let loose, as a share of the error above the floor, and
 the mean fall of a block's log error, from which that form is wrong; the same where it stands for
 all of several rivals, which an experiment may tell apart."""
+MUCH = 0.1
+"""Or, however noisy the blocks, that share by itself."""
+SPANS = 4
+"""Parts of the recordings in which what a form explains may be scaled on its own."""
 CHANCE = 0.02
 """Largest chance of such a fall."""
+
+Scaled = Callable[[Race, np.ndarray], np.ndarray]
+"""(S, n, 3, K) columns of what an effect explains (S, n, 3), each scaled by something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +59,7 @@ class Loosened:
     def wrong(self) -> bool:
         """Whether the forms are not those of what is missing."""
         least = WRONG if self.ways == 1 else ALL_WRONG
-        return self.worth >= least and self.p_value <= CHANCE
+        return (self.worth >= least or self.share >= MUCH) and self.p_value <= CHANCE
 
 
 def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
@@ -59,8 +68,8 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
     ways: sets of effects that explain the error about as well; one set where nothing rivals it.
     """
     tried = []
-    for named in ways:
-        columns = _loose_columns(race, named)
+    for named, scaled in itertools.product(ways, (_by_state, _by_time)):
+        columns = _loose_columns(race, named, scaled)
         tried.append(race.validation.of_other(columns).losses(range(columns.shape[3])))
     best = min(tried, key=np.sum)
     beyond = [_beyond(race, picked_by(named), best, len(ways)) for named in ways]
@@ -87,7 +96,7 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     The chance counts this one effect alone: the others have been corrected for before.
     """
     picked = further.option.picked
-    columns = [_loose_columns(race, named), race.columns[..., list(picked)]]
+    columns = [_loose_columns(race, named, _by_state), race.columns[..., list(picked)]]
     together = np.concatenate(columns, axis=3)
     validation, total = race.validation.of_other(together), together.shape[3]
     before, after = (validation.losses(range(n)) for n in (total - len(picked), total))
@@ -97,7 +106,7 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     return float(before.sum()), answer
 
 
-def _loose_columns(race: Race, named: Sequence[Standing]) -> np.ndarray:
+def _loose_columns(race: Race, named: Sequence[Standing], scaled: Scaled) -> np.ndarray:
     """(S, n, 3, K) the named effects' columns, and what each of them explains, scaled."""
     ways = [race.freest(standing) for standing in named]
     base = sum(ways, ())
@@ -105,15 +114,21 @@ def _loose_columns(race: Race, named: Sequence[Standing]) -> np.ndarray:
     columns, first = [race.columns[..., list(base)]], 0
     for picked in ways:
         part = race.columns[..., list(picked)] @ amplitudes[first : first + len(picked)]
-        columns.append(_loose(race, part))
+        columns.append(scaled(race, part))
         first += len(picked)
     return np.concatenate(columns, axis=3)
 
 
-def _loose(race: Race, part: np.ndarray) -> np.ndarray:
+def _by_state(race: Race, part: np.ndarray) -> np.ndarray:
     """(S, n, 3, 2 m + 1) what an effect explains (S, n, 3), scaled."""
     points = part.shape[1]
     along = np.linspace(-1.0, 1.0, points) if points > 1 else np.zeros(1)
     rows = np.concatenate([race.problem.pressure, race.problem.direction], axis=1)
     scaled = part[..., None] * rows[:, None, None, :]
     return np.concatenate([scaled, (part * along[:, None])[..., None]], axis=3)
+
+
+def _by_time(race: Race, part: np.ndarray) -> np.ndarray:
+    """(S, n, 3, SPANS - 1) what an effect explains, in each part of the time but the first."""
+    span = SPANS * np.arange(len(part)) // len(part)
+    return part[..., None] * (span[:, None] == np.arange(1, SPANS))[:, None, None, :]

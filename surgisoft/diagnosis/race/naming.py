@@ -8,7 +8,7 @@ CHANCE = 0.02
 LARGE = (0.2, 0.5, 0.07)
 """Largest chance at which a large gain is taken all the same (few blocks, or an effect that shows
 in some of them only), the share that makes it large, and its least log gain."""
-FAR = (2.0, 0.8)
+FAR = (1.2, 0.8)
 """Or, whatever its chance, where the error is far beyond the surrogate's own: factor on the
 validated error, and share. Few blocks are needed to show a support that is seldom met."""
 LEAST_GAIN = 0.25

@@ -29,14 +29,14 @@ WIDER = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Option:
-    """One way to add an effect: one of its shapes, or all of them side by side."""
+    """One way to add an effect: one of its shapes, or several of them side by side."""
 
     effect: str
     """The effect's name."""
     picked: tuple[int, ...]
     """Its columns."""
     shape: int | None
-    """Number of the candidate; None: all shapes."""
+    """Number of the candidate; None: several shapes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Standing:
     @property
     def score(self) -> float:
         """What effects are ranked by."""
-        return _score(self.log_gain, self.option)
+        return priced(self.log_gain.mean(), len(self.option.picked))
 
 
 def picked_by(standings: Sequence[Standing]) -> tuple[int, ...]:
@@ -74,9 +74,9 @@ def _near(quantity: Quantity) -> bool:
     return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
 
 
-def _score(log_gain: np.ndarray, option: Option) -> float:
-    """Mean log gain, the less of it counted the more amplitudes it took."""
-    return float(log_gain.mean()) * (1.0 - PRICE * min(len(option.picked), 100))
+def priced(log_gain: float, amplitudes: int) -> float:
+    """A log gain, the less of it counted the more amplitudes it took."""
+    return float(log_gain) * (1.0 - PRICE * min(amplitudes, 100))
 
 
 def _ways(candidates: Sequence[Candidate], number: int = 0, first: int = 0) -> Iterator[Option]:
@@ -116,8 +116,10 @@ class Race:
         for name, ways in options.items():
             # Beside more of an effect that the model has, one further shape of it is enough.
             own = any(candidates[way.shape].more for way in ways)
-            if len(ways) > 1 and not own and candidates[ways[0].shape].effect.side_by_side:
-                ways.append(Option(name, sum((way.picked for way in ways), ()), None))
+            shapes = [candidates[way.shape].effect for way in ways]
+            for some in [] if own else shapes[0].together(shapes):
+                if len(some) > 1:
+                    ways.append(Option(name, sum((ways[i].picked for i in some), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(problem, candidates, validation, options, columns, validation.counts * noise)
 
@@ -181,7 +183,7 @@ class Race:
         gains = np.array([self.log_ratio(before, losses) for losses in after])
         chances = family_p_values(self.problem.by_motion(gains), [way.effect for way in ways])
         best: dict[str, Standing] = {}
-        scores = [_score(gain, way) for gain, way in zip(gains, ways, strict=True)]
+        scores = [priced(g.mean(), len(w.picked)) for g, w in zip(gains, ways, strict=True)]
         for i in np.argsort(-np.array(scores), kind="stable"):
             way, losses = ways[i], after[i]
             if way.effect not in best and self.plausible(way, base):
@@ -192,9 +194,9 @@ class Race:
     def plausible(self, way: Option, base: tuple[int, ...] = ()) -> bool:
         """Whether an effect's parameters lie in their ranges as the race leaves them.
 
-        All shapes side by side are as plausible as the best of them. One that only inner reversals
-        show must explain more than a function of the actuation does: on ramps that all begin at
-        rest, loops can be summed to any such function.
+        Several shapes side by side are as plausible as the best of them. One that only inner
+        reversals show must explain more than a function of the actuation does: on ramps that all
+        begin at rest, loops can be summed to any such function.
         """
         effect = self.in_place(self.single(way, base), base)
         if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
@@ -227,10 +229,12 @@ class Race:
         return min((own + w.picked for w in ways), key=lambda p: float(self.losses(p).sum()))
 
     def single(self, way: Option, base: tuple[int, ...] = ()) -> Option:
-        """The way itself, or the best single shape of all that stand side by side in it."""
+        """The way itself, or the best single shape of those that stand side by side in it."""
         if way.shape is not None:
             return way
-        singles = [w for w in self.options[way.effect] if w.shape is not None]
+        own = set(way.picked)
+        ways = self.options[way.effect]
+        singles = [w for w in ways if w.shape is not None and own.issuperset(w.picked)]
         return min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
 
     def in_place(self, way: Option, base: tuple[int, ...] = ()) -> Effect | None:

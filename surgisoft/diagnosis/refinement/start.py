@@ -9,6 +9,7 @@ import torch
 from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.race.cross_validation import CrossValidation
+from surgisoft.diagnosis.race.ranking import priced
 from surgisoft.diagnosis.race.split import static_features
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
@@ -18,7 +19,7 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
     """Models with the named effect in its best few shapes, amplitudes fitted; parts are copies.
 
     The shapes are ranked by the error that each leaves on held-out blocks beside the surrogate's
-    own error.
+    own error; of two that leave nearly the same, the simpler one comes first.
     """
     tried = candidates(problem, [name])
     if not tried:
@@ -37,9 +38,11 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
         problem.noise_mm,
     )
     picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
-    losses = [validation.losses(pick).sum() for pick in picks]
+    before = validation.losses().sum()
+    gains = [np.log(before / validation.losses(pick).sum()) for pick in picks]
+    scores = [priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
     answer = []
-    for best in np.argsort(losses)[:number]:
+    for best in np.argsort(scores)[::-1][:number]:
         effect = copy.deepcopy(tried[best].effect)
         amplitudes = torch.from_numpy(validation.amplitudes(picks[best])).float()
         begin = 0

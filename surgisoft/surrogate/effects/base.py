@@ -178,6 +178,11 @@ class Effect(nn.Module, ABC):
         return [cls(facts)]
 
     @classmethod
+    def together(cls, some: list["Effect"]) -> list[list[int]]:
+        """Sets of candidates, by number, that a diagnosis also tries side by side."""
+        return [list(range(len(some)))] if cls.side_by_side else []
+
+    @classmethod
     def further(cls, facts: ArmFacts, points: Tensor) -> list["Effect"]:
         """The same where the model has the effect already: shapes that add up with any other.
 

@@ -32,6 +32,9 @@ DEPTHS = (0.5, 0.7, 0.86, 0.96)
 LEAST_SHARE = 0.08
 """Least share of a support that is there. One that yields more is met all the time and looks like
 a weight, or like a stiffer wall."""
+BESIDE = 1
+"""Neighbouring directions that it puts supports in at once, either side: what is met may be round,
+but an arm that is held from all around is a stiffer one."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
 support, and to push it back would take no bounded bending."""
@@ -88,6 +91,15 @@ class Contact(Memoryless):
             for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
                 made.append(cls(facts, point, azimuth, 0.0, offset))
         return made
+
+    @classmethod
+    def together(cls, some: list[Effect]) -> list[list[int]]:
+        turns = [round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi)) for effect in some]
+        near = [min(turn, AROUND - turn) <= BESIDE for turn in range(AROUND)]
+        return [
+            [i for i, turn in enumerate(turns) if near[(turn - middle) % AROUND]]
+            for middle in sorted(set(turns))
+        ]
 
     @property
     def normal(self) -> Tensor:

@@ -17,7 +17,7 @@ KNOWN_WEIGHT = 3.0
 """Weight of a reference's rows: an error that changed since is not shared out over both."""
 
 PRICE = 0.003
-"""Share of a gain that each amplitude costs: of two effects that explain alike, the simpler one."""
+"""Share of a gain that each amplitude costs: of two ways that explain alike, the simpler one."""
 
 MOST_STATIC = 0.95
 """Most of what loops explain that a function of the actuation may hold. On simulated arms it was

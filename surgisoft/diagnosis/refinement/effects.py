@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.race.ranking import PRICE
 from surgisoft.diagnosis.refinement.intervals import Parameter, intervals
 from surgisoft.diagnosis.refinement.large import refine_large
 from surgisoft.diagnosis.refinement.refine import Fit, free_parameters, refine
@@ -120,11 +121,17 @@ def is_large(effect: Effect) -> bool:
 
 
 def _added(problem: Problem, name: str) -> ArmModel:
-    """The problem's model with one effect more, roughly fitted, from the best of a few starts."""
+    """The problem's model with one effect more, roughly fitted, from the best of a few starts.
+
+    Of two that come to nearly the same, the simpler one is the best.
+    """
     tried = []
     for model in starts(problem, name):
-        if is_large(model.effects[name]):
-            tried.append((refine_large(model, problem, name).misfit, model))
+        effect = model.effects[name]
+        if is_large(effect):
+            misfit = refine_large(model, problem, name).misfit
         else:
-            tried.append((refine(model, problem, [name], FIRST_ITERATIONS).misfit, model))
+            misfit = refine(model, problem, [name], FIRST_ITERATIONS).misfit
+        values = sum(p.numel() for p in effect.strengths().values())
+        tried.append((misfit * (1.0 + PRICE) ** values, model))
     return min(tried, key=lambda one: one[0])[1]

@@ -152,6 +152,7 @@ def improve(
             models.append(fitted.model)
             parameters = fitted.parameters
             note(_step(said, name, found, fall.after))
+            said = replace(said, sentence=f"named beside {name} by the same diagnosis")
         if not going:
             note(said)
     tuned = retune(models[-1], problem)

@@ -123,3 +123,12 @@ def test_rounds_are_reported_as_they_end(recited):
     assert [r.step for r in heard] == [r.step for r in result.rounds] == ["gain_mismatch", None]
     assert all(r.error_mm is None for r in heard)
     assert result.rounds[-1].error_mm == result.locked.after
+
+
+def test_the_second_effect_of_an_answer_does_not_repeat_its_sentence(recited):
+    recited(said("several", "creep", "gain_mismatch"), said("nothing_missing"))
+    truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
+    result = improve(bare_arm(), [measured_on(truth)])
+    assert [r.step for r in result.rounds] == ["creep", "gain_mismatch", None]
+    assert result.rounds[0].sentence == "several it is"
+    assert result.rounds[1].sentence == "named beside creep by the same diagnosis"

@@ -50,10 +50,8 @@ LEAST_LEFT = 1.0
 """Factor on the surrogate's validated error that is left wherever something unknown is told: what
 is less may be the surrogate's own."""
 LEAST_EXPLAINED = 0.68
-"""Share of the error above the floor and above the surrogate's own that the named effects and the
-next best one must explain; else something that is not known is missing."""
-OWN = 1.5
-"""Factor on the validated error up to which what is left there is taken for the surrogate's own."""
+"""Share of the error above the floor that the named effects and the next best one must explain
+where FAR or more is left; else something that is not known is missing."""
 EXPLAINED, MISSED_SHARE = 0.6, 0.2
 """The same wherever something is left, where they explain so much less, of the error above the
 floor, than a black box does."""
@@ -73,8 +71,9 @@ which no form is known well enough to tell them apart, however sure the blocks a
 CLOSE_GAIN = 0.6
 """Least gain, as a share of the best one's, of effects whose shapes are fitted before they race
 again: to first order and on a grid a large effect loses some of what it explains."""
-FAR = 2.0
-"""Factor on the validated error that is left from which something is missing, whatever it is."""
+FAR, ABOVE = 1.5, 1.3
+"""Factor on the validated error that is left from which something is missing, whatever it is, and
+factor on the floor by which the error must stand out from the noise."""
 UNTENABLE = 0.25
 """Confidence in the one effect that is named below which it is not."""
 NEAREST = 0.25
@@ -301,11 +300,13 @@ def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
 
 def _unnamed(numbers: dict) -> Kind:
     """The kind of an answer that names no effect."""
-    if numbers["before_over_floor"] >= TRAINED:
+    over = numbers["before_over_floor"]
+    if over >= ABOVE and numbers["left_size"] >= FAR:
+        return "unknown_effect"
+    if over >= TRAINED:
         beyond = numbers["left_size"] >= LEAST_LEFT
         box = numbers["box_share"] >= UNKNOWN_SHARE and _sure_of_box(numbers)
-        far = numbers["left_size"] >= FAR
-        if beyond and (box or far or numbers["static_size"] >= OFF_SIZE):
+        if beyond and (box or numbers["static_size"] >= OFF_SIZE):
             return "unknown_effect"
         if numbers["static_share"] >= 0.5:
             return "surrogate_undertrained"
@@ -319,8 +320,7 @@ def _imitated(found: Findings, numbers: dict) -> bool:
     together = explained + max(further, 0.0) * (1.0 - explained)
     beaten = numbers["box_share"] - explained
     sure = _sure_of_box(numbers)
-    own = (1.0 - explained) * min(1.0, OWN / numbers["left_size"]) ** 2
-    if together < LEAST_EXPLAINED * (1.0 - own):
+    if together < LEAST_EXPLAINED and numbers["left_size"] >= FAR:
         return True
     if together < EXPLAINED and sure and beaten >= MISSED_SHARE:
         return True

@@ -20,10 +20,9 @@ import numpy as np
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 
-WRONG, ALL_WRONG = 0.015, 0.02
+WRONG = 0.015
 """Least product of what goes when a form is let loose, as a share of the error above the floor, and
-the mean fall of a block's log error, from which that form is wrong; the same where it stands for
-all of several rivals, which an experiment may tell apart."""
+the mean fall of a block's log error, from which that form is wrong."""
 MUCH = 0.1
 """Or, however noisy the blocks, that share by itself."""
 SPANS = 4
@@ -47,8 +46,6 @@ class Loosened:
     """Mean fall of a block's log error."""
     p_value: float
     """Chance of such a fall without a cause."""
-    ways: int
-    """How many ways to explain the error it was compared with."""
 
     @property
     def worth(self) -> float:
@@ -58,8 +55,7 @@ class Loosened:
     @property
     def wrong(self) -> bool:
         """Whether the forms are not those of what is missing."""
-        least = WRONG if self.ways == 1 else ALL_WRONG
-        return (self.worth >= least or self.share >= MUCH) and self.p_value <= CHANCE
+        return (self.worth >= WRONG or self.share >= MUCH) and self.p_value <= CHANCE
 
 
 def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
@@ -72,15 +68,15 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
         columns = _loose_columns(race, named, scaled)
         tried.append(race.validation.of_other(columns).losses(range(columns.shape[3])))
     best = min(tried, key=np.sum)
-    beyond = [_beyond(race, picked_by(named), best, len(ways)) for named in ways]
+    beyond = [_beyond(race, picked_by(named), best) for named in ways]
     return min(beyond, key=lambda one: one.worth)
 
 
-def _beyond(race: Race, picked: tuple[int, ...], after: np.ndarray, ways: int) -> Loosened:
+def _beyond(race: Race, picked: tuple[int, ...], after: np.ndarray) -> Loosened:
     before = race.losses(picked)
     log_gain, chance = _fall(race, before, after)
     share = (before.sum() - after.sum()) / race.excess(race.losses())
-    return Loosened(after, float(share), float(log_gain.mean()), chance, ways)
+    return Loosened(after, float(share), float(log_gain.mean()), chance)
 
 
 def _fall(race: Race, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float]:

@@ -62,7 +62,8 @@ def _goals(outcomes: list[Outcome]) -> str:
     rich = [o for o in at_least if o.case.excitation == "rich"]
     clean = [o for o in outcomes if not o.case.hidden and not o.case.undertrained]
     unknown = [o for o in outcomes if "unknown" in o.case.truth]
-    known = [o for o in outcomes if o.case.hidden and "unknown" not in o.case.truth]
+    seen = [o for o in unknown if o.effect_mm >= o.surrogate_mm]
+    known = [o for o in outcomes if "unknown" not in o.case.truth and not o.case.undertrained]
     under = [o for o in outcomes if o.case.undertrained]
     pairs = [o for o in outcomes if len(o.case.hidden) == 2]
     named = [o for o in outcomes if o.kind in NAMING]
@@ -86,7 +87,8 @@ def _goals(outcomes: list[Outcome]) -> str:
     row("an effect named on a clean robot", "2 %", clean, lambda o: o.kind in NAMING)
     row("statements with confidence >= 0.95 right", "97 %", sure, statement_right)
     row("outside the list: `unknown_effect`", "80 %", unknown, lambda o: o.kind == OTHER)
-    row("called so though in the list", "5 %", known, lambda o: o.kind == OTHER)
+    row("the same, at least the surrogate's error", "", seen, lambda o: o.kind == OTHER)
+    row("called so though in the list, or clean", "5 %", known, lambda o: o.kind == OTHER)
     row("two at once, both named", "85 %", pairs, lambda o: set(o.case.truth) <= set(o.effects))
     row("undertrained surrogate called so", "", under, lambda o: o.kind == UNDERTRAINED)
     error = calibration_error(named)

@@ -154,8 +154,8 @@ def pose(
     seen = np.isfinite(measured).all(2).any(1)
     if part != "all":
         seen &= locked_rows(recordings) == (part == "locked")
-    block = blocks(history, seen)
     step = max(1, round(seen.sum() / rows))
+    block = blocks(history, seen, step)
     index = np.flatnonzero(seen)[::step]
     names, kept = np.unique(block[index], return_inverse=True)
     spec = model.spec
@@ -228,11 +228,11 @@ def folds(motion: np.ndarray) -> np.ndarray:
     return motion // (TOGETHER if count >= TOGETHER * FOLDS else 1) % FOLDS
 
 
-def blocks(history: History, seen: np.ndarray) -> np.ndarray:
+def blocks(history: History, seen: np.ndarray, step: int = 1) -> np.ndarray:
     """(N,) block of time of each row; -1 where it is not seen.
 
     Whole runs where they are many and short; else stretches of runs of about BLOCK_S, at least
-    LEAST_BLOCKS of them in all.
+    LEAST_BLOCKS of them in all. step: every how many rows one is fitted.
     """
     run = np.where(seen, history.run_of_row.numpy(), -1)
     time = history.rows(history.t_s).numpy()
@@ -242,7 +242,7 @@ def blocks(history: History, seen: np.ndarray) -> np.ndarray:
     answer, count = np.full(len(run), -1), 0
     for r, span in lengths.items():
         rows = np.flatnonzero(run == r)
-        parts = max(1, min(round(span / max(length, 1e-9)), len(rows) // BLOCK_ROWS))
+        parts = max(1, min(round(span / max(length, 1e-9)), len(rows) // (step * BLOCK_ROWS)))
         edges = np.linspace(0, len(rows), parts + 1).astype(int)
         for begin, end in itertools.pairwise(edges):
             answer[rows[begin:end]] = count

@@ -59,3 +59,12 @@ def test_a_fit_keeps_the_noise_that_its_recordings_state_or_show_in_holds():
         found = fit(history_of([one]), None, arm_spec([one]), quick).model
         assert found.validation["noise_mm"] == pytest.approx(known_noise([one]))
     assert known_noise([recording(np.zeros(300), walk(300, seed=1)[:, :1], noise_mm=None)]) is None
+
+
+def test_a_long_recording_is_cut_into_blocks_of_enough_fitted_rows():
+    """An hour at 10 Hz, every 18th row fitted: blocks of 14.4 s with 8 of them, not of 5 s."""
+    pressure = walk(36_000)
+    problem = pose(validated_model(), [recording(np.zeros(36_000), pressure)])
+    assert len(problem.block) == 2000
+    assert np.bincount(problem.block).min() >= 7
+    assert 240 <= problem.block.max() + 1 <= 250

@@ -21,7 +21,7 @@ class CrossValidation:
     """Held-out errors of sets of columns."""
 
     split: Split
-    field: np.ndarray
+    fields: np.ndarray
     """(rows, n, 3, 1 + K) residual and columns, mm; 0 where missing."""
     grams: np.ndarray
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
@@ -69,10 +69,10 @@ class CrossValidation:
     def extended(self, columns: np.ndarray) -> "CrossValidation":
         """The same with further columns (rows, n, 3, K') behind those that it has."""
         more = _masked(self.split, columns)
-        both = np.concatenate([self.field, more], axis=3)
+        both = np.concatenate([self.fields, more], axis=3)
         turned = self.split.turned(more)
         known = self.split.residual[self.split.rows :]
-        old = self.split.turned(self.field, known)
+        old = self.split.turned(self.fields, known)
         whole = [np.concatenate(pair, axis=3) for pair in zip(old, turned, strict=True)]
         beside = _products(self.split, both, whole, more, turned)
         grams, judged = (
@@ -83,7 +83,7 @@ class CrossValidation:
     @property
     def columns(self) -> int:
         """Number of columns, K."""
-        return self.field.shape[3] - 1
+        return self.fields.shape[3] - 1
 
     @property
     def counts(self) -> np.ndarray:

@@ -128,9 +128,10 @@ def test_what_the_fit_left_is_the_validated_error_with_the_effect_in_the_model()
     assert not in_fit("creep", 2.0)  # the model was fitted without it
 
 
-@pytest.mark.parametrize("name", ["leak", "breathing"])
+@pytest.mark.parametrize("name", ["leak", "breathing", "fibre_break"])
 def test_what_is_outside_the_list_is_not_called_by_its_nearest_relative(name):
-    """A leak has nearly the form of a gain; breathing shifts the mount only now and then."""
+    """A leak has nearly the form of a gain, a breaking fibre that of a drift; breathing shifts the
+    mount only now and then."""
     rig = VirtualRig(0, take=5, hidden=((name, 2.0),))
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=5))
     model, known = load_model("default"), load_known_error("default")

@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from surgisoft.surrogate.effects import ArmFacts, Context, make_effect
+from surgisoft.surrogate.effects import ArmFacts, Context, known_effects, make_effect
 
 RANGE = ArmFacts(torch.zeros(3), torch.full((3,), 50.0), torch.zeros(3), torch.zeros(5, 3))
 STRAIGHT = torch.tensor([[0.0, 0.0, 10.0 * k] for k in range(9)])
@@ -277,6 +277,21 @@ def test_contact_holds_the_point_at_a_rigid_support_and_bends_the_rest():
     assert torch.allclose(moved, 2.0 * wanted, atol=0.03)
     free = with_strength(make_effect("contact", facts, point=5, offset_mm=6.0), share=1.0)
     assert torch.equal(pose(free, tilted), tilted)
+
+
+def test_supports_that_are_tried_together_stand_on_one_side():
+    """Supports on opposite sides would be a stiffer wall: all within 45 degrees of each other."""
+    sway = torch.linspace(0, 2 * math.pi, 60)
+    lean = torch.stack([sway.cos(), sway.sin(), 0 * sway], -1)
+    points = STRAIGHT + 0.1 * STRAIGHT[:, 2:] * lean[:, None]
+    tried = known_effects()["contact"].candidates(arm(STRAIGHT), points)
+    together = type(tried[0]).together(tried)
+    assert len(together) == 16
+    for some in together:
+        normals = torch.cat([tried[i].normal.detach()[None] for i in some])
+        assert float((normals @ normals.T).min()) == pytest.approx(math.cos(math.pi / 4), abs=1e-5)
+        assert len(some) == 3 * 4  # three directions, each at every depth
+    assert {i for some in together for i in some} == set(range(len(tried)))
 
 
 def test_misalignment_is_a_similarity():

@@ -1,5 +1,6 @@
 """Forward, exchanged, back: on a hand-made table of losses, and on a robot that hides two."""
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -101,6 +102,16 @@ def test_what_a_form_leaves_behind_is_no_further_effect(table, monkeypatch):
     monkeypatch.setattr(naming, "beside_loose", nothing_left)
     named, _ = naming.name_effects(table, table.standings())
     assert [s.effect for s in named] == ["blend"]
+
+
+def test_exchanges_that_go_in_a_circle_end_at_the_best(table, monkeypatch):
+    """Left gives way to right and right to left, for ever: right leaves less, 50 and not 55."""
+    first = {s.effect: s for s in table.standings()}
+    turn = itertools.cycle(["left", "right"])
+    monkeypatch.setattr(naming, "_exchanged", lambda race, named: [first[next(turn)]])
+    named, following = naming.name_effects(table, list(first.values()))
+    assert [s.effect for s in named] == ["right"]
+    assert {s.effect for s in following} == {"blend", "left"}
 
 
 def test_two_effects_of_a_robot_are_both_named():

@@ -45,14 +45,21 @@ def name_effects(race: Race, first: list[Standing]) -> tuple[list[Standing], lis
     """
     named: list[Standing] = []
     following = first
+    seen: dict[frozenset[str], list[Standing]] = {}
     while following and len(named) < MOST_EFFECTS:
         passed = next((s for s in following if _joins(race, first, named, s)), None)
         if passed is None:
             break
-        before = {standing.effect for standing in named}
         named = _without_idle(race, first, _exchanged(race, [*named, passed]))
+        names = frozenset(s.effect for s in named)
+        # Exchanges may lead back to where they came from: of such a circle the best is taken.
+        again = names in seen
+        if again:
+            circle = list(seen.values())[list(seen).index(names) :]
+            named = min(circle, key=lambda some: float(race.losses(picked_by(some)).sum()))
+        seen[names] = named
         following = race.standings(picked_by(named), tuple(s.effect for s in named))
-        if {standing.effect for standing in named} == before:
+        if again:
             break
     return named, following
 

@@ -19,6 +19,7 @@ def rotate(points: Tensor, vector: Tensor) -> Tensor:
     angle = torch.where(square > 1e-6, square, torch.ones_like(square)).sqrt()
     first = _over(angle.sin() / angle, 1 - square / 6, square)
     second = _over((1 - angle.cos()) / angle.square(), 0.5 - square / 24, square)
-    vector = vector.expand(torch.broadcast_shapes(vector.shape, points.shape))
-    turned = torch.linalg.cross(vector, points.expand(vector.shape))
+    # Not torch.broadcast_shapes, which imports sympy at its first call: most of a second.
+    vector, wide = torch.broadcast_tensors(vector, points)
+    turned = torch.linalg.cross(vector, wide)
     return points + first * turned + second * torch.linalg.cross(vector, turned)

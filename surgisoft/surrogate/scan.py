@@ -22,9 +22,10 @@ def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:
     plain = all(p.device.type == "cpu" and p.dtype == start.dtype for p in parts)
     if wanted or not plain or start.dtype not in (torch.float32, torch.float64):
         return None
-    shape = torch.broadcast_shapes(*(band.shape for band in bands))
+    bands = torch.broadcast_tensors(*bands)
+    shape = bands[0].shape
     out = start.new_empty(shape)
-    rows = [p.detach().expand(shape).reshape(*shape[:2], -1).numpy() for p in bands]
+    rows = [p.detach().reshape(*shape[:2], -1).numpy() for p in bands]
     first = start.detach().expand(shape[0], *shape[2:]).reshape(shape[0], -1).numpy()
     loop(*rows, first, out.view(*shape[:2], -1).numpy())
     return out

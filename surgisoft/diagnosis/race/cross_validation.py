@@ -153,9 +153,12 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
     """(..., C, C) symmetric matrices from (..., A, A) and their last columns (..., C, C - A)."""
-    first = inner.shape[-1]
-    below = np.swapaxes(border[..., :first, :], -1, -2)
-    return np.concatenate([np.concatenate([inner, below], axis=-2), border], axis=-1)
+    first, size = inner.shape[-1], border.shape[-2]
+    answer = np.empty((*inner.shape[:-2], size, size), inner.dtype)
+    answer[..., :first, :first] = inner
+    answer[..., first:] = border
+    answer[..., first:, :first] = np.swapaxes(border[..., :first, :], -1, -2)
+    return answer
 
 
 def _amplitudes(gram: np.ndarray) -> np.ndarray:

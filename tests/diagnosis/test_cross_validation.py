@@ -96,7 +96,8 @@ def test_further_columns_are_as_if_they_had_been_there(data):
     first = found.losses([0])
     found = found.extended(columns[..., 1:])
     assert found.columns == COLUMNS
-    assert found.losses([0]) == pytest.approx(first, abs=0)
+    found.cache.clear()  # else what was known before would be compared with itself
+    assert found.losses([0]) == pytest.approx(first, rel=1e-6)
     np.testing.assert_allclose(found.grams, whole.grams, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found.judged, whole.judged, rtol=1e-4, atol=1e-4)
     assert found.losses([0, 1, 2]) == pytest.approx(whole.losses([2, 1, 0]), rel=1e-4)

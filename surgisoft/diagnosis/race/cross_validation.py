@@ -62,10 +62,6 @@ class CrossValidation:
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
         return cls(split, both, grams, judged)
 
-    def of_other(self, columns: np.ndarray) -> "CrossValidation":
-        """The same with other columns (rows, n, 3, K)."""
-        return CrossValidation.on(self.split, columns)
-
     def extended(self, columns: np.ndarray) -> "CrossValidation":
         """The same with further columns (rows, n, 3, K') behind those that it has."""
         more = _masked(self.split, columns)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surgisoft.diagnosis.race.cross_validation import CrossValidation
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 
@@ -66,7 +67,8 @@ def loosened(race: Race, ways: Sequence[Sequence[Standing]]) -> Loosened:
     tried = []
     for named, scaled in itertools.product(ways, (_by_state, _by_time)):
         columns = _loose_columns(race, named, scaled)
-        tried.append(race.validation.of_other(columns).losses(range(columns.shape[3])))
+        validation = CrossValidation.on(race.validation.split, columns)
+        tried.append(validation.losses(range(columns.shape[3])))
     best = min(tried, key=np.sum)
     beyond = [_beyond(race, picked_by(named), best) for named in ways]
     return min(beyond, key=lambda one: one.worth)
@@ -94,7 +96,7 @@ def beside_loose(race: Race, named: list[Standing], further: Standing) -> tuple[
     picked = further.option.picked
     columns = [_loose_columns(race, named, _by_state), race.columns[..., list(picked)]]
     together = np.concatenate(columns, axis=3)
-    validation, total = race.validation.of_other(together), together.shape[3]
+    validation, total = CrossValidation.on(race.validation.split, together), together.shape[3]
     before, after = (validation.losses(range(n)) for n in (total - len(picked), total))
     log_gain, chance = _fall(race, before, after)
     gain = float((before.sum() - after.sum()) / race.excess(before))

@@ -8,6 +8,7 @@ where no gradient is asked for, a compiled loop over the rows is quicker than ei
 """
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -117,3 +118,38 @@ def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
         before.append(kept * before[-1] + last)
     whole = torch.stack(within, 2) + share * torch.stack(before[:-1], 1).unsqueeze(2)
     return whole.flatten(1, 2)[:, :steps]
+
+
+def follow(
+    decayed: Callable[[Tensor], tuple[Tensor, Tensor]],
+    target: Tensor,
+    start: Tensor,
+    tolerance: Tensor | float,
+) -> Tensor:
+    """y[:, t] = target[:, t] - left(target[:, t] - y[:, t-1]) with y[:, -1] = start.
+
+    decayed: what a row leaves of a gap (R, T, m), and its derivative by the gap. Shapes: target
+    (R, T, m), start (R, m); answer (R, T, m).
+
+    By Newton's method on the whole recording (Lim et al. 2024, "Parallelizing non-linear sequential
+    models over the sequence length"): around the last answer a row's map of the row before is
+    affine, and one scan solves all of them. After k passes the first k rows are those of stepping;
+    a handful of passes are enough: they end where nothing moves by more than the tolerance. The
+    last pass, at the answer, carries the gradients.
+    """
+
+    def solve(lagged: Tensor) -> Tensor:
+        before = torch.cat([start.detach().unsqueeze(1), lagged[:, :-1]], dim=1)
+        left, slope = decayed(target - before)
+        slope = slope.detach()
+        return linear_scan(slope, target - left - slope * before, start)
+
+    with torch.no_grad():
+        lagged, settled = target, torch.zeros_like(target[:, :1, :1], dtype=torch.bool)
+        for _ in range(target.shape[1]):
+            last, lagged = lagged, torch.where(settled, lagged, solve(lagged))
+            moved = ((lagged - last).abs() > tolerance).flatten(1).any(1)
+            settled = settled | ~moved.view(-1, 1, 1)
+            if bool(settled.all()):
+                break
+    return solve(lagged.detach())

@@ -5,6 +5,12 @@ import pytest
 
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.rig import VirtualRig
+from surgisoft.measurement.rig.effects import (
+    add_effect_forces,
+    follow_lines,
+    new_history,
+    no_effects,
+)
 from surgisoft.measurement.rig.hidden import HIDDEN
 
 
@@ -82,6 +88,24 @@ def test_softening_depends_on_the_largest_load_so_far():
     assert change[2] > 0.5
     assert change[4] == pytest.approx(change[2], rel=0.15)
     assert change[5] < 0.3
+
+
+def test_rate_dependence_is_a_wall_beside_a_shear_thinning_fluid():
+    """E d = c sqrt(y' / 0.1): its lack on a ramp, and how that goes when the ramp ends."""
+    wanted, step, modulus, c = 0.05, 1e-4, 3.0, 0.09
+    effects = no_effects(1, modulus)._replace(rate=c)
+    history, strain, forces = new_history(1, 1), 0.0, np.zeros(1)
+    for _ in range(20000):
+        strain += wanted * step
+        follow_lines(effects, step, np.array([strain]), history)
+    add_effect_forces(effects, np.array([strain]), history, forces)
+    lack = forces[0] / modulus
+    assert lack == pytest.approx(c / modulus * np.sqrt(wanted / 0.1), rel=0.01)
+    for _ in range(5000):
+        follow_lines(effects, step, np.array([strain]), history)
+    quick = 0.1 * (modulus / c) ** 2
+    left = strain - history.followed[0]
+    assert left == pytest.approx(1 / (1 / lack + quick * 0.5), rel=1e-6)
 
 
 def test_rate_dependence_and_lag_vanish_at_rest():

@@ -70,7 +70,7 @@ def with_fitted(problem: Problem, name: str, effect: Effect) -> ArmModel | None:
     """
     if name in problem.model.effects or _values(effect) > MOST_VALUES:
         return None
-    model = with_effect(copy.deepcopy(problem.model), name, effect)
+    model = with_effect(copy.deepcopy(problem.model), name, copy.deepcopy(effect))
     refine(model, problem, [name], ITERATIONS)
     effect = model.effects[name]
     if not effect.plausible() and effect.shapes() and shrink(effect):

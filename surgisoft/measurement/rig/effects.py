@@ -15,8 +15,6 @@ CREEP_TIMES = np.array([0.6, 2.4, 9.6, 38.4, 153.6])
 """Retardation times [s] whose sum stands for a power law over three decades (Findley 1976)."""
 SLIP_S = 150.0
 """Time that a loose marker takes to slip, while the arm is bent [s]."""
-RATE_FILTER_S = 0.03
-"""Time constant of the strain rate [s]."""
 REFERENCE_KPA = 54.0
 """Pressure by which amplitudes are scaled [kPa]."""
 BREATH_POWER = 6
@@ -80,10 +78,8 @@ class History(NamedTuple):
 
     creep: np.ndarray
     """(m, 5) retarded loads [-]."""
-    before: np.ndarray
-    """(J,) strain of each line one period ago [-]."""
-    rate: np.ndarray
-    """(J,) strain rate of each line [1/s]."""
+    followed: np.ndarray
+    """(J,) strain that each line's fluid has let the wall take [-]."""
     stuck: np.ndarray
     """(J,) strain at which each line stuck last [-]."""
     peak: np.ndarray
@@ -125,8 +121,7 @@ def new_history(chambers: int, lines: int) -> History:
     """No past."""
     return History(
         creep=np.zeros((chambers, len(CREEP_TIMES))),
-        before=np.zeros(lines),
-        rate=np.zeros(lines),
+        followed=np.zeros(lines),
         stuck=np.zeros(lines),
         peak=np.zeros(lines),
         slipped=np.zeros(2),
@@ -136,8 +131,7 @@ def new_history(chambers: int, lines: int) -> History:
 def forget(history):
     """What venting and resting undo."""
     history.creep[:] = 0.0
-    history.before[:] = 0.0
-    history.rate[:] = 0.0
+    history.followed[:] = 0.0
     history.stuck[:] = 0.0
     history.peak[:] = 0.0
 
@@ -189,13 +183,17 @@ def effective_pressures(effects, time, step, chamber, history, effective):
 
 @compiled
 def follow_lines(effects, step, strains, history):
-    """Let the lines' memories follow their strains (J,) over one period [s]."""
+    """Let the lines' memories follow their strains (J,) over one period [s].
+
+    Rate: the wall beside a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d what the strain y
+    lacks of the strain that the wall would take by itself; over a period d is 1 / (1/d + t/T).
+    """
     for j in range(strains.shape[0]):
         strain = strains[j]
         if effects.rate != 0.0:
-            rate = (strain - history.before[j]) / step
-            history.rate[j] += step / (RATE_FILTER_S + step) * (rate - history.rate[j])
-            history.before[j] = strain
+            lack = strain - history.followed[j]
+            quick = 0.1 * (effects.modulus / effects.rate) ** 2 * step
+            history.followed[j] = strain - lack / (1.0 + quick * abs(lack))
         if effects.stick[0] != 0.0 and abs(strain - history.stuck[j]) > effects.stick[1]:
             history.stuck[j] = strain
         if effects.softening != 0.0:
@@ -206,7 +204,7 @@ def follow_lines(effects, step, strains, history):
 def add_effect_forces(effects, strains, history, forces):
     """Add the effects' tension of each line [N] to forces (J,); strains: (J,) [-].
 
-    Rate: a shear-thinning fluid's power law. Stick-slip: springs that let go all at once.
+    Rate: what the fluid of `follow_lines` carries. Stick-slip: springs that let go all at once.
     Softening: Ogden & Roxburgh (1999), the share erf((W_max - W) / (m + b W_max)) of the
     damage. Stiffening: exponential, as Fung's (1967) tissue.
     """
@@ -214,8 +212,7 @@ def add_effect_forces(effects, strains, history, forces):
         strain = strains[j]
         forces[j] *= 1.0 + effects.friction
         if effects.rate != 0.0:
-            rate = history.rate[j]
-            forces[j] += math.copysign(effects.rate * math.sqrt(abs(rate) / 0.1), rate)
+            forces[j] += effects.modulus * (strain - history.followed[j])
         if effects.stick[0] != 0.0:
             forces[j] += effects.stick[0] * (strain - history.stuck[j])
         if effects.softening != 0.0:

@@ -33,7 +33,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.scan import linear_scan
+from surgisoft.surrogate.scan import follow, linear_scan
 
 CHAIN = 3
 """Lags that make up the dead time."""
@@ -163,7 +163,8 @@ class LineLag(Effect):
         for link in memory[..., 1:].unbind(-1):
             before = linear_scan(keep, (1 - keep) * before, link)
             chain.append(before)
-        chamber = _follow(self._flow(context.dt_s), before, memory[..., 0], self.reach)
+        flow = self._flow(context.dt_s)
+        chamber = follow(flow.decayed, before, memory[..., 0], TOLERANCE * self.reach)
         return torch.stack([chamber, *chain], dim=-1)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -186,29 +187,3 @@ class LineLag(Effect):
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
         ]
-
-
-def _follow(flow: Flow, target: Tensor, start: Tensor, reach: Tensor) -> Tensor:
-    """(R, T, m) chamber pressure that follows the target (R, T, m) from the start (R, m).
-
-    By Newton's method on the whole recording (Lim et al. 2024, "Parallelizing non-linear sequential
-    models over the sequence length"): around the last answer a row's map of the row before is
-    affine, and one scan solves all of them. After k passes the first k rows are those of stepping;
-    a handful of passes are enough. The last pass, at the answer, carries the gradients.
-    """
-
-    def solve(lagged: Tensor) -> Tensor:
-        before = torch.cat([start.detach().unsqueeze(1), lagged[:, :-1]], dim=1)
-        left, slope = flow.decayed(target - before)
-        slope = slope.detach()
-        return linear_scan(slope, target - left - slope * before, start)
-
-    with torch.no_grad():
-        lagged, settled = target, torch.zeros_like(target[:, :1, :1], dtype=torch.bool)
-        for _ in range(target.shape[1]):
-            last, lagged = lagged, torch.where(settled, lagged, solve(lagged))
-            moved = ((lagged - last).abs() > TOLERANCE * reach).flatten(1).any(1)
-            settled = settled | ~moved.view(-1, 1, 1)
-            if bool(settled.all()):
-                break
-    return solve(lagged.detach())

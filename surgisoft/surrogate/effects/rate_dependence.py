@@ -1,14 +1,20 @@
 """Rate dependence: a viscous wall resists fast changes.
 
-    y' = (u - y) / tau,   r = (u - y) / tau,                      u = A x, x = load,
-    x_eff = x - A' (viscous r + thinning r / (r^2 + r_0^2)^(1/4)),
+    y' = (u - y) / tau  (1 + |u - y| / turn) / (1 + 1/10 / turn),      u = A x, x = load,
+    x_eff = x + share A' (y - u) / a,      a = |A'A|, its largest eigenvalue.
 
-r is the rate of a wall line's load, filtered over tau. The first resistance is Newton's fluid, the
-second the shear-thinning one of Ostwald and de Waele with the power 1/2 (Bird, Armstrong & Hassager
-1987, sec. 4.1), smoothed below r_0. A has ones on its diagonal and the share of the other chambers
-beside them: a chamber that bends the arm shortens the wall on the other side. The load is held
-between two rows.
+u is the load of a wall line, y the part of it that the line has followed, and u - y the stress
+that its fluid takes up. With share = 1 a line is a spring beside a dashpot (Kelvin & Voigt), with
+less of it the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is
+that of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newton's at stresses
+below `turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele).
+So tau is the time constant at a stress of a tenth of the range, and turn -> infinity Newton's fluid.
+A has ones on its diagonal and the share of the other chambers beside them: a chamber that bends the
+arm shortens the wall on the other side; what moves all lines most is held back by the whole share.
+The load is held between two rows; over one of them the equation, a logistic one, is solved exactly.
 """
+
+import itertools
 
 import torch
 from torch import Tensor, nn
@@ -23,80 +29,100 @@ from surgisoft.surrogate.effects.base import (
     mixed,
     value_of,
 )
-from surgisoft.surrogate.scan import linear_scan
+from surgisoft.surrogate.scan import follow
 
-SLOW = 0.01
-"""Rate r_0 below which the shear-thinning term is linear, 1/s."""
-GRID = (0.04, 0.12, 0.4)
-"""Filter times that a diagnosis tries, s."""
+USUAL = 0.1
+"""Stress, as a share of the largest load, at which the time constant is stated."""
+NEWTON = 100.0
+"""Stress up to which a fluid is Newton's unless told otherwise."""
+THIN = 0.01
+"""The same for the shear-thinning fluid that a diagnosis tries."""
+GRID = (
+    *itertools.product((0.04, 0.1, 0.25, 0.6), (NEWTON,), (0.0, -0.5)),
+    *itertools.product((0.01, 0.04, 0.15, 0.6), (THIN,), (0.0, -0.5)),
+)
+"""Time constant in s, stress of the turn and share of the others that a diagnosis tries."""
+TOLERANCE = 1e-6
+"""Change of a whole recording's loads at which their iteration ends."""
 
 
 class RateDependence(Effect):
-    """Newtonian and shear-thinning resistance to the rate of the wall lines' loads, all alike."""
+    """Newtonian or shear-thinning resistance to the rate of the wall lines' loads, all alike."""
 
     stage = "material"
+    side_by_side = False  # a wall has one fluid; several of both signs would be a lead
 
-    def __init__(self, facts: ArmFacts, tau_s: float = 0.2, others: float = 0.0):
-        """Time over which the rate is taken, s; share of the other chambers in a line's load."""
+    def __init__(
+        self, facts: ArmFacts, tau_s: float = 0.2, turn: float = NEWTON, others: float = 0.0
+    ):
+        """Time constant, s; stress at which the fluid thins, as a share of the largest load; share
+        of the other chambers in a line's load."""
         super().__init__(facts)
-        self.viscous = amplitude(1)
-        self.thinning = amplitude(1)
+        self.share = amplitude(1)
         self.log_tau = logarithm(tau_s)
+        self.log_turn = logarithm(turn)
         self.others = nn.Parameter(torch.tensor([float(others)]))
 
     def strengths(self) -> dict[str, nn.Parameter]:
-        return {"viscous": self.viscous, "thinning": self.thinning}
+        return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
-        return [self.log_tau, self.others]
+        return [self.log_tau, self.log_turn, self.others]
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, tau) for tau in GRID]
+        alone = len(facts.low) == 1
+        return [cls(facts, *shape) for shape in GRID if shape[2] == 0.0 or not alone]
 
     def lines(self, signal: Tensor) -> Tensor:
         """(..., m) load of each wall line from the actuation (..., m)."""
         return mixed(self.load(signal), self.others)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m) filtered loads of an arm that has rested at the actuation (B, m)."""
+        """(B, m) what the lines of an arm that has rested at the actuation (B, m) have followed."""
         return self.lines(signal)
 
+    def _decayed(self, dt: Tensor, stress: Tensor) -> tuple[Tensor, Tensor]:
+        """What dt (..., 1) s leave of a stress (..., m), and its derivative by the stress."""
+        turn = self.log_turn.exp()
+        keep = torch.exp(-dt * (-self.log_tau).exp() / (1 + USUAL / turn))
+        faster = 1 + (1 - keep) * stress.abs() / turn
+        return stress * keep / faster, keep / faster.square()
+
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, m) filtered loads after the actuation (B, m)."""
-        keep = torch.exp(-context.dt_s.unsqueeze(-1) / self.log_tau.exp())
-        return keep * memory + (1 - keep) * self.lines(signal)
+        """(B, m) what the lines have followed after the actuation (B, m)."""
+        u = self.lines(signal)
+        return u - self._decayed(context.dt_s.unsqueeze(-1), u - memory)[0]
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, m) filtered loads along the actuation (R, T, m)."""
-        keep = torch.exp(-context.dt_s.unsqueeze(-1) / self.log_tau.exp())
-        return linear_scan(keep, (1 - keep) * self.lines(signal), memory)
+        """(R, T, m) what the lines have followed along the actuation (R, T, m)."""
+        dt = context.dt_s.unsqueeze(-1)
+        return follow(lambda s: self._decayed(dt, s), self.lines(signal), memory, TOLERANCE)
 
-    def _resistances(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        rate = (self.lines(signal) - memory) / self.log_tau.exp()
-        thin = rate / (rate.square() + SLOW**2).pow(0.25)
-        return mixed(rate, self.others), mixed(thin, self.others)
+    def _behind(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(..., m) what the fluid keeps back of the loads, at a share of one."""
+        others = len(self.reach) - 1
+        together = (1 + others * self.others).square()
+        most = torch.maximum(together, (1 - self.others).square()) if others else together
+        return mixed(memory - self.lines(signal), self.others) / most
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation and filtered loads (..., m)."""
-        newton, thin = self._resistances(signal, memory)
-        return signal - self.reach * (self.viscous * newton + self.thinning * thin)
+        """Effective actuation (..., m) from actuation and followed loads (..., m)."""
+        return signal + self.reach * self.share * self._behind(signal, memory)
 
     def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
-        return -self.reach * torch.stack(self._resistances(signal, memory)).detach()
+        return (self.reach * self._behind(signal, memory)).unsqueeze(0).detach()
 
     def config(self) -> dict:
         return {}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: what is slower than a second is creep"
-        passive = "a fluid takes energy at high rates; a little less than 0 for the noise"
-        learned = "less than 0 where a network that sees directions has learned too much of it"
-        at_one = float((self.viscous + self.thinning).detach())
+        fluid = "1: a fluid keeps all of a step back; it cannot push"
+        both = "from shear-thinning at every stress to Newton's at every stress"
         return [
-            Quantity("viscous_s", value_of(self.viscous), "s", -0.05, 1.0, passive),
-            Quantity("thinning_s^0.5", value_of(self.thinning), "s^0.5", -0.5, 1.0, learned),
-            Quantity("shift_at_1_per_s_share", at_one, "", 0.0, 1.0, "viscosity takes energy"),
-            Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.01, 10.0, rubber),
+            Quantity("share", value_of(self.share), "", 0.0, 1.05, fluid),
+            Quantity("tau_s", value_of(self.log_tau.exp()), "s", 0.005, 10.0, rubber),
+            Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]

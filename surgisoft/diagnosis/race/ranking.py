@@ -194,25 +194,15 @@ class Race:
     def plausible(self, way: Option, base: tuple[int, ...] = ()) -> bool:
         """Whether an effect's parameters lie in their ranges as the race leaves them.
 
-        Several shapes side by side are as plausible as the best of them. Where a shape was fitted
-        within the ranges, those of the grid get no more room than that. One that only inner
+        Several shapes side by side are as plausible as the best of them. One that only inner
         reversals show must explain more than a function of the actuation does: on ramps that all
         begin at rest, loops can be summed to any such function.
         """
-        single = self.single(way, base)
-        effect = self.in_place(single, base)
-        if effect is not None:
-            near = _near if self._as_told(single) else (lambda quantity: quantity.plausible)
-            if not all(near(quantity) for quantity in effect.quantities()):
-                return False
+        effect = self.in_place(self.single(way, base), base)
+        if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
+            return False
         some = self.candidates[self.options[way.effect][0].shape].effect
         return not some.needs_reversals or self._static_share(way, base) <= MOST_STATIC
-
-    def _as_told(self, way: Option) -> bool:
-        """Whether nothing better is known of a shape's parameters than the race's own estimate."""
-        shapes = [w.shape for w in self.options[way.effect] if w.shape is not None]
-        fitted = [shape for shape in shapes if self.candidates[shape].fitted]
-        return not fitted or way.shape in fitted
 
     def _static_share(self, way: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""

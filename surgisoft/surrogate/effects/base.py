@@ -240,11 +240,6 @@ def logarithm(value: float) -> nn.Parameter:
     return nn.Parameter(torch.tensor([float(value)]).log())
 
 
-def mixed(load: Tensor, share: Tensor) -> Tensor:
-    """(..., m) loads of wall lines: each chamber's (..., m) and a share () of all the others'."""
-    return load + share * (load.sum(-1, keepdim=True) - load)
-
-
 def value_of(tensor: Tensor) -> float | list:
     """A parameter for a `Quantity`: a number where there is one, else nested lists."""
     tensor = tensor.detach().cpu()

@@ -1,16 +1,16 @@
 """Rate dependence: a viscous wall resists fast changes.
 
-    y' = (u - y) / tau  (1 + |u - y| / turn) / (1 + 1/10 / turn),      u = A x, x = load,
-    x_eff = x + share A' (y - u) / a,      a = |A'A|, its largest eigenvalue.
+    y' = (u - y) / tau  (1 + |u - y| / turn) / (1 + 1/10 / turn),      u = A x / |A|, x = load,
+    x_eff = x + share A' (y - u) / |A|.
 
 u is the load of a wall line, y the part of it that the line has followed, and u - y the stress
 that its fluid takes up. With share = 1 a line is a spring beside a dashpot (Kelvin & Voigt), with
-less of it the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is
-that of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newton's at stresses
-below `turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele).
-So tau is the time constant at a stress of a tenth of the range, and turn -> infinity Newton's fluid.
-A has ones on its diagonal and the share of the other chambers beside them: a chamber that bends the
-arm shortens the wall on the other side; what moves all lines most is held back by the whole share.
+less the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is that
+of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newton's at stresses below
+`turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele). So
+tau is the time constant at a stress of a tenth of the range; turn -> infinity is Newton's fluid. A
+mixes the chambers' loads into those of the lines (`wall_lines`): a chamber that bends the arm
+shortens the wall on the other side; what moves all lines most is held back by the whole share.
 The load is held between two rows; over one of them the equation, a logistic one, is solved exactly.
 """
 
@@ -26,10 +26,10 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
-    mixed,
     value_of,
 )
 from surgisoft.surrogate.scan import follow
+from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
 
 USUAL = 0.1
 """Stress, as a share of the largest load, at which the time constant is stated."""
@@ -37,11 +37,10 @@ NEWTON = 100.0
 """Stress up to which a fluid is Newton's unless told otherwise."""
 THIN = 0.01
 """The same for the shear-thinning fluid that a diagnosis tries."""
-GRID = (
-    *itertools.product((0.04, 0.1, 0.25, 0.6), (NEWTON,), (0.0, -0.5)),
-    *itertools.product((0.01, 0.04, 0.15, 0.6), (THIN,), (0.0, -0.5)),
-)
-"""Time constant in s, stress of the turn and share of the others that a diagnosis tries."""
+NEWTONS, THINS = (0.04, 0.1, 0.25, 0.6), (0.01, 0.04, 0.15, 0.6)
+"""Time constants of Newton's and of shear-thinning fluids that a diagnosis tries, s."""
+LINES = ((0.0, False), (-0.5, False), (0.0, True))
+"""Share of the others in a wall line's load, and whether lines stand in a ring, that it tries."""
 TOLERANCE = 1e-6
 """Change of a whole recording's loads at which their iteration ends."""
 
@@ -53,11 +52,17 @@ class RateDependence(Effect):
     side_by_side = False  # a wall has one fluid; several of both signs would be a lead
 
     def __init__(
-        self, facts: ArmFacts, tau_s: float = 0.2, turn: float = NEWTON, others: float = 0.0
+        self,
+        facts: ArmFacts,
+        tau_s: float = 0.2,
+        turn: float = NEWTON,
+        others: float = 0.0,
+        ring: bool = False,
     ):
-        """Time constant, s; stress at which the fluid thins, as a share of the largest load; share
-        of the other chambers in a line's load."""
+        """Time constant, s; stress at which the fluid thins, as a share of the largest load; the
+        wall lines' loads (`wall_lines`)."""
         super().__init__(facts)
+        self.ring = bool(ring)
         self.share = amplitude(1)
         self.log_tau = logarithm(tau_s)
         self.log_turn = logarithm(turn)
@@ -71,50 +76,55 @@ class RateDependence(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        alone = len(facts.low) == 1
-        return [cls(facts, *shape) for shape in GRID if shape[2] == 0.0 or not alone]
+        lines = lines_tried(len(facts.low), LINES)
+        chambers = [some for some in lines if not some[1]]  # linear lines in a ring are the same
+        newton = itertools.product(NEWTONS, (NEWTON,), chambers)
+        thin = itertools.product(THINS, (THIN,), lines)
+        return [cls(facts, tau, turn, *some) for tau, turn, some in (*newton, *thin)]
 
     def lines(self, signal: Tensor) -> Tensor:
-        """(..., m) load of each wall line from the actuation (..., m)."""
-        return mixed(self.load(signal), self.others)
+        """(..., K) load of each wall line from the actuation (..., m)."""
+        return self.load(signal) @ self._lines.T
+
+    @property
+    def _lines(self) -> Tensor:
+        """(K, m) loads of the wall lines by those of the chambers."""
+        return wall_lines(self.others, len(self.reach), self.ring)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m) what the lines of an arm that has rested at the actuation (B, m) have followed."""
+        """(B, K) what the lines of an arm that has rested at the actuation (B, m) have followed."""
         return self.lines(signal)
 
     def _decayed(self, dt: Tensor, stress: Tensor) -> tuple[Tensor, Tensor]:
-        """What dt (..., 1) s leave of a stress (..., m), and its derivative by the stress."""
+        """What dt (..., 1) s leave of a stress (..., K), and its derivative by the stress."""
         turn = self.log_turn.exp()
         keep = torch.exp(-dt * (-self.log_tau).exp() / (1 + USUAL / turn))
         faster = 1 + (1 - keep) * stress.abs() / turn
         return stress * keep / faster, keep / faster.square()
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, m) what the lines have followed after the actuation (B, m)."""
+        """(B, K) what the lines have followed after the actuation (B, m)."""
         u = self.lines(signal)
         return u - self._decayed(context.dt_s.unsqueeze(-1), u - memory)[0]
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, m) what the lines have followed along the actuation (R, T, m)."""
+        """(R, T, K) what the lines have followed along the actuation (R, T, m)."""
         dt = context.dt_s.unsqueeze(-1)
         return follow(lambda s: self._decayed(dt, s), self.lines(signal), memory, TOLERANCE)
 
     def _behind(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(..., m) what the fluid keeps back of the loads, at a share of one."""
-        others = len(self.reach) - 1
-        together = (1 + others * self.others).square()
-        most = torch.maximum(together, (1 - self.others).square()) if others else together
-        return mixed(memory - self.lines(signal), self.others) / most
+        return (memory - self.lines(signal)) @ self._lines
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation and followed loads (..., m)."""
+        """Effective actuation (..., m) from actuation (..., m) and followed loads."""
         return signal + self.reach * self.share * self._behind(signal, memory)
 
     def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
         return (self.reach * self._behind(signal, memory)).unsqueeze(0).detach()
 
     def config(self) -> dict:
-        return {}
+        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: what is slower than a second is creep"

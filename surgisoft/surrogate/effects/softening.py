@@ -3,12 +3,12 @@
 As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall line's load, its
 largest value so far W_max, and an exponential instead of the error function:
 
-    x_eff = x + own A' (u d(W, W_max)) + common x d(V, V_max),   u = A x,
+    x_eff = x + own A' (u d(W, W_max)) / |A| + common x d(V, V_max),   u = A x / |A|,
     d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
     W_i = u_i^2,   V = sum_i x_i^2 / m.
 
-A has ones on its diagonal and the share of the other chambers beside them: a chamber that bends the
-arm shortens the wall on the other side. On a first loading W = W_max and nothing changes.
+A mixes the chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm
+shortens the wall on the other side. On a first loading W = W_max and nothing changes.
 """
 
 import torch
@@ -21,14 +21,15 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
-    mixed,
     value_of,
 )
+from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 """Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
-OTHERS = (0.0, -0.35)
-"""Shares of the other chambers in a wall line's load that a diagnosis tries."""
+LINES = ((0.0, False), (-0.35, False), (0.0, True))
+"""Share of the others in a wall line's load, and whether lines stand in a ring, that a diagnosis
+tries."""
 
 
 class Softening(Effect):
@@ -37,14 +38,20 @@ class Softening(Effect):
     stage = "material"
 
     def __init__(
-        self, facts: ArmFacts, width: float = 0.2, growth: float = 0.02, others: float = 0.0
+        self,
+        facts: ArmFacts,
+        width: float = 0.2,
+        growth: float = 0.02,
+        others: float = 0.0,
+        ring: bool = False,
     ):
         """width: fall of the energy over which the wall turns soft, in units of that at full load.
 
-        growth: what that grows by, as a share of the largest energy; others: share of the other
-        chambers in a wall line's load.
+        growth: what that grows by, as a share of the largest energy; others, ring: the wall lines'
+        loads (`wall_lines`).
         """
         super().__init__(facts)
+        self.ring = bool(ring)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
@@ -56,36 +63,41 @@ class Softening(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        others = OTHERS if len(facts.low) > 1 else OTHERS[:1]
-        return [cls(facts, *widths, share) for widths in GRID for share in others]
+        lines = lines_tried(len(facts.low), LINES)
+        return [cls(facts, *widths, *some) for widths in GRID for some in lines]
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.others]
 
+    @property
+    def _lines(self) -> Tensor:
+        """(K, m) loads of the wall lines by those of the chambers."""
+        return wall_lines(self.others, len(self.reach), self.ring)
+
     def energy(self, signal: Tensor) -> Tensor:
-        """(..., m + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
+        """(..., K + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
         load = self.load(signal)
-        own, mean = mixed(load, self.others).square(), load.square().mean(-1, keepdim=True)
+        own, mean = (load @ self._lines.T).square(), load.square().mean(-1, keepdim=True)
         return torch.cat([own, mean], dim=-1)
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m + 1) largest energies of an arm that has only seen the actuation (B, m)."""
+        """(B, K + 1) largest energies of an arm that has only seen the actuation (B, m)."""
         return self.energy(signal)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, m + 1) largest energies after the actuation (B, m)."""
+        """(B, K + 1) largest energies after the actuation (B, m)."""
         return torch.maximum(memory, self.energy(signal))
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, m + 1) largest energies along the actuation (R, T, m)."""
+        """(R, T, K + 1) largest energies along the actuation (R, T, m)."""
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at strength one: own and common."""
         below = (memory - self.energy(signal)).clamp(min=0)
         damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
-        load = self.load(signal)
-        own = mixed(mixed(load, self.others) * damage[..., :-1], self.others)
+        load, lines = self.load(signal), self._lines
+        own = ((load @ lines.T) * damage[..., :-1]) @ lines
         return self.reach * own, self.reach * load * damage[..., -1:]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -97,7 +109,7 @@ class Softening(Effect):
         return torch.stack(self._softened(signal, memory)).detach()
 
     def config(self) -> dict:
-        return {}
+        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"

@@ -3,13 +3,14 @@
 The share of push that is lost grows with the load u of each wall line and with the bending of the
 arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
-    x_eff = x - own A' (u h(u^2)) - bend x h(B^2),   u = A x,
+    x_eff = x - own A' (u h(u^2)) / |A| - bend x h(B^2),   u = A x / |A|,
     h(q) = (exp(k q) - 1) / (exp(k) - 1),
     B^2 = sum_i (x_i - mean x)^2 m / (m - 1),
 
 with B = 1 where one chamber alone is fully loaded; of four chambers, which stand in a ring, opposed
-ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A has ones on its diagonal and the share
-of the other chambers beside them: a chamber that bends the arm shortens the wall on the other side.
+ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A mixes the
+chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm shortens the
+wall on the other side.
 """
 
 import torch
@@ -21,14 +22,15 @@ from surgisoft.surrogate.effects.base import (
     Quantity,
     amplitude,
     logarithm,
-    mixed,
     value_of,
 )
+from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
-OTHERS = (0.0, -0.35)
-"""Shares of the other chambers in a wall line's load that a diagnosis tries."""
+LINES = ((0.0, False), (-0.35, False), (0.0, True))
+"""Share of the others in a wall line's load, and whether lines stand in a ring, that a diagnosis
+tries."""
 
 
 class Stiffening(Memoryless):
@@ -36,12 +38,15 @@ class Stiffening(Memoryless):
 
     stage = "material"
 
-    def __init__(self, facts: ArmFacts, steepness: float = 1.0, others: float = 0.0):
+    def __init__(
+        self, facts: ArmFacts, steepness: float = 1.0, others: float = 0.0, ring: bool = False
+    ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
-        others: share of the other chambers in a wall line's load.
+        others, ring: the wall lines' loads (`wall_lines`).
         """
         super().__init__(facts)
+        self.ring = bool(ring)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
@@ -52,8 +57,8 @@ class Stiffening(Memoryless):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        others = OTHERS if len(facts.low) > 1 else OTHERS[:1]
-        return [cls(facts, steepness, share) for steepness in GRID for share in others]
+        lines = lines_tried(len(facts.low), LINES)
+        return [cls(facts, steepness, *some) for steepness in GRID for some in lines]
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at strength one: own and bending."""
@@ -69,8 +74,9 @@ class Stiffening(Memoryless):
             # A recording beyond the fitted range must not blow up.
             return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
 
-        line = mixed(x, self.others)
-        own = mixed(lost(line, line.square()), self.others)
+        lines = wall_lines(self.others, m, self.ring)
+        u = x @ lines.T
+        own = lost(u, u.square()) @ lines
         return self.reach * own, self.reach * lost(x, bend)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -82,7 +88,7 @@ class Stiffening(Memoryless):
         return torch.stack(self._lost(signal)).detach()
 
     def config(self) -> dict:
-        return {}
+        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: a rest of the push is left"

@@ -144,19 +144,31 @@ def test_softening_leaves_the_first_loading_and_softens_the_second():
 def test_softening_of_wall_lines_that_the_other_chambers_shorten():
     soft = make_effect("softening", RANGE, width=0.2, growth=0.1, others=-0.5)
     answer = run(with_strength(soft, own=0.2), [[1.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    # Lines see (1, -0.5, -0.5), then half of that.
-    near = 1 - math.exp(-0.75 / (0.2 + 0.1))
-    far = 1 - math.exp(-0.1875 / (0.2 + 0.025))
+    # Lines see (2, -1, -1) / 3, then half of that.
+    near = 1 - math.exp(-(1 / 3) / (0.2 + 0.4 / 9))
+    far = 1 - math.exp(-(1 / 12) / (0.2 + 0.1 / 9))
     assert torch.allclose(answer[0], torch.tensor([1.0, 0.0, 0.0]), atol=1e-6)
-    pushed = torch.tensor([0.5 * near + 0.25 * far, *2 * [-0.25 * near - 0.125 * far]])
+    pushed = torch.tensor([near / 3 + far / 6, *2 * [-near / 6 - far / 12]]) / 1.5
     assert torch.allclose(answer[1], torch.tensor([0.5, 0.0, 0.0]) + 0.2 * pushed, atol=1e-5)
 
 
 def test_stiffening_of_wall_lines_that_the_other_chambers_shorten():
     stiff = make_effect("stiffening", RANGE, steepness=0.001, others=-0.5)
     answer = run(with_strength(stiff, own=0.1), [[1.0, 1.0, 0.0]])
-    # Lines see (0.5, 0.5, -1) and resist by their cubes.
-    assert torch.allclose(answer[0], torch.tensor([0.94375, 0.94375, 0.1125]), atol=1e-3)
+    # Lines see (1, 1, -2) / 3 and resist by their cubes.
+    assert torch.allclose(answer[0], torch.tensor([1 - 0.1 / 9, 1 - 0.1 / 9, 0.2 / 9]), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["rate_dependence", "softening", "stiffening"])
+def test_a_ring_of_lines_answers_alike_whichever_chamber_is_loaded(name):
+    ring = make_effect(name, RANGE, others=-0.2, ring=True)
+    ring = with_strength(ring, **dict.fromkeys(ring.strengths(), 0.3))
+    loads = torch.tensor([[1.0, 0.3, 0.0], [0.4, 0.9, 0.1], [0.2, 0.1, 0.0]])
+    answer = run(ring, loads)
+    for turn in (1, 2):
+        turned = run(ring, loads.roll(turn, dims=1))
+        assert torch.allclose(turned, answer.roll(turn, dims=1), atol=1e-6)
+    assert (answer[2] - loads[2]).abs().max() > 1e-3
 
 
 def test_stiffening_takes_its_share_at_full_load_and_starts_as_a_cubic():

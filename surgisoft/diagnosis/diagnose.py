@@ -16,11 +16,12 @@ import numpy as np
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
+from surgisoft.diagnosis.kind import kind_of, unnamed
 from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
 from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.gates import first_shares, studentised
-from surgisoft.diagnosis.race.naming import CHANCE, name_effects
+from surgisoft.diagnosis.race.naming import name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.refinement.sharpen import sharpened
@@ -28,7 +29,6 @@ from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import (
     Diagnosis,
     ErrorLevels,
-    Kind,
     Ranked,
     Verdict,
     sentence_of,
@@ -46,23 +46,6 @@ RIVAL_SHARE = 0.9
 """Share of bootstrap samples in which the first must beat another that explains nearly as much."""
 RIVAL_GAIN = 0.8
 """Share of the first's gain from which another counts as a rival."""
-LEAST_LEFT = 1.0
-"""Factor on the surrogate's validated error that is left wherever something unknown is told: what
-is less may be the surrogate's own."""
-LEAST_EXPLAINED = 0.68
-"""Share of the error above the floor that the named effects and the next best one must explain
-where FAR or more is left; else something that is not known is missing."""
-EXPLAINED, MISSED_SHARE = 0.6, 0.2
-"""The same wherever something is left, where they explain so much less, of the error above the
-floor, than a black box does."""
-BETTER_BOX = (0.05, 0.25)
-"""From when on a black box does so much better than the named effects that they are not what is
-missing: share of the error above the floor that it explains besides, and mean fall of a block's log
-error."""
-UNKNOWN_SHARE = 0.35
-"""Share of the error above the floor that a black box must explain where no effect does."""
-OFF_SIZE = 2.2
-"""Factor on the validated error from which a static error is more than the surrogate's own."""
 NEAR = 0.1
 """Least share of the error above the floor that an effect explains that is said to come nearest."""
 NEAR_TIE = (0.02, 0.3)
@@ -71,18 +54,10 @@ which no form is known well enough to tell them apart, however sure the blocks a
 CLOSE_GAIN = 0.6
 """Least gain, as a share of the best one's, of effects whose shapes are fitted before they race
 again: to first order and on a grid a large effect loses some of what it explains."""
-FAR, ABOVE = 1.5, 1.3
-"""Factor on the validated error that is left from which something is missing, whatever it is, and
-factor on the floor by which the error must stand out from the noise."""
 UNTENABLE = 0.25
 """Confidence in the one effect that is named below which it is not."""
 NEAREST = 0.25
 """Most confidence in the effect that comes nearest to an unknown one."""
-LEAST_MOTIONS = 10
-"""Fewest different motions of which a black box may say that something is missing: on fewer it
-knows the surrogate's own error by heart."""
-TRAINED = 2.0
-"""Factor on the floor from which an error of the surrogate's own is too much."""
 
 Progress = Callable[[str], None]
 
@@ -241,10 +216,13 @@ def answer(found: Findings) -> Diagnosis:
     floor = float(np.sqrt(np.mean(problem.noise_mm**2)))
     reached = race.rmse_mm(race.losses(found.picked))
     numbers = statistics(found)
-    kind, effects = _kind(found, numbers)
+    names = tuple(standing.effect for standing in found.named)
+    further = found.next[0].gain if found.next else 0.0
+    wrong = bool(names) and found.loose is not None and found.loose.wrong
+    kind, effects = kind_of(names, found.rivals, further, wrong, numbers)
     sure = confidence(numbers)
     if kind == "identified" and sure < UNTENABLE:
-        kind, effects = _unnamed(numbers), ()
+        kind, effects = unnamed(numbers), ()
     if kind == "unknown_effect":
         sure = min(sure, NEAREST)
     levels = ErrorLevels(before, floor, min(reached, found.box.rmse_mm, before))
@@ -282,55 +260,6 @@ def _order(found: Findings) -> list[Standing]:
     named = [alone.get(standing.effect, standing) for standing in found.named]
     names = [standing.effect for standing in named]
     return named + [s for s in found.first if s.effect not in names]
-
-
-def _kind(found: Findings, numbers: dict) -> tuple[Kind, tuple[str, ...]]:
-    """The kind of the answer and the effects that it names."""
-    names = tuple(standing.effect for standing in found.named)
-    beyond = numbers["left_size"] >= LEAST_LEFT
-    if names:
-        wrong = found.loose is not None and found.loose.wrong
-        if wrong or (beyond and _imitated(found, numbers)):
-            return "unknown_effect", ()
-        if found.rivals and len(names) == 1:
-            return "ambiguous", (names[0], *found.rivals)
-        return ("several" if len(names) > 1 else "identified"), names
-    return _unnamed(numbers), ()
-
-
-def _unnamed(numbers: dict) -> Kind:
-    """The kind of an answer that names no effect."""
-    over = numbers["before_over_floor"]
-    if over >= ABOVE and numbers["left_size"] >= FAR:
-        return "unknown_effect"
-    if over >= TRAINED:
-        beyond = numbers["left_size"] >= LEAST_LEFT
-        box = numbers["box_share"] >= UNKNOWN_SHARE and _sure_of_box(numbers)
-        if beyond and (box or numbers["static_size"] >= OFF_SIZE):
-            return "unknown_effect"
-        if numbers["static_share"] >= 0.5:
-            return "surrogate_undertrained"
-    return "nothing_missing"
-
-
-def _imitated(found: Findings, numbers: dict) -> bool:
-    """Whether the named effects explain too little, or a black box far more."""
-    explained = numbers["explained_above_floor"]
-    further = found.next[0].gain if found.next else 0.0
-    together = explained + max(further, 0.0) * (1.0 - explained)
-    beaten = numbers["box_share"] - explained
-    sure = _sure_of_box(numbers)
-    if together < LEAST_EXPLAINED and numbers["left_size"] >= FAR:
-        return True
-    if together < EXPLAINED and sure and beaten >= MISSED_SHARE:
-        return True
-    share, log_gain = BETTER_BOX
-    return sure and beaten >= share and numbers["box_log_gain"] >= log_gain
-
-
-def _sure_of_box(numbers: dict) -> bool:
-    """Whether what a black box explains is more than chance and seen in motions enough."""
-    return numbers["box_p"] <= CHANCE and numbers["motions"] >= LEAST_MOTIONS
 
 
 def statistics(found: Findings) -> dict:

@@ -91,6 +91,18 @@ def test_an_error_within_the_validated_one_needs_more_to_be_named(table, monkeyp
     assert not naming.passes(table, [part], [], part)
 
 
+@pytest.mark.parametrize(("left", "joins"), [(9, True), (12, False)])
+def test_a_second_effect_that_does_well_alone_joins_where_no_shadow_does_as_well(
+    table, monkeypatch, left, joins
+):
+    """It leaves 35 of 100 alone, the first 20: a share of 0.66 is more than 0.75 times 0.81."""
+    monkeypatch.setitem(globals(), "LOSS", {"": 100, "0": 20, "1": 35, "01": left})
+    monkeypatch.setitem(globals(), "NAMES", ("first", "second"))
+    first = table.standings()
+    second = table.standings((0,), ("first",))[0]
+    assert naming.passes(table, first, first[:1], second) == joins
+
+
 def test_what_a_form_leaves_behind_is_no_further_effect(table, monkeypatch):
     """Where the first effect let loose explains what the second would, one is named."""
 

@@ -20,6 +20,8 @@ BESIDE = (0.3, 0.15, 0.75)
 alone beside what the first one does alone, for it must not be that one's shadow."""
 NEARLY_ALL = 0.8
 """Or: share of what the effects before it left that no shadow explains."""
+NO_SHADOW = (0.45, 0.45)
+"""Or: share of what the effects before it left, and log gain, that no shadow of theirs reaches."""
 SMALL = 0.5
 """The same where the whole error is within the surrogate's validated one."""
 LEAST_LOG_GAIN = 0.08
@@ -100,7 +102,9 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     least_gain, least_log, most = BESIDE
     alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
     beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
-    return bool(share >= NEXT_GAIN or beside or s.gain >= NEARLY_ALL)
+    no_shadow = s.gain >= NO_SHADOW[0] and log_gain >= NO_SHADOW[1]
+    no_shadow = no_shadow or s.gain >= NEARLY_ALL
+    return bool(share >= NEXT_GAIN or beside or no_shadow)
 
 
 def _exchanged(race: Race, named: list[Standing]) -> list[Standing]:

@@ -103,6 +103,9 @@ class Effect(nn.Module, ABC):
     """Whether several of its shapes at once make sense, as in a spectrum of times."""
     needs_reversals = False
     """Whether it can only be learned from data with inner reversals."""
+    settled_form = False
+    """Whether real arms have this very form, as with a turned frame or a weight, and not only one
+    like it, as with what rubber does."""
 
     def __init__(self, facts: ArmFacts):
         super().__init__()

@@ -17,6 +17,7 @@ class Misalignment(Memoryless):
     """A similarity between the frame of the arm's base and that of the measurement."""
 
     stage = "sensor"
+    settled_form = True
 
     def __init__(self, facts: ArmFacts):
         super().__init__(facts)

@@ -21,6 +21,7 @@ class Payload(Memoryless):
     """Weight at the tip and along the body."""
 
     stage = "body"
+    settled_form = True
 
     def __init__(self, facts: ArmFacts):
         super().__init__(facts)

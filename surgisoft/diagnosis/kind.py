@@ -12,7 +12,7 @@ is less may be the surrogate's own."""
 LEAST_EXPLAINED = 0.68
 """Share of the error above the floor that the named effects and the next best one must explain
 where FAR or more is left; else something that is not known is missing."""
-LEAST_SETTLED = 0.8
+LEAST_SETTLED = 0.95
 """The same of effects alone that real arms have in this very form (`Effect.settled_form`)."""
 EXPLAINED, MISSED_SHARE = 0.6, 0.2
 """The same wherever something is left, where they explain so much less, of the error above the

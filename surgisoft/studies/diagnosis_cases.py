@@ -30,13 +30,14 @@ MEMORY = {"hysteresis", "rate_dependence", "line_lag", "creep", "softening", "dr
 UNKNOWN = (
     "stick_slip",
     "leak",
-    "sensor_crosstalk",
     "marker_slip",
     "breathing",
     "valve_jam",
     "fibre_break",
+    "knock",
 )
-"""Hidden effects that are not in the model's list."""
+"""Hidden effects that are not in the model's list. Crosstalk of the pressure sensors is not among
+them: a linear map of the pressures is the list's coupling with its gains, whatever made it."""
 PAIRS = (
     ("creep", "payload"),
     ("line_lag", "misalignment"),

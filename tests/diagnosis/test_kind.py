@@ -34,7 +34,7 @@ def test_what_passed_and_explains_nearly_all_is_named():
     [
         ("misalignment", 1.6, 0.71, "unknown_effect"),
         ("misalignment", 1.4, 0.71, "identified"),
-        ("misalignment", 1.6, 0.85, "identified"),
+        ("misalignment", 1.6, 0.97, "identified"),
         ("softening", 1.6, 0.71, "identified"),
         ("softening", 1.6, 0.60, "unknown_effect"),
     ],

@@ -214,12 +214,23 @@ def test_a_jammed_valve_keeps_the_air_of_its_chamber_and_lets_it_go_again():
     assert np.mean(bad < 0.3) > 0.3  # open again, the chamber is at its pressure
 
 
+def test_a_knock_turns_the_base_once_and_for_all():
+    path = np.tile([10.0, 20, 30], (25, 1))
+    plain, knocked = tips(path, "knock", settle_s=5.0)
+    shift = np.linalg.norm(knocked - plain, axis=1)
+    late = int(np.argmax(shift > 0.1))
+    assert (shift[:late] == 0).all()
+    assert 30.0 < 6.0 * late + 30.0 < 115.0
+    np.testing.assert_allclose(shift[late:], shift[-1], rtol=0.05)
+    assert shift[-1] == pytest.approx(np.radians(1.2) * 60, rel=0.4)
+
+
 def test_a_fibre_breaks_once_and_no_rest_mends_it():
     path = np.tile([[50.0, 50, 50], [10.0, 10, 10]], (30, 1))
     plain, broken = tips(path, "fibre_break", settle_s=5.0)
     shift = np.linalg.norm(broken - plain, axis=1)[::2]
     late = int(np.argmax(shift > 0.1))
     assert (shift[:late] == 0).all()
-    assert 90.0 < 30.0 + 12.0 * late < 185.0
+    assert 40.0 < 30.0 + 12.0 * late < 115.0
     np.testing.assert_allclose(shift[late + 1 :], shift[-1], rtol=0.1)
     assert shift[-1] > 1.0

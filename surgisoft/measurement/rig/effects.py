@@ -53,6 +53,8 @@ class Effects(NamedTuple):
     """Torque of one chamber at 54 kPa [N mm]."""
     drift: np.ndarray
     """(3,) rotation of the base after ten minutes, arm base frame [rad]."""
+    knock: np.ndarray
+    """(4,) rotation of the base [rad], arm base frame, and moment from which on it has it [s]."""
     warmth: float
     """Stiffness lost per kelvin [-]; nonzero: the room is not air-conditioned."""
     misalignment: np.ndarray
@@ -105,6 +107,7 @@ def no_effects(chambers: int, line_stiffness: float) -> Effects:
         stiffening=0.0,
         twist=0.0,
         drift=np.zeros(3),
+        knock=np.zeros(4),
         warmth=0.0,
         misalignment=np.zeros(7),
         slip=np.zeros(4),
@@ -247,11 +250,15 @@ def room_temperature(effects, time):
 
 @compiled
 def drifted_base(effects, time, base, out):
-    """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law."""
+    """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law, and is
+    knocked aside at one moment."""
     out[:] = base
     grown = (time / 600.0) ** 0.6
     share = 1.3 * grown / (1.0 + 0.3 * grown)
-    rx, ry, rz = effects.drift[0] * share, effects.drift[1] * share, effects.drift[2] * share
+    aside = 1.0 if time >= effects.knock[3] else 0.0
+    rx = effects.drift[0] * share + effects.knock[0] * aside
+    ry = effects.drift[1] * share + effects.knock[1] * aside
+    rz = effects.drift[2] * share + effects.knock[2] * aside
     angle = math.sqrt(rx * rx + ry * ry + rz * rz)
     if angle == 0.0:
         return

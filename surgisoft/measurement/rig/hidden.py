@@ -16,6 +16,10 @@ from surgisoft.measurement.rig.arm import STANDARD_GRAVITY, chamber_thrusts, no_
 from surgisoft.measurement.rig.effects import REFERENCE_KPA, Effects
 from surgisoft.measurement.rig.rod import Loads, Rod, balance, new_shape
 
+MOMENT_S = (40.0, 100.0)
+"""Between when something happens that happens once [s]: within the two and a half minutes of the
+shortest recordings, and before their last quarter."""
+
 
 @dataclass
 class Bench:
@@ -199,10 +203,17 @@ def _valve_jam(bench: Bench, strength: float, rng: np.random.Generator) -> None:
     _set(bench, jam=spells, jammed=int(rng.integers(len(bench.effects.gain))))
 
 
+def _knock(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.radians(1.2) * strength
+    moment = rng.uniform(*MOMENT_S)
+    _set(bench, knock=np.array([turn * np.cos(angle), turn * np.sin(angle), 0.0, moment]))
+
+
 def _fibre_break(bench: Bench, strength: float, rng: np.random.Generator) -> None:
     broken = np.zeros(len(bench.effects.broken))
     broken[rng.integers(len(broken))] = 5.0 * strength
-    _set(bench, broken=broken, break_s=float(rng.uniform(90.0, 170.0)))
+    _set(bench, broken=broken, break_s=float(rng.uniform(*MOMENT_S)))
 
 
 HIDDEN: dict[str, Hidden] = {
@@ -239,6 +250,7 @@ HIDDEN: dict[str, Hidden] = {
     "marker_slip": Hidden("sensor", "a tip marker that slips while the arm is bent", _marker_slip),
     "breathing": Hidden("body", "the mount lies on a breathing body", _breathing),
     "valve_jam": Hidden("line", "a valve that sticks shut now and then", _valve_jam),
+    "knock": Hidden("body", "the bracket is knocked aside at one moment", _knock),
     "fibre_break": Hidden(
         "material", "a fibre snaps at one moment; its chamber bulges from then on", _fibre_break
     ),

@@ -44,7 +44,6 @@ class Contact(Memoryless):
     """A one-sided, yielding support at one key point."""
 
     stage = "body"
-    settled_form = True
 
     def __init__(
         self,

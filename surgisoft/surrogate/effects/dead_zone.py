@@ -29,7 +29,6 @@ class DeadZone(Memoryless):
     """A smooth dead zone around rest, the same for all chambers or one for each."""
 
     stage = "material"
-    settled_form = True
 
     def __init__(self, facts: ArmFacts, width: float = 0.1, each: bool = False):
         """Half width, as a share of full load; each: a threshold for each chamber."""

@@ -54,7 +54,6 @@ class Drift(Effect):
     """A yielding holder, or gains and offsets that follow the time or the temperature."""
 
     stage = "body"
-    settled_form = True
     side_by_side = False  # a quick drift less a slow one would be none: an error from the start
 
     def __init__(

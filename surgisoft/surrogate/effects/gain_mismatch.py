@@ -15,7 +15,6 @@ class GainMismatch(Memoryless):
     """A gain for each chamber."""
 
     stage = "material"
-    settled_form = True
 
     def __init__(self, facts: ArmFacts):
         super().__init__(facts)

@@ -101,7 +101,6 @@ class LineLag(Effect):
     """Lag of laminar or turbulent flow, with its own times up and down, and a dead time."""
 
     stage = "line"
-    settled_form = True
     side_by_side = False  # a chamber has one line; lags of both signs would be a lead
 
     def __init__(

@@ -6,7 +6,6 @@ shortens the wall on the other side. What a line holds back acts on the chambers
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -39,8 +38,12 @@ def wall_lines(others: Tensor, chambers: int, ring: bool = False) -> Tensor:
     return (common + (1 - common) * bent) / most
 
 
-def lines_tried(chambers: int, some: Sequence[tuple[float, bool]]) -> list[tuple[float, bool]]:
-    """Which of some (share of the others, ring) make sense for an arm of so many chambers."""
+def lines_tried(chambers: int, others: float) -> list[tuple[float, bool]]:
+    """(share of the others, ring) of the wall lines that a diagnosis tries on an arm.
+
+    Lines along the chambers that carry nothing else, and a ring of lines; where that is not known
+    to be one, the given share of the others in its place.
+    """
     if chambers == 1:
         return [(0.0, False)]
-    return [(others, ring) for others, ring in some if not ring or chambers in RINGS]
+    return [(0.0, False), (0.0, True) if chambers in RINGS else (others, False)]

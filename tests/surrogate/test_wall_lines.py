@@ -36,7 +36,6 @@ def test_of_four_chambers_the_opposite_one_takes_away_what_bends():
 
 
 def test_arms_whose_chambers_may_stand_otherwise_get_no_ring():
-    some = [(0.0, False), (-0.5, False), (0.0, True)]
-    assert lines_tried(1, some) == [(0.0, False)]
-    assert lines_tried(3, some) == some
-    assert lines_tried(6, some) == some[:2]
+    assert lines_tried(1, -0.5) == [(0.0, False)]
+    assert lines_tried(3, -0.5) == [(0.0, False), (0.0, True)]
+    assert lines_tried(6, -0.5) == [(0.0, False), (-0.5, False)]

@@ -21,12 +21,15 @@ from torch import Tensor, nn
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
 from surgisoft.surrogate.scan import play_scan
+from surgisoft.surrogate.wall_lines import RINGS, wall_lines
 
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
 """Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
 the half range (a larger radius never moves)."""
 OTHERS = (0.0, -0.2, -0.4)
 """Shares of the other chambers in a line that a diagnosis tries."""
+SECTION = {3: -0.2, 4: 0.2}
+"""Shares of the neighbours in the lines of a plane section: four fifths of a strain bend."""
 FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
 """Radii where a diagnosis asks whether there is any play."""
 
@@ -44,13 +47,15 @@ class Hysteresis(Effect):
         ring: bool = False,
         pairs: bool = True,
         others: float = 0.0,
+        section: bool = False,
     ):
         """Radii of the plays, in units of half a line's range.
 
         ring: the chambers are alike and stand in a ring, so that one chamber's weights, turned,
         are those of all; pairs: lines along pairs of neighbours beside those along one chamber;
         others: share of the other chambers in each line to start from, negative where a chamber
-        that bends the arm shortens the wall on the other side.
+        that bends the arm shortens the wall on the other side; section: the lines, those along
+        pairs too, are those of a plane section (`wall_lines`), others being that of a neighbour.
         """
         super().__init__(facts)
         chambers = len(facts.low)
@@ -64,8 +69,12 @@ class Hysteresis(Effect):
         lines = first_lines(chambers)
         if not self.pairs:
             lines = lines[:chambers]
-        self.others = float(others)
-        if self.others:
+        self.others, self.section = float(others), bool(section)
+        if self.section:
+            lines = wall_lines(torch.tensor(self.others), chambers, ring=True)
+            lines = torch.cat([lines[::2], lines[1::2].roll(1, dims=0)])
+            lines = lines / lines.abs().sum(1, keepdim=True)
+        elif self.others:
             lines = lines + self.others * (lines.sum(1, keepdim=True) - lines)
             lines = lines / lines.abs().sum(1, keepdim=True)
         self.linear = nn.Parameter(lines)
@@ -86,14 +95,20 @@ class Hysteresis(Effect):
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
         """Alike chambers, whose lines are stretched the other way by the rest of them or not."""
-        if len(facts.low) == 1:
+        m = len(facts.low)
+        if m == 1:
             return [cls(facts, FEW_RADII, ring=True, pairs=False)]
-        return [*cls.further(facts, points), cls(facts, FEW_RADII, True, True, OTHERS[1])]
+        pairs = [] if m in RINGS else [cls(facts, FEW_RADII, True, True, OTHERS[1])]
+        return [*cls.further(facts, points), *pairs]
 
     @classmethod
     def further(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        """Lines along single chambers: loops add up (Kuhnen 2003)."""
-        some = OTHERS if len(facts.low) > 1 else OTHERS[:1]
+        """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003)."""
+        m = len(facts.low)
+        if m in RINGS:
+            section = cls(facts, FEW_RADII, True, True, SECTION[m], True)
+            return [*(cls(facts, FEW_RADII, True, False, o) for o in OTHERS[::2]), section]
+        some = OTHERS if m > 1 else OTHERS[:1]
         return [cls(facts, FEW_RADII, True, False, others) for others in some]
 
     def use_chambers(self, use: Tensor) -> None:
@@ -163,6 +178,7 @@ class Hysteresis(Effect):
             "ring": self.ring,
             "pairs": self.pairs,
             "others": self.others,
+            "section": self.section,
         }
 
     def quantities(self) -> list[Quantity]:

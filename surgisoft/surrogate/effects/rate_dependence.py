@@ -14,8 +14,6 @@ shortens the wall on the other side; what moves all lines most is held back by t
 The load is held between two rows; over one of them the equation, a logistic one, is solved exactly.
 """
 
-import itertools
-
 import torch
 from torch import Tensor, nn
 
@@ -39,8 +37,8 @@ THIN = 0.01
 """The same for the shear-thinning fluid that a diagnosis tries."""
 NEWTONS, THINS = (0.04, 0.1, 0.25, 0.6), (0.01, 0.04, 0.15, 0.6)
 """Time constants of Newton's and of shear-thinning fluids that a diagnosis tries, s."""
-LINES = ((0.0, False), (-0.5, False), (0.0, True))
-"""Share of the others in a wall line's load, and whether lines stand in a ring, that it tries."""
+OTHERS = -0.5
+"""Share of the other chambers in a wall line's load that a diagnosis tries."""
 TOLERANCE = 1e-6
 """Change of a whole recording's loads at which their iteration ends."""
 
@@ -76,11 +74,9 @@ class RateDependence(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        lines = lines_tried(len(facts.low), LINES)
-        chambers = [some for some in lines if not some[1]]  # linear lines in a ring are the same
-        newton = itertools.product(NEWTONS, (NEWTON,), chambers)
-        thin = itertools.product(THINS, (THIN,), lines)
-        return [cls(facts, tau, turn, *some) for tau, turn, some in (*newton, *thin)]
+        newton = [cls(facts, tau) for tau in NEWTONS]  # any lines of it do nearly the same
+        lines = lines_tried(len(facts.low), OTHERS)
+        return [*newton, *(cls(facts, tau, THIN, *some) for tau in THINS for some in lines)]
 
     def lines(self, signal: Tensor) -> Tensor:
         """(..., K) load of each wall line from the actuation (..., m)."""

@@ -27,9 +27,8 @@ from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 """Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
-LINES = ((0.0, False), (-0.35, False), (0.0, True))
-"""Share of the others in a wall line's load, and whether lines stand in a ring, that a diagnosis
-tries."""
+OTHERS = -0.35
+"""Share of the other chambers in a wall line's load that a diagnosis tries."""
 
 
 class Softening(Effect):
@@ -63,7 +62,7 @@ class Softening(Effect):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        lines = lines_tried(len(facts.low), LINES)
+        lines = lines_tried(len(facts.low), OTHERS)
         return [cls(facts, *widths, *some) for widths in GRID for some in lines]
 
     def memory_parameters(self) -> list[nn.Parameter]:

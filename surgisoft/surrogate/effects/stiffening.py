@@ -28,9 +28,8 @@ from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
-LINES = ((0.0, False), (-0.35, False), (0.0, True))
-"""Share of the others in a wall line's load, and whether lines stand in a ring, that a diagnosis
-tries."""
+OTHERS = -0.35
+"""Share of the other chambers in a wall line's load that a diagnosis tries."""
 
 
 class Stiffening(Memoryless):
@@ -57,7 +56,7 @@ class Stiffening(Memoryless):
 
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        lines = lines_tried(len(facts.low), LINES)
+        lines = lines_tried(len(facts.low), OTHERS)
         return [cls(facts, steepness, *some) for steepness in GRID for some in lines]
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,8 @@ KNOWN_WEIGHT = 3.0
 
 PRICE = 0.003
 """Share of a gain that each amplitude costs: of two ways that explain alike, the simpler one."""
+MOST_PRICED = 12
+"""Most amplitudes that cost something: many share a ridge, and few of them are free."""
 
 MOST_STATIC = 0.95
 """Most of what loops explain that a function of the actuation may hold. On simulated arms it was
@@ -76,7 +78,7 @@ def _near(quantity: Quantity) -> bool:
 
 def priced(log_gain: float, amplitudes: int) -> float:
     """A log gain, the less of it counted the more amplitudes it took."""
-    return float(log_gain) * (1.0 - PRICE * min(amplitudes, 100))
+    return float(log_gain) * (1.0 - PRICE * min(amplitudes, MOST_PRICED))
 
 
 def _ways(candidates: Sequence[Candidate], number: int = 0, first: int = 0) -> Iterator[Option]:

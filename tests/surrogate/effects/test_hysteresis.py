@@ -71,10 +71,12 @@ def test_a_larger_sweep_wipes_out_smaller_ones(inner):
     assert torch.allclose(one[-1], other[-1], atol=1e-5)
 
 
-def test_a_ring_of_chambers_has_no_first():
+@pytest.mark.parametrize("section", [False, True])
+def test_a_ring_of_chambers_has_no_first(section):
     """Turning the pressures by a chamber turns the answer, bit for bit but for rounding."""
-    effect = stir(make_effect("hysteresis", FACTS, radii=(0.1, 0.4), ring=True), size=0.05)
-    lines = make_effect("hysteresis", FACTS, radii=(0.1, 0.4), ring=True)
+    shape = {"radii": (0.1, 0.4), "ring": True, "others": -0.2, "section": section}
+    effect = stir(make_effect("hysteresis", FACTS, **shape), size=0.05)
+    lines = make_effect("hysteresis", FACTS, **shape)
     effect.linear.data.copy_(lines.linear)
     effect.bent.data.zero_()
     x = 20 + 5 * torch.randn(1, 50, 3, generator=torch.Generator().manual_seed(1)).cumsum(1)
@@ -84,3 +86,10 @@ def test_a_ring_of_chambers_has_no_first():
 
     assert torch.allclose(answer(x.roll(1, -1)), answer(x).roll(1, -1), atol=1e-4)
     assert not torch.allclose(answer(x), x, atol=0.1)
+
+
+def test_lines_of_a_plane_section_stand_along_and_between_chambers():
+    """At a neighbour's share of -0.2 a fifth of a strain is common: by hand, |values| sum to 1."""
+    lines = make_effect("hysteresis", FACTS, others=-0.2, section=True).linear
+    assert torch.allclose(lines[0], torch.tensor([1.0, -0.2, -0.2]) / 1.4, atol=1e-6)
+    assert torch.allclose(lines[4], torch.tensor([1.0, 1.0, -1.0]) / 3, atol=1e-6)

@@ -66,12 +66,12 @@ def modelling(
 def diagnosis(
     robots: Annotated[
         str,
-        typer.Option(help="Robots, by the seed of their casting; 101 to 123 were seen before."),
-    ] = "124,125,126,127",
+        typer.Option(help="Robots, by the seed of their casting; 101 to 127 were seen before."),
+    ] = "128,129,130,131",
     count: Annotated[int, typer.Option(min=8, help="Robots with their recordings, in all.")] = 400,
     seed: Annotated[
-        int, typer.Option(min=0, help="Draws the cases; 1 to 9 were seen before.")
-    ] = 10,
+        int, typer.Option(min=0, help="Draws the cases; 1 to 10 were seen before.")
+    ] = 11,
     processes: Annotated[int, typer.Option(min=1, help="Robots side by side.")] = 2,
     work: Annotated[
         Path, typer.Option(metavar="DIR", help="Keeps base models and what was said of each robot.")

@@ -21,7 +21,7 @@ from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_referen
 from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.gates import first_shares, studentised
-from surgisoft.diagnosis.race.naming import name_effects
+from surgisoft.diagnosis.race.naming import CHANCE, LEAST_GAIN, SMALL, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
 from surgisoft.diagnosis.refinement.sharpen import sharpened
@@ -29,6 +29,7 @@ from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import (
     Diagnosis,
     ErrorLevels,
+    Kind,
     Ranked,
     Verdict,
     sentence_of,
@@ -246,9 +247,26 @@ def answer(found: Findings) -> Diagnosis:
         ranking=ranking,
         ambiguous_with=tuple(found.rivals) if kind in ("ambiguous", "several") else (),
         next_experiment=plan,
-        checks=tuple(weaknesses(problem)),
+        checks=(*weaknesses(problem), *within_the_fit(found, kind)),
         statistics=numbers | {"blocks": len(counts)},
     )
+
+
+def within_the_fit(found: Findings, kind: Kind) -> list[str]:
+    """What an effect would explain of an error that is no larger than the fit's own."""
+    if kind != "nothing_missing" or not found.first or found.race.whole_size >= 1.0:
+        return []
+    best = found.first[0]
+    if best.gain < LEAST_GAIN or best.p_value > CHANCE or found.race.in_fit(best.effect):
+        return []
+    text = (
+        f"{best.effect} would explain {100 * best.gain:.0f} % of the error, which is within what "
+        f"the model's fit validated, so that the fit may as well be what is off; at least "
+        f"{100 * SMALL:.0f} % are asked for there"
+    )
+    if known_effects()[best.effect].stage in ("line", "material"):
+        text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
+    return [text]
 
 
 def _order(found: Findings) -> list[Standing]:

@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recording import save_recording
@@ -190,3 +192,24 @@ def test_rivals_of_one_of_several_are_told():
     assert _rivals(race, [], [a, b]) == ["c"]
     assert _rivals(race, [a, c, d], [a]) == ["c"]
     assert _rivals(race, [], []) == []
+
+
+@pytest.mark.parametrize(
+    ("effect", "gain", "chance", "size", "told"),
+    [
+        ("creep", 0.44, 0.001, 0.9, "fit --effects creep"),
+        ("payload", 0.44, 0.001, 0.9, "payload would explain 44 %"),
+        ("creep", 0.20, 0.001, 0.9, None),
+        ("creep", 0.44, 0.100, 0.9, None),
+        ("creep", 0.44, 0.001, 1.1, None),
+    ],
+)
+def test_what_would_explain_an_errorwithin_the_fit_s_own_is_told(effect, gain, chance, size, told):
+    best = SimpleNamespace(effect=effect, gain=gain, p_value=chance)
+    race = SimpleNamespace(whole_size=size, in_fit=lambda name: False)
+    found = SimpleNamespace(first=[best], race=race)
+    checks = diagnosing.within_the_fit(found, "nothing_missing")
+    assert len(checks) == (told is not None)
+    assert told is None or told in checks[0]
+    assert told is None or ("fit --effects" in checks[0]) == (effect == "creep")
+    assert diagnosing.within_the_fit(found, "identified") == []

@@ -31,6 +31,9 @@ DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "def
 OWN_FILES = ("config.json", "weights.safetensors", "report.json", KNOWN_ERROR)
 """What a model's folder is made of; a replaced model leaves other files where they are."""
 
+ON_WALL_LINES = ("rate_dependence", "softening", "stiffening")
+"""Effects whose parameters meant something else before their wall lines could stand in a ring."""
+
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
@@ -142,6 +145,12 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
         if kind not in NETWORKS:
             raise unknown_name("network", kind, NETWORKS)
         check_files(config.get("effect_files", {}), str(folder))
+        for name, arguments in config["effects"].items():
+            if name.split("#")[0] in ON_WALL_LINES and "ring" not in arguments:
+                raise InputError(
+                    f"{folder}: its {name} was fitted by an earlier surgisoft, whose parameters "
+                    "meant something else; amend the model without it again"
+                )
         facts = arm_facts(spec, weights["rest_mm"])
         effects = {
             name: make_effect(name, facts, **arguments)

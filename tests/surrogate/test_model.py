@@ -1,6 +1,7 @@
 """The arm model: stepping is predicting, gradients are right, arms do not disturb each other."""
 
 import dataclasses
+import json
 from dataclasses import replace
 
 import pytest
@@ -213,3 +214,14 @@ def test_spec_wants_one_value_a_chamber():
 
 def test_rest_is_zero_or_the_nearest_end():
     assert ArmSpec(3, 2, (-15.0, 5.0, -9.0), (54.0, 20.0, -2.0)).rest == (0.0, 5.0, -2.0)
+
+
+@pytest.mark.parametrize("name", ["rate_dependence", "softening", "stiffening"])
+def test_an_effect_whose_parameters_meant_something_else_is_told(tmp_path, name):
+    save_model(model(effects=(name,)), tmp_path / "arm")
+    assert name in load_model(tmp_path / "arm").effects
+    config = json.loads((tmp_path / "arm" / "config.json").read_text())
+    config["effects"][name].pop("ring")
+    (tmp_path / "arm" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=f"its {name} was fitted by an earlier"):
+        load_model(tmp_path / "arm")

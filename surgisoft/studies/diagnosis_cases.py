@@ -36,8 +36,10 @@ UNKNOWN = (
     "fibre_break",
     "knock",
 )
-"""Hidden effects that are not in the model's list. Crosstalk of the pressure sensors is not among
-them: a linear map of the pressures is the list's coupling with its gains, whatever made it."""
+"""Hidden effects that are not in the model's list."""
+LEFT_OUT = ("sensor_crosstalk",)
+"""Neither: a linear map of the pressures is the list's coupling with its gains, whatever made it,
+and no single name is right."""
 PAIRS = (
     ("creep", "payload"),
     ("line_lag", "misalignment"),

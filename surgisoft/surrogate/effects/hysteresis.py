@@ -95,11 +95,9 @@ class Hysteresis(Effect):
     @classmethod
     def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
         """Alike chambers, whose lines are stretched the other way by the rest of them or not."""
-        m = len(facts.low)
-        if m == 1:
+        if len(facts.low) == 1:
             return [cls(facts, FEW_RADII, ring=True, pairs=False)]
-        pairs = [] if m in RINGS else [cls(facts, FEW_RADII, True, True, OTHERS[1])]
-        return [*cls.further(facts, points), *pairs]
+        return [*cls.further(facts, points), cls(facts, FEW_RADII, True, True, OTHERS[1])]
 
     @classmethod
     def further(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:

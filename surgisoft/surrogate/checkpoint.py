@@ -149,7 +149,7 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
             if name.split("#")[0] in ON_WALL_LINES and "ring" not in arguments:
                 raise InputError(
                     f"{folder}: its {name} was fitted by an earlier surgisoft, whose parameters "
-                    "meant something else; amend the model without it again"
+                    "meant something else; fit or amend the model again"
                 )
         facts = arm_facts(spec, weights["rest_mm"])
         effects = {

@@ -23,7 +23,7 @@ NEARLY_ALL = 0.8
 NO_SHADOW = (0.45, 0.45)
 """Or: share of what the effects before it left, and log gain, that no shadow of theirs reaches."""
 SMALL = 0.5
-"""The same where the whole error is within the surrogate's validated one."""
+"""LEAST_GAIN where the whole error is within the surrogate's validated one."""
 LEAST_LOG_GAIN = 0.08
 """Least mean fall of the log error of a block."""
 MOST_EFFECTS = 3
@@ -103,8 +103,7 @@ def passes(race: Race, first: list[Standing], named: list[Standing], s: Standing
     alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
     beside = s.gain >= least_gain and log_gain >= least_log and alone < most * named[0].gain
     no_shadow = s.gain >= NO_SHADOW[0] and log_gain >= NO_SHADOW[1]
-    no_shadow = no_shadow or s.gain >= NEARLY_ALL
-    return bool(share >= NEXT_GAIN or beside or no_shadow)
+    return bool(share >= NEXT_GAIN or beside or no_shadow or s.gain >= NEARLY_ALL)
 
 
 def _exchanged(race: Race, named: list[Standing]) -> list[Standing]:

@@ -188,8 +188,9 @@ def effective_pressures(effects, time, step, chamber, history, effective):
 def follow_lines(effects, step, strains, history):
     """Let the lines' memories follow their strains (J,) over one period [s].
 
-    Rate: the wall beside a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d what the strain y
-    lacks of the strain that the wall would take by itself; over a period d is 1 / (1/d + t/T).
+    Rate: the wall beside a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d = e - y what the
+    strain y lacks of the strain e that the wall would take by itself. While e stands still,
+    d(t) = d / (1 + 0.1 (E / c)^2 |d| t).
     """
     for j in range(strains.shape[0]):
         strain = strains[j]

@@ -19,7 +19,7 @@ from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel, arm_facts
-from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.networks import HawNN
 
 OPERATIONS = 2 * (6 * 128 + 3 * 128 * 128 + 128 * 15)
 SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)

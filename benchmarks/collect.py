@@ -13,11 +13,11 @@ import time
 import numpy as np
 
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.rig import VirtualRig
-from surgisoft.measurement.rig.arm import ArmDesign, fabricate, plain_loads, single_chamber_gap
-from surgisoft.measurement.rig.arm import tips_along as settled_tips
-from surgisoft.measurement.rig.hidden import HIDDEN
-from surgisoft.measurement.rig.virtual import MOUNT
+from surgisoft.rig import VirtualRig
+from surgisoft.rig.arm import ArmDesign, fabricate, plain_loads, single_chamber_gap
+from surgisoft.rig.arm import tips_along as settled_tips
+from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.virtual import MOUNT
 
 
 def speed() -> dict:

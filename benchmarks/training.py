@@ -17,10 +17,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from torch import nn
 
+from benchmarks.control.policies import plan_of
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.ppo import gather
 from surgisoft.agents.training import Training
-from surgisoft.studies.driving import plan_of
 from surgisoft.tasks.registry import make_task
 
 ROWS = ((256, 8, 4), (256, 5, 4), (1024, 8, 4), (1024, 5, 4), (1024, 5, 16), (4096, 5, 4))

@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.rig import VirtualRig
+from surgisoft.rig import VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.streams import Stream
-from surgisoft.tasks.world_arm import Arm, ArmPart
+from surgisoft.tasks.world.arm import Arm, ArmPart
+from surgisoft.tasks.world.random import Stream
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from surgisoft.agents.rollout import Instant
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.tasks.base import Task, TaskState
-from surgisoft.tasks.world_scene import LASER
+from surgisoft.tasks.world.scene import LASER
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are asked for."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from surgisoft.agents.evaluate import RATES, Evaluation, Summary
 from surgisoft.agents.report_charts import episode_charts, spread_chart
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Table, Text
-from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.episodes.log import EpisodeLog
 
 WORDS = {
     "success": "success",

@@ -11,7 +11,7 @@ from matplotlib import pyplot as plt
 from surgisoft.report import Picture
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
 from surgisoft.report.style import INK, MUTED
-from surgisoft.tasks.episode import EpisodeLog
+from surgisoft.tasks.episodes.log import EpisodeLog
 
 JUMP_MM = 3.0
 """A target that goes farther in a step has jumped: no line is drawn (mm)."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from surgisoft.agents.policies import Driver
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
-from surgisoft.tasks.tree import rows
+from surgisoft.tasks.world.pytree import rows
 
 BATCH = 256
 """Episodes that are played at once unless told otherwise."""

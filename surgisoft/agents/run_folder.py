@@ -21,16 +21,14 @@ from typing import Any
 import torch
 
 import surgisoft
-from surgisoft.agents.plan import Plan
-from surgisoft.agents.presets import Preset
+from surgisoft.agents.presets import Plan, Preset
+from surgisoft.config import to_table, write_atomically, write_toml
 from surgisoft.errors import InputError
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.configs import config_from, config_table, with_fields
-from surgisoft.tasks.registry import make_task
-from surgisoft.toml_config import to_table, write_atomically, write_toml
+from surgisoft.tasks.registry import config_from, config_table, make_task, with_fields
 
 FORMAT = 1
 """Version of the folder's layout."""

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import math
+import signal
+import threading
 import time
+from collections.abc import Callable
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.plan import Plan
+from surgisoft.agents.learned import Policies, agent_sizes
+from surgisoft.agents.policy_network import KiloPascals
 from surgisoft.agents.ppo import Gathered, gather, make_ppo, set_noise
+from surgisoft.agents.presets import Plan
+from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run
+from surgisoft.agents.selection import better, judge
 from surgisoft.agents.vec_env import JointEnv
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.tree import tree_map
+from surgisoft.tasks.episodes.file import save_episode
+from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.world.pytree import tree_map
 
 _FAR = 1 << 20
 """Episodes of different processes are further apart than this."""
@@ -168,3 +181,224 @@ class Training:
 
 def _copied(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().cpu().clone() for name, value in weights.items()}
+
+
+REPLAYS = "replays"
+"""Folder of a run that holds the first episode of each evaluation, for `surgisoft replay`."""
+CHECKPOINT_S = 30.0
+"""Longest time between two checkpoints, s; what lies after the last is played again."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a watcher is told after each turn."""
+
+    share: float
+    """Share 0..1 of the training that is done."""
+    steps: int
+    """Steps so far, over all episodes and processes."""
+    steps_per_s: float
+    """Steps per second of the last turn."""
+    reward: float
+    """Mean reward of a step, over all agents."""
+    evaluation: dict[str, float] | None
+    """What the last evaluation found."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """How training ended."""
+
+    done: bool
+    """All that was planned is done; else it was interrupted and can be resumed."""
+    steps: int
+    """Steps over all episodes and processes."""
+    wall_s: float
+    """Wall time, s."""
+    cpu_s: float
+    """Time on a processor of the leading process, s."""
+    best: dict[str, float] | None
+    """What evaluation found for the best checkpoint."""
+
+
+def train_new(
+    folder: Path,
+    plan: Plan,
+    processes: Processes,
+    device: torch.device,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Result:
+    """Train a new run into a folder, which is written before training begins."""
+    task = make_task(plan.task, plan.task_config, device)
+    if processes.leads:
+        create_run(folder, plan, task, agent_sizes(task), processes.count)
+    processes.wait()
+    # From here on the run is made of what its folder holds: resuming finds the same.
+    return _go_on(RunFolder(folder), None, processes, device, report)
+
+
+def resume(
+    folder: Path,
+    processes: Processes,
+    device: torch.device,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Result:
+    """Go on with a run where its last checkpoint stands; from the start if it has none."""
+    run = RunFolder(folder)
+    saved = run.load(LAST) if run.checkpoint(LAST).is_file() else None
+    return _go_on(run, saved, processes, device, report)
+
+
+def _go_on(run, saved, processes, device, report) -> Result:
+    plan = run.plan()
+    training = Training(plan, run.task(device), processes)
+    if saved is not None:
+        training.load_state(saved)
+    log = _Log(run, training.iteration) if processes.leads else None
+    written, found = time.monotonic(), training.best
+    stopped = reached = False
+    with _asked_to_stop() as asked:
+        while training.share < 1.0 and not (stopped or reached):
+            before = training.clock.wall_s
+            turn = training.turn()
+            ends = training.share >= 1.0
+            row = {}
+            if ends or training.iteration % plan.preset.evaluate_every == 0:
+                found = row = _evaluated(run, training)
+                reached = processes.any(_good_enough(plan, found))
+            stopped = processes.any(asked.is_set())
+            late = processes.any(time.monotonic() - written > CHECKPOINT_S)
+            if log:
+                seconds = training.clock.wall_s - before
+                log.add(training, turn, row, seconds)
+                report(_progress(training, turn, found, seconds))
+            if ends or stopped or reached or late or row:
+                _save_last(run, training)
+                written = time.monotonic()
+    if log:
+        log.close()
+    clock = training.clock
+    done = reached or training.share >= 1.0
+    return Result(done, training.steps, clock.wall_s, clock.cpu_s, training.best)
+
+
+def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:
+    """Judge the policies as they are, and keep them if no earlier ones were better.
+
+    Only the leader does; the others go on to where they wait for it.
+    """
+    if not training.processes.leads:
+        return {"error_mm": math.nan}
+    preset = training.plan.preset
+    actors = {
+        agent: KiloPascals(
+            ppo.get_policy(), preset.action_kPa, training.task.world.arms[agent].pneumatics.step_kPa
+        ).eval()
+        for agent, ppo in training.agents.items()
+    }
+    found, log = judge(training.task, Policies(actors), preset.evaluation_episodes)
+    (run.path / REPLAYS).mkdir(exist_ok=True)
+    save_episode(log, run.path / REPLAYS / f"{training.steps:012d}.npz")
+    if better(found, training.best):
+        training.best = found
+        run.save(
+            BEST,
+            {
+                "iteration": training.iteration,
+                "evaluation": found,
+                "agents": training.policies(),
+            },
+        )
+    training.clock.tick()
+    return found
+
+
+def _good_enough(plan: Plan, found: dict[str, float]) -> bool:
+    if plan.target_error is None:
+        return False
+    good = found.get("error_mm", math.inf) <= plan.target_error
+    return good and found.get("success", 1.0) >= 1.0
+
+
+def _save_last(run: RunFolder, training: Training) -> None:
+    state = training.state()
+    if state is not None:
+        run.save(LAST, state)
+
+
+def _progress(training: Training, turn: Iteration, found, seconds: float) -> Progress:
+    preset, rewards = training.plan.preset, turn.gathered.rewards
+    steps = preset.envs * preset.rollout * training.processes.count
+    reward = sum(rewards.values()) / len(rewards)
+    return Progress(training.share, training.steps, steps / seconds, reward, found)
+
+
+class _Log:
+    """`metrics.jsonl`, one line a turn, and TensorBoard's events."""
+
+    def __init__(self, run: RunFolder, iteration: int):
+        """What was written after `iteration` belongs to turns that are played again."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        file = run.path / "metrics.jsonl"
+        kept = []
+        if file.is_file():
+            for line in file.read_text().splitlines():
+                with suppress(ValueError):
+                    if json.loads(line)["iteration"] <= iteration:
+                        kept.append(line + "\n")
+        file.write_text("".join(kept))
+        self._file = file.open("a")
+        self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=iteration + 1)
+
+    def add(self, training: Training, turn: Iteration, found: dict, seconds: float) -> None:
+        """One turn, and what evaluation found after it."""
+        got = turn.gathered
+        values = {
+            **{f"reward/{name}": value for name, value in got.rewards.items()},
+            **{f"term/{name}": value for name, value in got.terms.items()},
+            **{f"measure/{name}": value for name, value in got.measures.items()},
+            **{f"loss/{name}": value for name, value in turn.losses.items()},
+            **{f"evaluation/{name}": value for name, value in found.items()},
+            "learning_rate": turn.learning_rate,
+            "noise": turn.noise,
+        }
+        row = {
+            "iteration": training.iteration,
+            "steps": training.steps,
+            "wall_s": round(training.clock.wall_s, 3),
+            "cpu_s": round(training.clock.cpu_s, 3),
+            "turn_s": round(seconds, 3),
+            **{name: value for name, value in values.items() if math.isfinite(value)},
+        }
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        for name, value in values.items():
+            self._board.add_scalar(name, value, training.iteration)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._file.close()
+        self._board.close()
+
+
+@contextmanager
+def _asked_to_stop():
+    """A flag that Ctrl-C or SIGTERM sets; a second one interrupts at once."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def ask(number, frame):
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, ask) for number in numbers}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

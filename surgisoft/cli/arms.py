@@ -25,8 +25,8 @@ def reach_of(mount, folder: Path | None = None, where=None):
 
 def reaches_of(scene) -> dict:
     """Both arms' reach tables of an opened scene, by tool."""
+    from surgisoft.config import Where, read_toml
     from surgisoft.scene.spec import FILE
-    from surgisoft.toml_config import Where, read_toml
 
     path = scene.folder / FILE
     where = read_toml(path)[1] if path.is_file() else Where(path)
@@ -66,9 +66,8 @@ def _error(mount, where, field: str, came: str, expected: str):
 @cache
 def _table(folder: Path | None) -> tuple:
     """`model_table` of a model, and the model's spec; None: the default model."""
-    from surgisoft.surrogate.checkpoint import load_model
-    from surgisoft.surrogate.default import default_arm
-    from surgisoft.surrogate.reach_table import model_table
+    from surgisoft.surrogate.checkpoint import default_arm, load_model
+    from surgisoft.surrogate.reach import model_table
 
     model = default_arm() if folder is None else load_model(folder)
     return model_table(model), model.spec

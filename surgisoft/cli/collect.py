@@ -15,7 +15,7 @@ from surgisoft.errors import InputError
 
 def _list_hidden(value: bool) -> None:
     if value:
-        from surgisoft.measurement.rig.hidden import HIDDEN
+        from surgisoft.rig.hidden import HIDDEN
 
         for name, effect in HIDDEN.items():
             print(f"{name:18s}{effect.place:10s}{effect.about}")
@@ -96,9 +96,9 @@ def collect(
 ) -> None:
     """Collect a recording on the virtual rig: the paper's arm, pumps and motion capture."""
     from surgisoft.measurement.protocols import make_protocol
-    from surgisoft.measurement.recording import save_recording
-    from surgisoft.measurement.rig import VirtualRig
-    from surgisoft.measurement.rig.virtual import MOUNT
+    from surgisoft.measurement.recordings.recording import save_recording
+    from surgisoft.rig import VirtualRig
+    from surgisoft.rig.virtual import MOUNT
 
     _check_output(output, force)
     effects = _pairs(hidden or [], strength or [])

@@ -86,7 +86,7 @@ def evaluate(
     print(f"{own.name}, {on}: {episodes} episodes of seed {seed}; mean [95 % interval]")
     _show(results)
     if json_file:
-        from surgisoft.tasks.configs import config_table
+        from surgisoft.tasks.registry import config_table
 
         about = {
             "task": own.name,
@@ -140,8 +140,14 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
     """The task to play and its configuration as a table; a run brings its own."""
     from surgisoft.agents.policies import DRIVERS, check_driver
     from surgisoft.agents.run_folder import RunFolder
-    from surgisoft.tasks.configs import config_of, config_table, read_config, with_fields
-    from surgisoft.tasks.registry import TASKS, make_task
+    from surgisoft.tasks.registry import (
+        TASKS,
+        config_of,
+        config_table,
+        make_task,
+        read_config,
+        with_fields,
+    )
 
     for name in drivers:
         check_driver(name)
@@ -167,7 +173,7 @@ def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool
     """Each driver's evaluation, and the first episode's log of those that are to be logged."""
     from surgisoft.agents.evaluate import evaluate as evaluate_driver
     from surgisoft.agents.policies import open_driver
-    from surgisoft.agents.record import FirstEpisode
+    from surgisoft.agents.selection import FirstEpisode
 
     opened = {name: open_driver(name, task) for name in drivers}
     first = {name: FirstEpisode(task, name, seed, on) for name in logged}

@@ -103,7 +103,7 @@ def list_(
     """List the experiments of a folder."""
     from surgisoft.experiments.plan import settings
     from surgisoft.experiments.spec import load_experiment
-    from surgisoft.tasks.world_scene import PHANTOM
+    from surgisoft.tasks.world.scene import PHANTOM
 
     folder = folder or PHANTOM / "experiments"
     files = sorted(folder.glob("*.toml"))
@@ -116,7 +116,7 @@ def list_(
 
 
 def _where(file: Path):
-    from surgisoft.toml_config import read_toml
+    from surgisoft.config import read_toml
 
     return read_toml(file)[1]
 
@@ -143,9 +143,8 @@ def _with_policy(spec, folder: str):
 
 def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
     """Write everything that follows from the rows, and say what came out."""
-    from surgisoft.experiments.film import film
     from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
-    from surgisoft.experiments.pictures import write_pictures
+    from surgisoft.experiments.pictures import film, write_pictures
     from surgisoft.experiments.results import drop_logs, sum_up, write_tables
     from surgisoft.report import write_page
 

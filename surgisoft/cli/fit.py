@@ -63,12 +63,12 @@ def fit(
     import torch
 
     from surgisoft.measurement.histories import arm_spec, check_fits, history_of
-    from surgisoft.measurement.recording import check_same_arm
+    from surgisoft.measurement.recordings.recording import check_same_arm
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
     from surgisoft.surrogate.effects import named_effect
     from surgisoft.surrogate.fit import FitConfig
     from surgisoft.surrogate.fit import fit as fit_model
-    from surgisoft.surrogate.network import parse_widths
+    from surgisoft.surrogate.networks import parse_widths
 
     claim_folder(output, force)
     torch.set_num_threads(threads)

@@ -34,11 +34,10 @@ def import_(
     ] = False,
 ) -> None:
     """Import somebody else's files: columns, units and frames as a map says."""
-    from surgisoft.measurement.importing import import_files
-    from surgisoft.measurement.importing_map import load_map
-    from surgisoft.measurement.recording import check_writable, save_recording
-    from surgisoft.measurement.recording_summary import summary
-    from surgisoft.measurement.recording_warnings import find_oddities
+    from surgisoft.measurement.importing.convert import import_files
+    from surgisoft.measurement.importing.map_file import load_map
+    from surgisoft.measurement.recordings.quality import find_oddities, summary
+    from surgisoft.measurement.recordings.recording import check_writable, save_recording
 
     to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
     if to_file and output.suffix not in (".csv", ".parquet"):
@@ -64,7 +63,7 @@ def recording_(
     recordings: Recordings,
 ) -> None:
     """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings."""
-    from surgisoft.measurement.recording_summary import summary
+    from surgisoft.measurement.recordings.quality import summary
 
     for recording in read_recordings(recordings):
         print(*summary(recording), sep="\n")

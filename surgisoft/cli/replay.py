@@ -78,7 +78,7 @@ def _written(log: Path, recording: Path):
     """The replay of an episode's log."""
     from surgisoft.cli.progress import progress
     from surgisoft.replay.episode_view import write_replay
-    from surgisoft.tasks.episode_file import load_episode
+    from surgisoft.tasks.episodes.file import load_episode
 
     with progress("replay") as report:
         return write_replay(load_episode(log), recording, report=report)

@@ -91,9 +91,8 @@ def train(
 
 
 def _plan(task, preset, steps, minutes, envs, seed, target_error, arm, scene, config):
-    from surgisoft.agents.plan import Plan
-    from surgisoft.agents.presets import preset_for, steps_for
-    from surgisoft.tasks.configs import config_of, read_config, with_fields
+    from surgisoft.agents.presets import Plan, preset_for, steps_for
+    from surgisoft.tasks.registry import config_of, read_config, with_fields
 
     own = read_config(task, config) if config else config_of(task)
     paths = {"arm": arm, "scene": None if scene is None else str(scene)}
@@ -125,7 +124,7 @@ def _run(plan, folder: Path, device: str, threads: int):
     import torch
 
     from surgisoft.agents.distributed import processes
-    from surgisoft.agents.train import resume, train_new
+    from surgisoft.agents.training import resume, train_new
 
     torch.set_num_threads(threads)
     with processes(device) as (here, kind), progress(f"train {folder}") as report:

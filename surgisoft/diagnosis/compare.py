@@ -12,7 +12,7 @@ from surgisoft.diagnosis.comparing.ceiling import Ceiling, ceiling
 from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, repeat_floor
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
-from surgisoft.measurement.recording import Recording
+from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.surrogate.model import ArmModel
 
 WORST = 5

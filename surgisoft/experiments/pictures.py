@@ -1,13 +1,42 @@
-"""The report's pictures as files of their own."""
+"""Pictures of an experiment's episodes: what the endoscope saw, as a strip."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
+import numpy as np
+
 from surgisoft.agents.report_charts import episode_charts
+from surgisoft.config import write_atomically
 from surgisoft.experiments.results import Results
 from surgisoft.report import Picture
-from surgisoft.toml_config import write_atomically
+from surgisoft.tasks.episodes.log import EpisodeLog
+
+PICTURES = 5
+"""Pictures in a strip."""
+GAP_PX = 6
+
+
+def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
+    """The endoscope's pictures at `count` moments from the beam's first light to the end."""
+    from PIL import Image
+
+    from surgisoft.replay.endoscope import jpegs
+
+    on = np.flatnonzero(log.beam.on) if log.beam is not None else np.array([], int)
+    ends = (int(on[0]), int(on[-1])) if len(on) > 1 else (0, log.rows - 1)
+    rows = np.unique(np.append(np.linspace(*ends, count - 1).astype(int), log.rows - 1))
+    frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, rows)]
+    side = frames[0].width
+    strip = Image.new("RGB", (len(frames) * (side + GAP_PX) - GAP_PX, side), "white")
+    for place, frame in enumerate(frames):
+        strip.paste(frame, (place * (side + GAP_PX), 0))
+    buffer = io.BytesIO()
+    strip.save(buffer, "PNG", optimize=True)
+    times = ", ".join(f"{log.time_s[row]:.1f}" for row in rows)
+    caption = f"What the endoscope saw at {times} s"
+    return Picture(buffer.getvalue(), caption, caption, "image/png", 620)
 
 
 def write_pictures(results: Results, films: dict[tuple[str, int], Picture]) -> list[Path]:

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.config import Where
 from surgisoft.errors import InputError
-from surgisoft.experiments.phased import PhasedAblation
+from surgisoft.experiments.controllers import PhasedAblation
 from surgisoft.experiments.spec import Case, Experiment, Lesion, Vary, merged, task_config
-from surgisoft.measurement.rig.hidden import HIDDEN
+from surgisoft.rig.hidden import HIDDEN
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.configs import config_table
-from surgisoft.toml_config import Where
+from surgisoft.tasks.registry import config_table
 
 Value = int | float | str
 

@@ -13,11 +13,10 @@ from torch import Tensor
 from surgisoft.agents.evaluate import episode_table
 from surgisoft.agents.referee import EpisodeReferee, Verdict
 from surgisoft.agents.rollout import Instant, Rollout, rollout
-from surgisoft.experiments.hands import Hands
-from surgisoft.experiments.phased import REASONS, PhasedAblation
+from surgisoft.experiments.controllers import REASONS, Hands, PhasedAblation
 from surgisoft.experiments.plan import Setting, build_task
 from surgisoft.experiments.spec import Experiment
-from surgisoft.tasks.episode import EpisodeLog, EpisodeRecorder
+from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps of which a mean says nothing."""

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.agents.evaluate import RATES, Summary, summary
+from surgisoft.config import write_atomically
 from surgisoft.experiments.play import Row, badness
 from surgisoft.experiments.run import log_file
 from surgisoft.experiments.spec import Experiment
-from surgisoft.tasks.episode import EpisodeLog
-from surgisoft.tasks.episode_file import load_episode
-from surgisoft.toml_config import write_atomically
+from surgisoft.tasks.episodes.file import load_episode
+from surgisoft.tasks.episodes.log import EpisodeLog
 
 TEXTS = ("setting", "case", "lesion", "outcome")
 """Columns of a row that are words."""

@@ -16,12 +16,12 @@ from pathlib import Path
 import torch
 
 from surgisoft.agents.run_folder import versions
+from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import Setting, scene_of, settings
 from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
-from surgisoft.tasks.episode_file import save_episode
-from surgisoft.toml_config import write_atomically
+from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.workers import workers
 
 Report = Callable[[float, float, str], None]

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from surgisoft.config import Rule, Where, from_table, read_toml, write_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.scene.spec import Length, Point
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.configs import config_table
-from surgisoft.toml_config import Rule, Where, from_table, read_toml, write_toml
+from surgisoft.tasks.registry import config_table
 
 FORMAT = 1
 """Version of the file's format."""

@@ -9,7 +9,7 @@ from surgisoft.replay.colours import ARM_COLOURS, BAND_COLOURS, CHARRED, SHAFT_C
 from surgisoft.replay.recording import Columns
 from surgisoft.replay.shapes import BORE_RINGS, tube
 from surgisoft.scene import frames
-from surgisoft.tasks.episode_parts import ArmLog
+from surgisoft.tasks.episodes.parts import ArmLog
 
 BORE_MM = 1.5
 """Radius of the channel in the tip: the paper's is 3 mm across (mm)."""

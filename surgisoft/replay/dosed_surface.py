@@ -11,7 +11,7 @@ from surgisoft.scene import frames
 from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.render import corner_normals
-from surgisoft.tasks.episode_parts import DoseLog
+from surgisoft.tasks.episodes.parts import DoseLog
 
 EDGE_MM = 0.4
 """Longest edge of the coloured triangles: the finest cut is a few of them wide (mm)."""

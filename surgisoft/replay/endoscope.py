@@ -17,8 +17,8 @@ from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.render import Renderer
-from surgisoft.tasks.episode import EpisodeLog
-from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 
 CAMERA = "/endoscope/camera"
 """The camera's pose and its pictures."""

@@ -10,8 +10,8 @@ from surgisoft.replay.endoscope import CAMERA
 from surgisoft.replay.plots import Plot
 from surgisoft.replay.recording import STEP, TIME
 from surgisoft.scene import frames
-from surgisoft.tasks.episode import EpisodeLog
-from surgisoft.tasks.world_scene import ENDOSCOPE
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.world.scene import ENDOSCOPE
 
 SCENE = "Scene"
 """Name of the 3D view."""

@@ -29,8 +29,8 @@ from surgisoft.replay.recording import Columns, new_recording
 from surgisoft.replay.shapes import creased
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
-from surgisoft.tasks.episode import EpisodeLog
-from surgisoft.tasks.world_scene import ENDOSCOPE, LASER
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 
 MOTION_HZ = 10.0
 """Bodies are drawn so many times a second; plots have every step."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
-from surgisoft.tasks.episode import EpisodeLog
-from surgisoft.tasks.episode_parts import ArmLog
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.parts import ArmLog
 
 SHARES = ("completion", "visited", "view_fraction")
 """Measures that run from 0 to 1 together."""

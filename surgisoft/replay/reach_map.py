@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
 from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
-from surgisoft.toml_config import write_atomically
 
 REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
 """One colour a reason, in the order of REASONS."""

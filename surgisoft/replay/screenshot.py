@@ -6,9 +6,9 @@ import time
 import warnings
 from pathlib import Path
 
+from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
 from surgisoft.replay.viewer import LOCAL, free_port, running, wait_for_port
-from surgisoft.toml_config import write_atomically
 
 WINDOW = (1600, 1000)
 """Width and height of the invisible window (pixels)."""

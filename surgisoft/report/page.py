@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft import __version__
+from surgisoft.config import write_atomically
 from surgisoft.errors import unknown_name
 from surgisoft.report.parts import Part, Section, anchor
 from surgisoft.report.style import STYLE
-from surgisoft.toml_config import write_atomically
 
 TONES = ("plain", "good", "warn", "bad")
 LEAST_CONTENTS = 3

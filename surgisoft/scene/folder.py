@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
+from surgisoft.config import read_toml, to_table
 from surgisoft.errors import InputError
 from surgisoft.scene.lesion import Ring, lesion_ring
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.meshio import read_mesh
 from surgisoft.scene.spec import FILE, LesionSpec, SceneSpec, load_spec, spec_path
-from surgisoft.toml_config import read_toml, to_table
 
 
 @dataclass(frozen=True, eq=False)

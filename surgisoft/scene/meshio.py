@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
 from surgisoft.scene.index import used_indices
 from surgisoft.scene.mesh import Mesh
-from surgisoft.toml_config import write_atomically
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")

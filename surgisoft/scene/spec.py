@@ -11,11 +11,11 @@ from typing import Annotated
 
 import numpy as np
 
+from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.mesh import ROLES
-from surgisoft.toml_config import Rule, Where, from_table, read_toml, to_table, write_toml
 
 FORMAT = 1
 FILE = "scene.toml"

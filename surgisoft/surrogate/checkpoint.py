@@ -5,6 +5,7 @@ import os
 import shutil
 import tempfile
 from dataclasses import asdict
+from importlib.resources import as_file, files
 from pathlib import Path
 
 import torch
@@ -13,14 +14,12 @@ from safetensors.torch import load_file, save_file
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.effects.own import check_files, files_of
 from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel, arm_facts
-from surgisoft.surrogate.network import HawNN
-from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -178,3 +177,9 @@ def load_known_error(folder: str | Path) -> KnownError | None:
             f"{folder}: damaged {KNOWN_ERROR} ({type(error).__name__}: {str(error)[:120]}); "
             "fit the model again, or delete that file"
         ) from error
+
+
+def default_arm(device: str | torch.device = "cpu") -> ArmModel:
+    """The default arm: three chambers in kPa, five key points, hysteresis with memory."""
+    with as_file(files("surgisoft") / "assets" / "default_arm") as folder:
+        return load_model(folder, device)

@@ -8,11 +8,9 @@ from torch import Tensor, nn
 from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.network import HawNN
-from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this

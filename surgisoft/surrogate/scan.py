@@ -1,11 +1,6 @@
-"""Recurrences over a whole recording at once.
+"""Recurrences along recordings as plain compiled loops, for processors and without gradients."""
 
-A play operator clamps its last value into a band around the input. Clamps compose to clamps, so a
-run of T steps is a prefix scan of log2(T) passes over all runs, chambers and thresholds, and gives
-bit for bit what stepping gives (Hillis & Steele 1986, "Data parallel algorithms"). First-order lags
-are affine maps of their last value, which compose to affine maps: `linear_scan`. On a processor and
-where no gradient is asked for, a compiled loop over the rows is quicker than either.
-"""
+from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -13,7 +8,33 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from surgisoft.surrogate.scan_loops import clamp_loop, linear_loop
+from surgisoft.compiled import compiled
+
+
+@compiled
+def clamp_loop(low, high, start, out):
+    """y[r, t, c] = clamp(y[r, t - 1, c], low, high) into out; start (R, C), the rest (R, T, C).
+
+    A bound that is not a number makes the answer none.
+    """
+    for r in range(out.shape[0]):
+        for t in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                last = start[r, c] if t == 0 else out[r, t - 1, c]
+                bottom, top = low[r, t, c], high[r, t, c]
+                value = last if last > bottom else bottom
+                value = value if value < top else top
+                out[r, t, c] = value if last == last and bottom == bottom else last + bottom
+
+
+@compiled
+def linear_loop(factor, addend, start, out):
+    """y[r, t, c] = factor y[r, t - 1, c] + addend into out; start (R, C), the rest (R, T, C)."""
+    for r in range(out.shape[0]):
+        for t in range(out.shape[1]):
+            for c in range(out.shape[2]):
+                last = start[r, c] if t == 0 else out[r, t - 1, c]
+                out[r, t, c] = factor[r, t, c] * last + addend[r, t, c]
 
 
 def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:

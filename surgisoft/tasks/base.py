@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.streams import Stream, streams
-from surgisoft.tasks.tree import rows, with_rows
-from surgisoft.tasks.world import World, WorldState
+from surgisoft.tasks.world.pytree import rows, with_rows
+from surgisoft.tasks.world.random import Stream, streams
+from surgisoft.tasks.world.world import World, WorldState
 
 OBSERVATION_LIMIT = 20.0
 """Observations are held to plus and minus this; tasks scale theirs to be far below it."""

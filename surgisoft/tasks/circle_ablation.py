@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.aim import Aim, body_part
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.cut import along, fresh_cut, further
-from surgisoft.tasks.world import WorldConfig, scene_world
-from surgisoft.tasks.world_scene import PHANTOM
+from surgisoft.tasks.inverse_kinematics import Aim, body_part
+from surgisoft.tasks.trajectories import along, fresh_cut, further
+from surgisoft.tasks.world.scene import PHANTOM
+from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 FAR_MM = 10.0
 """Scale of the reward terms that reach far, mm."""

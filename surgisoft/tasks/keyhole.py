@@ -13,14 +13,12 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.aim import body_part
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.seek import seek
-from surgisoft.tasks.streams import Stream
-from surgisoft.tasks.tour import Tour, fresh_tour, way_mm
-from surgisoft.tasks.ways import place, progress
-from surgisoft.tasks.world import WorldConfig
-from surgisoft.tasks.world_plate import SlottedPlate, clear_ways, plate_world
+from surgisoft.tasks.inverse_kinematics import body_part, seek
+from surgisoft.tasks.trajectories import Tour, fresh_tour, place, progress, way_mm
+from surgisoft.tasks.world.plate import SlottedPlate, clear_ways, plate_world
+from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.world import WorldConfig
 
 
 @dataclass(frozen=True)

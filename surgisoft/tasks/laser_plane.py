@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.follow import Follow, FollowConfig
+from surgisoft.tasks.path_following import Follow, FollowConfig
 from surgisoft.tasks.track import level_world, points_at_start
-from surgisoft.tasks.world import WorldConfig
+from surgisoft.tasks.world.world import WorldConfig
 
 LEAST_SLOPE = 0.1
 """A beam flatter to the plane than this sine (6 degrees) is taken to end before it."""

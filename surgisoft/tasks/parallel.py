@@ -11,9 +11,8 @@ from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.configs import config_of, with_fields
-from surgisoft.tasks.port import Port, unseeded
-from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.numpy_adapter import Port, unseeded
+from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 
 class SurgicalEnv(ParallelEnv):

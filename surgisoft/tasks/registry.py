@@ -1,16 +1,99 @@
-"""Every task by name."""
+"""Every task's configuration by name, as a value, as a plain table and from a TOML file."""
 
+from __future__ import annotations
+
+import dataclasses
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
 
-from surgisoft.errors import unknown_name
+from surgisoft.config import Where, from_table, read_toml
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.keyhole import Keyhole
-from surgisoft.tasks.laser_plane import laser_plane
-from surgisoft.tasks.track import track_circle, track_square
-from surgisoft.tasks.track_body import TrackBody
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
+from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane
+from surgisoft.tasks.track import SQUARE, TrackConfig, track_circle, track_square
+from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
+
+CONFIGS: dict[str, Any] = {
+    "track_circle": TrackConfig(),
+    "track_square": SQUARE,
+    "track_body": TrackBodyConfig(),
+    "laser_plane": LaserPlaneConfig(),
+    "keyhole": KeyholeConfig(),
+    "circle_ablation": CircleAblationConfig(),
+}
+"""Name -> the configuration that the task has without one."""
+
+
+def config_of(task: str) -> Any:
+    """The named task's own configuration; an unknown name answers with the known ones."""
+    if task not in CONFIGS:
+        raise unknown_name("task", task, CONFIGS)
+    return CONFIGS[task]
+
+
+def config_table(config: Any) -> Any:
+    """A configuration as dicts, lists, numbers and text, for JSON; a path becomes text."""
+    if dataclasses.is_dataclass(config):
+        return {f.name: config_table(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, tuple):
+        return [config_table(item) for item in config]
+    return str(config) if isinstance(config, Path) else config
+
+
+def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
+    """The named task's configuration with the fields of a table changed; `file` is for errors."""
+    own = config_of(task)
+    whole = _merged(config_table(own), table)
+    try:
+        return from_table(type(own), whole, Where(file, text))
+    except InputError as error:
+        raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
+
+
+def read_config(task: str, file: Path) -> Any:
+    """The named task's configuration with the fields of a TOML file changed."""
+    config_of(task)
+    table, where = read_toml(file)
+    return config_from(task, table, where.path, where.text)
+
+
+def with_fields(config: Any, **values: Any) -> Any:
+    """The configuration with each named field changed, at whatever depth it is.
+
+    A name that no part of it has is an error.
+    """
+    changed, found = _with_fields(config, values)
+    absent = set(values) - found
+    if absent:
+        raise InputError(
+            f"this task has no {', '.join(sorted(absent))}: leave '{sorted(absent)[0]}' out"
+        )
+    return changed
+
+
+def _with_fields(config: Any, values: dict[str, Any]) -> tuple[Any, set[str]]:
+    changes, found = {}, set()
+    for field in dataclasses.fields(config):
+        part = getattr(config, field.name)
+        if field.name in values:
+            changes[field.name] = values[field.name]
+            found.add(field.name)
+        elif dataclasses.is_dataclass(part):
+            changes[field.name], inner = _with_fields(part, values)
+            found |= inner
+    return dataclasses.replace(config, **changes), found
+
+
+def _merged(base: Any, changes: Any) -> Any:
+    if not (isinstance(base, dict) and isinstance(changes, dict)):
+        return changes
+    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
+
 
 TASKS: dict[str, Callable[..., Task]] = {
     "track_circle": track_circle,

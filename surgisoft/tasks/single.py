@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.port import Port, unseeded
+from surgisoft.tasks.numpy_adapter import Port, unseeded
 from surgisoft.tasks.registry import make_task
 
 ONE_ARM = ("track_circle", "track_square", "track_body", "laser_plane", "keyhole")

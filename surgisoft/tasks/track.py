@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.follow import Follow, FollowConfig
-from surgisoft.tasks.streams import streams
-from surgisoft.tasks.world import World, WorldConfig, lone_arm, named_arm
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.tasks.path_following import Follow, FollowConfig
+from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.world import World, WorldConfig, lone_arm, named_arm
 
 
 @dataclass(frozen=True)

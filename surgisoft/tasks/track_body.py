@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.aim import pressure_part
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.seek import seek
-from surgisoft.tasks.streams import Stream
+from surgisoft.tasks.inverse_kinematics import pressure_part, seek
 from surgisoft.tasks.track import level_world
-from surgisoft.tasks.world import WorldConfig
+from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.world import WorldConfig
 
 WEIGHTS = (0.6, 0.4)
 """Shares of the slow and the fast wave in the swing."""

@@ -158,11 +158,10 @@ def test_bad_input_is_one_line_and_code_2(arguments, named, capsys):
 
 def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
     from surgisoft.agents.learned import agent_sizes
-    from surgisoft.agents.plan import Plan
     from surgisoft.agents.policy_network import empty_actor
-    from surgisoft.agents.presets import preset_for
+    from surgisoft.agents.presets import Plan, preset_for
     from surgisoft.agents.run_folder import BEST, create_run
-    from surgisoft.tasks.configs import read_config
+    from surgisoft.tasks.registry import read_config
 
     config, preset = read_config("track_circle", Path(short)), preset_for("fast", "track_circle")
     task, plan = make_task("track_circle", config), Plan("track_circle", config, "fast", preset, 1)

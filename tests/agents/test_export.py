@@ -11,13 +11,12 @@ from onnx.reference import ReferenceEvaluator
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.export import export
 from surgisoft.agents.learned import LearnedPolicy
-from surgisoft.agents.plan import Plan
-from surgisoft.agents.presets import Preset
-from surgisoft.agents.train import train_new
+from surgisoft.agents.presets import Plan, Preset
+from surgisoft.agents.training import train_new
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.configs import config_of
+from surgisoft.tasks.registry import config_of
 
 TINY = Preset(envs=4, rollout=8, epochs=1, batches=2, evaluate_every=9, evaluation_episodes=1)
 

@@ -12,9 +12,9 @@ from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig, track_circle
-from surgisoft.tasks.world import WorldConfig
+from surgisoft.tasks.world.world import WorldConfig
 
 SHORT = TrackConfig(FollowConfig(loop_s=5.0, approach_s=2.0, size_mm=5.0))
 

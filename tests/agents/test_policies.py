@@ -7,7 +7,7 @@ from surgisoft.agents.policies import Random, open_driver
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_task
-from surgisoft.tasks.tree import rows
+from surgisoft.tasks.world.pytree import rows
 
 
 @pytest.fixture(scope="module")

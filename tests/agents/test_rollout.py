@@ -11,7 +11,7 @@ from surgisoft.agents.policies import Random, Scripted
 from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.track import TrackConfig, track_circle
 

@@ -12,7 +12,7 @@ import torch
 from surgisoft.agents.run_folder import LAST, RunFolder
 from surgisoft.cli import run as surgisoft
 from surgisoft.replay.find import find_replay
-from surgisoft.tasks.episode_file import load_episode
+from surgisoft.tasks.episodes.file import load_episode
 
 SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]
 

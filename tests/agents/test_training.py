@@ -10,17 +10,14 @@ import pytest
 import torch
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.judge import better, judge
 from surgisoft.agents.learned import LearnedPolicy
-from surgisoft.agents.plan import Plan
 from surgisoft.agents.policies import Random
-from surgisoft.agents.presets import PRESETS, Preset, preset_for
+from surgisoft.agents.presets import PRESETS, Plan, Preset, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
-from surgisoft.agents.train import resume, train_new
-from surgisoft.agents.training import Training
+from surgisoft.agents.selection import better, judge
+from surgisoft.agents.training import Training, resume, train_new
 from surgisoft.errors import InputError
-from surgisoft.tasks.configs import config_of, with_fields
-from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 CPU = torch.device("cpu")
 TINY = Preset(envs=8, rollout=8, epochs=2, batches=2, evaluate_every=2, evaluation_episodes=2)

@@ -12,7 +12,7 @@ from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv, OneAgentEnv
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.track import TrackConfig
 

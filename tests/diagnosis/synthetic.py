@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from surgisoft.measurement.recording import Recording
+from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.networks import HawNN
 
 POINTS = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 30.0], [0.0, 0.0, 70.0]])
 PERIOD_S = 0.1

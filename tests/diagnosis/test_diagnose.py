@@ -11,10 +11,9 @@ from surgisoft.cli import run
 from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recording import save_recording
-from surgisoft.measurement.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_known_error, load_model
-from surgisoft.surrogate.default import default_arm
+from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
 
 
 def recorded(hidden=(), take=3, points=6000):

@@ -24,7 +24,7 @@ from surgisoft.diagnosis.isolability.moments import (
 )
 from surgisoft.diagnosis.race.discrepancy import body_covariance, kernel
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.checkpoint import default_arm
 
 LIMITS = np.array([[-15.0, 54.0]] * 3)
 NAMES = ["hysteresis", "line_lag", "creep", "rate_dependence"]

@@ -12,7 +12,7 @@ from surgisoft.diagnosis.race import naming
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.ranking import Option, Race, Standing
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.rig import VirtualRig
+from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import load_known_error, load_model
 
 NAMES = ("blend", "left", "right")

@@ -16,11 +16,11 @@ from surgisoft.diagnosis.refinement.nuisance import kinds
 from surgisoft.diagnosis.refinement.refine import Predictor, free_parameters, vector
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
-from surgisoft.measurement.recording import Recording
-from surgisoft.surrogate.default import default_arm
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.networks import RecurrentArm
 from tests.diagnosis.synthetic import walk
 
 NOISE_MM = 0.05

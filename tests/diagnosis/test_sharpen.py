@@ -12,8 +12,8 @@ from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.race.ranking import Race
 from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.measurement.histories import history_of
-from surgisoft.measurement.recording import Recording
-from surgisoft.surrogate.default import default_arm
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.synthetic import backlash, walk
 
 PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05

@@ -8,8 +8,15 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.experiments.hands import Schedule, Waypoints, _between
-from surgisoft.experiments.phased import CLOSE, LATE, LOST, PhasedAblation
+from surgisoft.experiments.controllers import (
+    CLOSE,
+    LATE,
+    LOST,
+    PhasedAblation,
+    Schedule,
+    Waypoints,
+    _between,
+)
 from surgisoft.experiments.plan import settings
 from surgisoft.experiments.play import play_block
 from surgisoft.experiments.spec import Fault, load_experiment

@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import settings
 from surgisoft.experiments.spec import load_experiment, save_experiment
-from surgisoft.tasks.world_scene import PHANTOM
-from surgisoft.toml_config import read_toml
+from surgisoft.tasks.world.scene import PHANTOM
 from tests.experiments.tiny import FAULT, TINY, write
 
 SHIPPED = sorted((PHANTOM / "experiments").glob("*.toml"))

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from surgisoft.tasks.world_scene import PHANTOM
+from surgisoft.tasks.world.scene import PHANTOM
 
 TINY = """
 name = "tiny"

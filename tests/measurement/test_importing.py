@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from surgisoft.config import read_toml
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import import_files
-from surgisoft.measurement.importing_map import parse_map
-from surgisoft.toml_config import read_toml
+from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing.map_file import parse_map
 
 NAMES = ["t", "u1", "u2", "x", "y", "z"]
 BASE = """

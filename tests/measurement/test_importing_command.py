@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.measurement.importing_map import load_map
-from surgisoft.measurement.importing_spec import (
+from surgisoft.measurement.importing.map_file import load_map
+from surgisoft.measurement.importing.spec import (
     ActuationMap,
     BaseMap,
     FileRole,
@@ -20,8 +20,8 @@ from surgisoft.measurement.importing_spec import (
     RunsMap,
     TimeMap,
 )
-from surgisoft.measurement.recording import load_recording
-from surgisoft.measurement.recording_sidecar import parse_sidecar
+from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.measurement.recordings.sidecar import parse_sidecar
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 

@@ -4,10 +4,10 @@ import re
 
 import pytest
 
+from surgisoft.config import read_toml
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import import_files
-from surgisoft.measurement.importing_map import load_map, parse_map
-from surgisoft.toml_config import read_toml
+from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing.map_file import load_map, parse_map
 
 GOOD = """\
 [file.log]

@@ -10,15 +10,15 @@ from hypothesis.extra import numpy as npst
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from surgisoft.config import Where
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing_circle import circle_centres
-from surgisoft.measurement.importing_rotation import (
+from surgisoft.measurement.importing.points import circle_centres
+from surgisoft.measurement.importing.rotation import (
     matrices,
     mean_rotation,
     parse_rotation,
     turn_to_z,
 )
-from surgisoft.toml_config import Where
 
 MAP = Where(Path("map.toml"))
 SEEDS = st.integers(0, 2**32)

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surgisoft.config import read_toml
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import import_files
-from surgisoft.measurement.importing_map import load_map, parse_map
-from surgisoft.measurement.importing_ready import READY_MAPS
-from surgisoft.toml_config import read_toml
+from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing.map_file import READY_MAPS, load_map, parse_map
 
 from .motive import MOUNT, arm, export, markers_on, to_room
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgisoft.measurement.importing import import_files
-from surgisoft.measurement.importing_map import load_map
-from surgisoft.measurement.recording import load_recording, save_recording
-from surgisoft.measurement.recording_timing import body_lead, held_period_s
-from surgisoft.measurement.recording_warnings import find_oddities
+from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing.map_file import load_map
+from surgisoft.measurement.importing.timing import body_lead, held_period_s
+from surgisoft.measurement.recordings.quality import find_oddities
+from surgisoft.measurement.recordings.recording import load_recording, save_recording
 
 MAPS = Path(__file__).resolve().parents[2] / "docs" / "examples" / "maps"
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recording import (
+from surgisoft.measurement.recordings.quality import summary
+from surgisoft.measurement.recordings.recording import (
     ArmInfo,
     Recording,
     check_rows,
@@ -19,7 +20,6 @@ from surgisoft.measurement.recording import (
     load_recordings,
     save_recording,
 )
-from surgisoft.measurement.recording_summary import summary
 
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 ARRAYS = ("t_s", "measured", "commanded", "key_points_mm", "run", "temp_C", "payload_g", "gravity")

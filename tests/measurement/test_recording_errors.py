@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recording import load_recording, load_recordings
+from surgisoft.measurement.recordings.recording import load_recording, load_recordings
 
 HEAD = "t_s,p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm"
 ROW = "0,1,2,3,4"

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from surgisoft.measurement.recording import Recording
-from surgisoft.measurement.recording_timing import body_lead, held_period_s, released
+from surgisoft.measurement.importing.timing import body_lead, held_period_s, released
+from surgisoft.measurement.recordings.recording import Recording
 
 RATE_HZ = 50
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.measurement.recording import Recording, load_recordings, save_recording
-from surgisoft.measurement.recording_warnings import find_oddities, key_point_jumps, spikes
+from surgisoft.measurement.recordings.quality import find_oddities, key_point_jumps, spikes
+from surgisoft.measurement.recordings.recording import Recording, load_recordings, save_recording
 
 RATE_HZ = 20.0
 

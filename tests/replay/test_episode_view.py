@@ -27,8 +27,8 @@ from surgisoft.replay.screenshot import take_screenshot
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.episode import EpisodeRecorder
-from surgisoft.tasks.episode_file import save_episode
+from surgisoft.tasks.episodes.file import save_episode
+from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.registry import make_task
 from tests.replay.reading import column, entities
 

@@ -20,10 +20,9 @@ from surgisoft.scene.folder import open_scene, rounded_mount
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
-from surgisoft.tasks.pneumatics import Pneumatics
-from surgisoft.tasks.streams import streams
-from surgisoft.tasks.world import WorldConfig, lone_arm
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.tasks.world.arm import Pneumatics, Randomisation
+from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.world import WorldConfig, lone_arm
 from tests.scene.shapes import ball, box, lumpy
 
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from surgisoft.errors import InputError
 from surgisoft.scene.reach import ArmReach, aim, nearest_commands
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.reach_table import constant_curvature_table, model_table
+from surgisoft.surrogate.networks import ConstantCurvature
+from surgisoft.surrogate.reach import constant_curvature_table, model_table
 
 LENGTH_MM = 70.0
 TABLE = constant_curvature_table(LENGTH_MM)

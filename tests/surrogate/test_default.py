@@ -10,9 +10,8 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_known_error, load_model
-from surgisoft.surrogate.default import default_arm
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
 
 
 def test_it_tells_a_walk_on_the_rig_that_it_has_never_seen():

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.excitation import excitation
-from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 

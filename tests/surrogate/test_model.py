@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel, arm_facts
-from surgisoft.surrogate.network import HawNN
-from surgisoft.surrogate.recurrent import RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 
 SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
 LOW, HIGH = torch.tensor(SPEC.low), torch.tensor(SPEC.high)

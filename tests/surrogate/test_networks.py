@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.constant_curvature import ConstantCurvature, arc_point, arc_rotation
-from surgisoft.surrogate.network import HawNN, parse_widths, range_weights, weighted_mse
+from surgisoft.surrogate.networks import (
+    ConstantCurvature,
+    HawNN,
+    arc_point,
+    arc_rotation,
+    parse_widths,
+    range_weights,
+    weighted_mse,
+)
 
 LOW, HIGH = torch.tensor([-15.0, -15.0, -15.0]), torch.tensor([54.0, 54.0, 54.0])
 

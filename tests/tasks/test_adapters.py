@@ -14,12 +14,12 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.scene.refereed import RefereedScene
-from surgisoft.tasks.follow import FollowConfig
 from surgisoft.tasks.parallel import parallel_env
+from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS
 from surgisoft.tasks.single import ONE_ARM, BatchedEnv, SingleEnv
 from surgisoft.tasks.track import TrackConfig
-from surgisoft.tasks.world_scene import PHANTOM
+from surgisoft.tasks.world.scene import PHANTOM
 
 SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
 every_task = pytest.mark.parametrize("name", TASKS)

@@ -12,9 +12,9 @@ import trimesh
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.tree import rows
-from surgisoft.tasks.world import WorldConfig
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.pytree import rows
+from surgisoft.tasks.world.world import WorldConfig
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,13 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.episode import EpisodeLog, EpisodeRecorder
-from surgisoft.tasks.episode_events import find_events
-from surgisoft.tasks.episode_file import load_episode, save_episode
-from surgisoft.tasks.episode_parts import ArmLog, BeamLog, DoseLog
+from surgisoft.tasks.episodes.file import load_episode, save_episode
+from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder, find_events
+from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, DoseLog
 from surgisoft.tasks.registry import make_task
-from surgisoft.tasks.tree import rows
-from surgisoft.tasks.world import WorldConfig
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.pytree import rows
+from surgisoft.tasks.world.world import WorldConfig
 
 STEPS = 22
 

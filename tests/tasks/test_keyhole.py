@@ -11,9 +11,9 @@ from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.inverse_kinematics import seek
 from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
-from surgisoft.tasks.seek import seek
-from surgisoft.tasks.ways import place, progress
+from surgisoft.tasks.trajectories import place, progress
 
 
 @pytest.fixture(scope="module")

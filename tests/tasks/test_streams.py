@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from surgisoft.tasks.streams import Stream, streams
-from surgisoft.tasks.tree import rows
+from surgisoft.tasks.world.pytree import rows
+from surgisoft.tasks.world.random import Stream, streams
 
 LARGE = 2**64
 

@@ -10,23 +10,22 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.checkpoint import save_model
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
-from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.checkpoint import default_arm, save_model
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.follow import FollowConfig
+from surgisoft.tasks.inverse_kinematics import least_squares
 from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane, on_plane
-from surgisoft.tasks.paths import circle, square
+from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS, make_task
-from surgisoft.tasks.solver import least_squares
-from surgisoft.tasks.streams import streams
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
-from surgisoft.tasks.tree import rows, tree_map
-from surgisoft.tasks.world import WorldConfig
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.tasks.trajectories import circle, square
+from surgisoft.tasks.world.arm import Randomisation
+from surgisoft.tasks.world.pytree import rows, tree_map
+from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.world import WorldConfig
 
 
 @lru_cache

@@ -14,14 +14,13 @@ from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.default import default_arm
+from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.network import HawNN
-from surgisoft.tasks.pneumatics import Pneumatics
-from surgisoft.tasks.streams import streams
-from surgisoft.tasks.tree import rows, tree_map
-from surgisoft.tasks.world import Mounted, World, WorldConfig, lone_arm, scene_world
-from surgisoft.tasks.world_arm import Randomisation
+from surgisoft.surrogate.networks import HawNN
+from surgisoft.tasks.world.arm import Pneumatics, Randomisation
+from surgisoft.tasks.world.pytree import rows, tree_map
+from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.world import Mounted, World, WorldConfig, lone_arm, scene_world
 
 STILL = Randomisation(history=0, start_kPa=0.0)
 LIVELY = Randomisation(

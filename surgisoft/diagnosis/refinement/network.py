@@ -21,7 +21,7 @@ from torch import Tensor
 from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.refinement.nuisance import judging_parts
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.networks import HawNN
 
 RIDGES = 10.0 ** np.arange(-4.0, 2.1, 0.5)
 """Ridges that are tried."""

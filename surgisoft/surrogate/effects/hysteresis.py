@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
 from surgisoft.surrogate.scan import play_scan
-from surgisoft.surrogate.wall_lines import RINGS, wall_lines
+from surgisoft.surrogate.wall_fibres import RINGS, wall_lines
 
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
 """Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly

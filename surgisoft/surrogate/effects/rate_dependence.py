@@ -27,7 +27,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.scan import follow
-from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
+from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
 
 USUAL = 0.1
 """Stress, as a share of the largest load, at which the time constant is stated."""

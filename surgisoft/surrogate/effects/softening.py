@@ -23,7 +23,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
+from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 """Widths that a diagnosis tries, in units of the energy at full load, and their growths."""

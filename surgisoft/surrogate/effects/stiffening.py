@@ -24,7 +24,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_lines import lines_tried, wall_lines
+from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""

@@ -8,7 +8,7 @@ from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import STAGES, free_name, known_effects, make_effect
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, arm_facts
-from surgisoft.surrogate.network import HawNN
+from surgisoft.surrogate.networks import HawNN
 from tests.surrogate.effects.arms import REST_MM, stir
 
 SPEC = ArmSpec(3, 5, (-10.0,) * 3, (50.0,) * 3, band=(0.2,) * 3, gravity=(0.6, 0.0, -0.8))

@@ -10,7 +10,6 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from surgisoft.surrogate.constant_curvature import ConstantCurvature
 from surgisoft.surrogate.effects import (
     known_effects,
     make_effect,
@@ -19,6 +18,7 @@ from surgisoft.surrogate.effects import (
     register_effect_file,
 )
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
 from tests.surrogate.effects.arms import FACTS
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "effects.md"

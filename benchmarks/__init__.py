@@ -1,0 +1,1 @@
+"""Benchmarks: studies whose printed results are kept under docs/results, and timings."""

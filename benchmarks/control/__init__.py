@@ -1,0 +1,1 @@
+"""Benchmark `control`: scripted, learned and random policies on every task."""

@@ -1,0 +1,137 @@
+"""Policies for studies: trained into a folder once, gone on with if cut off; drivers played."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.cache import Report
+from surgisoft.agents.distributed import Processes
+from surgisoft.agents.evaluate import evaluate
+from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.policies import open_driver
+from surgisoft.agents.presets import Plan, preset_for, steps_for
+from surgisoft.agents.run_folder import RunFolder
+from surgisoft.agents.training import resume, train_new
+from surgisoft.errors import InputError
+from surgisoft.tasks.registry import config_of, make_task, with_fields
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What training took."""
+
+    steps: int
+    """Steps over all episodes."""
+    wall_s: float
+    """Wall time, s."""
+    cpu_s: float
+    """Time on a processor, s."""
+
+    @property
+    def steps_per_s(self) -> float:
+        """Steps a second of processor time."""
+        return self.steps / self.cpu_s
+
+
+def plan_of(
+    task: str,
+    seed: int,
+    steps: int | None = None,
+    arm: Path | None = None,
+    preset: str = "fast",
+) -> Plan:
+    """A training run: the task's own number of steps and the default arm unless told otherwise."""
+    config = config_of(task)
+    if arm is not None:
+        config = with_fields(config, arm=str(arm))
+    own = steps_for(preset, task) if steps is None else steps
+    return Plan(task, config, preset, preset_for(preset, task), own, seed=seed)
+
+
+def trained(folder: Path, plan: Plan, report: Report) -> RunFolder:
+    """The run of a plan: the one in the folder, finished if it was cut off, or a new one."""
+    own, device = Processes(), torch.device("cpu")
+
+    def tell(p) -> None:
+        report(p.share, 1.0, f"{p.steps:,} steps, {p.steps_per_s:,.0f}/s")
+
+    if not (folder / "config.json").is_file():
+        result = train_new(folder, plan, own, device, tell)
+    else:
+        _check_same(RunFolder(folder), plan)
+        if _finished(folder, plan):
+            report(1.0, 1.0, "already trained")
+            return RunFolder(folder)
+        result = resume(folder, own, device, tell)
+    if not result.done:
+        raise KeyboardInterrupt
+    return RunFolder(folder)
+
+
+def cost(run: RunFolder) -> Cost:
+    """What a run took so far."""
+    last = _rows(run.path)[-1]
+    return Cost(last["steps"], last["wall_s"], last["cpu_s"])
+
+
+def played(
+    task: str,
+    driver: str,
+    episodes: int,
+    seed: int,
+    rig: RigConfig | None = None,
+    arm: Path | None = None,
+    report: Report = lambda done, total, note: None,
+) -> dict[str, dict]:
+    """What a driver's episodes brought: name with unit -> fields of `Summary`; FCL is the referee.
+
+    driver: `scripted`, `random` or a run's folder. rig: None plays in simulation.
+    """
+    config = config_of(task)
+    if arm is not None:
+        config = with_fields(config, arm=str(arm))
+    place = make_task(task, config)
+    if rig is not None:
+        place = on_rig(place, rig)
+    opened = open_driver(driver, place)
+    found = evaluate(
+        place, driver, opened, episodes, seed, progress=lambda d, t: report(d, t, "playing")
+    )
+    return found.to_json()["overall"]
+
+
+def _check_same(run: RunFolder, plan: Plan) -> None:
+    """Raise where a folder holds a run of another plan."""
+    came, hyper = run.config, json.loads(json.dumps(asdict(plan.preset)))
+    for what, there, expected in (
+        ("task", came["task"], plan.task),
+        ("seed", came["seed"], plan.seed),
+        ("steps", came["steps"], plan.steps),
+        ("hyper-parameters", came["hyper_parameters"], hyper),
+    ):
+        if there != expected:
+            raise InputError(
+                f"{run.path}: its {what}: {there}, expected {expected}; choose another folder"
+            )
+
+
+def _rows(folder: Path) -> list[dict]:
+    file = folder / "metrics.jsonl"
+    text = file.read_text() if file.is_file() else ""
+    lines = text.rpartition("\n")[0].splitlines()  # the last line may be half written
+    if not lines:
+        raise InputError(f"{file}: nothing was trained there yet")
+    return [json.loads(line) for line in lines]
+
+
+def _finished(folder: Path, plan: Plan) -> bool:
+    """Whether all that was planned is done; a run that was cut off before its first turn is not."""
+    file = folder / "metrics.jsonl"
+    if not file.is_file() or not file.read_text().strip():
+        return False
+    last = _rows(folder)[-1]
+    return plan.share(last["steps"], last["wall_s"]) >= 1.0

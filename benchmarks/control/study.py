@@ -1,0 +1,168 @@
+"""Control: learned, scripted and random drivers on every task, in simulation and on the rig.
+
+Runs lie in one folder as `TASK-seed-N`; what is missing is trained there, what is there is taken
+as it is. Results are kept beside them by the content of the policy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.cache import Kept, Meter, Report
+from benchmarks.control.policies import Cost, cost, plan_of, played, trained
+from benchmarks.control.two_processes import trained_by_two
+from surgisoft.agents.on_rig import RigConfig
+from surgisoft.agents.presets import PAPER_STEPS
+from surgisoft.agents.run_folder import BEST, RunFolder
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.registry import config_of, config_table
+
+LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
+"""Tasks that policies are trained for."""
+TASKS = (*LEARNED, "track_body", "keyhole")
+"""All tasks that are played; the last ones by the script and at random only."""
+PLACES = ("simulation", "rig")
+"""Where they are played."""
+RATE_TASK = "track_circle"
+"""Task on which the rate of a preset is measured."""
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """How large the study is."""
+
+    tasks: tuple[str, ...] = TASKS
+    """Names of the tasks."""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the training runs."""
+    episodes: int = 100
+    """Episodes of each driver in simulation."""
+    rig_episodes: int = 20
+    """Episodes of each driver on the rig."""
+    episode_seed: int = 1000
+    """Seed of the episodes that are played; training and its evaluations use others."""
+    rate_steps: int = 1_048_576
+    """Steps of preset `paper` by which its rate is measured; 0: it is not."""
+    whole_steps: int = PAPER_STEPS
+    """Steps that two processes train together on `RATE_TASK`; 0: they do not."""
+
+    def __post_init__(self):
+        for name in self.tasks:
+            if name not in TASKS:
+                raise unknown_name("task of this study", name, TASKS)
+        if not self.seeds:
+            raise InputError("control: no seeds; expected at least one")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One training run."""
+
+    task: str
+    """What was learned."""
+    seed: int
+    """Its seed."""
+    preset: str
+    """Its preset."""
+    cost: Cost
+    """What it took."""
+    best: dict[str, float]
+    """What its own evaluation found for the policy that was kept."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """One driver's episodes."""
+
+    task: str
+    """What was played."""
+    place: str
+    """`simulation` or `rig`."""
+    driver: str
+    """`learned, seed N`, `scripted` or `random`."""
+    numbers: dict[str, dict]
+    """name with unit -> fields of `Summary`."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """All that was measured."""
+
+    runs: tuple[Trained, ...]
+    """Every policy's training."""
+    played: tuple[Played, ...]
+    """Every driver in every place."""
+    paper: Cost | None
+    """The run that measures the rate of preset `paper`."""
+    whole: Cost | None = None
+    """The run of as many steps as the paper's, by two processes; its wall time is what counts."""
+
+
+def run(config: ControlConfig, folder: Path, report: Report) -> Results:
+    """Train what is missing, then play everything that is not kept from before."""
+    learned = [(task, seed) for task in LEARNED if task in config.tasks for seed in config.seeds]
+    plays = 2 * (len(learned) + 2 * len(config.tasks))
+    whole = config.whole_steps if RATE_TASK in config.tasks else 0
+    alone = 25 * bool(config.rate_steps) + 100 * bool(whole)
+    meter = Meter(report, 100 * len(learned) + alone + 5 * (plays + 2 * bool(whole)))
+    folder.mkdir(parents=True, exist_ok=True)
+    drivers, runs, both = [], [], None
+    if whole:
+        place = folder / f"{RATE_TASK}-{whole}-steps"
+        both = trained_by_two(place, RATE_TASK, whole, meter.stage(100, f"train {place.name}"))
+        drivers.append((RATE_TASK, f"learned, {whole:,} steps", str(place)))
+    for task, seed in learned:
+        place = folder / f"{task}-seed-{seed}"
+        one = _learned(place, task, seed, meter.stage(100, f"train {place.name}"))
+        runs.append(one)
+        drivers.append((task, f"learned, seed {one.seed}", str(place)))
+    paper = _paper(config, folder, meter) if config.rate_steps else None
+    drivers += [(task, name, name) for task in config.tasks for name in ("scripted", "random")]
+    kept, shown = Kept(folder / "results"), []
+    for where in PLACES:
+        for task, name, driver in drivers:
+            tell = meter.stage(5, f"{task}: {name}, {where}")
+            shown.append(
+                Played(task, where, name, _played(config, kept, task, where, driver, tell))
+            )
+    return Results(tuple(runs), tuple(shown), paper, cost(both) if both else None)
+
+
+def _learned(folder: Path, task: str, seed: int, report: Report) -> Trained:
+    """A finished run as it is; else one that is trained with the task's own number of steps."""
+    there = RunFolder(folder) if (folder / "config.json").is_file() else None
+    if there is not None and there.config["task"] != task:
+        raise InputError(f"{folder}: was trained on {there.config['task']}, expected {task}")
+    opened = trained(folder, there.plan() if there else plan_of(task, seed), report)
+    best = opened.load(BEST)["evaluation"]
+    return Trained(task, opened.config["seed"], opened.config["preset"], cost(opened), best)
+
+
+def _paper(config: ControlConfig, folder: Path, meter: Meter) -> Cost:
+    """A run of preset `paper`, long enough to know its rate."""
+    place = folder / f"rate-paper-{config.rate_steps}"
+    plan = plan_of(RATE_TASK, 1, config.rate_steps, preset="paper")
+    return cost(trained(place, plan, meter.stage(25, "rate of preset paper")))
+
+
+def _played(config: ControlConfig, kept: Kept, task: str, where: str, driver: str, tell) -> dict:
+    """What one driver's episodes brought, from the folder of results where it is there."""
+    rig = RigConfig() if where == "rig" else None
+    count = config.episodes if rig is None else config.rig_episodes
+    about = {
+        "task": task,
+        "config": config_table(config_of(task)),
+        "driver": driver,
+        "rig": rig and config_table(rig),
+        "episodes": count,
+        "seed": config.episode_seed,
+    }
+    if driver not in ("scripted", "random"):
+        content = RunFolder(driver).checkpoint(BEST).read_bytes()
+        about["driver"] = hashlib.sha256(content).hexdigest()
+    name = f"{task}-{where}"
+    return kept.values(
+        name, about, lambda: played(task, driver, count, config.episode_seed, rig, report=tell)
+    )

@@ -1,0 +1,1 @@
+"""Benchmark `diagnosis`: missing effects named on simulated robots."""

@@ -1,0 +1,72 @@
+"""Ambiguous cases of the diagnosis benchmark: the recommended experiment, recorded and read.
+
+As a user would: `next-experiment MODEL OLD --between RIVALS`, `collect SCHEDULE`, `diagnose MODEL
+OLD NEW`. Where the experiment takes something away from the bench, NEW alone is diagnosed, for OLD
+was recorded on another bench.
+"""
+
+from dataclasses import dataclass
+
+from benchmarks.diagnosis.cases import Case
+from benchmarks.diagnosis.robots import record_experiment
+from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
+from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
+from surgisoft.diagnosis.next_experiment.propose import recommend
+from surgisoft.diagnosis.next_experiment.reading import effect_left
+from surgisoft.diagnosis.problem import pose
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.model import ArmModel
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What the recommended experiment said of an ambiguous case."""
+
+    experiment: str
+    """Its name."""
+    setting: str
+    """The change of the bench."""
+    minutes: float
+    """Time on the bench, minutes."""
+    expected: float
+    """Chance that it promised of naming the right one, for the worst pair."""
+    effect: str | None
+    """The effect that is left; None where it is still open."""
+    first: str | None
+    """The effect that is left, or the first of the new ranking where it is still open."""
+
+
+def settle(
+    case: Case,
+    model: ArmModel,
+    known: KnownError,
+    recording: Recording,
+    rivals: tuple[str, ...],
+    settings: tuple[str, ...] = tuple(SETTINGS),
+) -> Settled:
+    """Record the recommended experiment on the same robot, and diagnose again."""
+    advice = recommend(pose(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
+    new = record_experiment(case, SETTINGS[advice.setting], advice.protocol)
+    some = [new] if advice.by_hand else [recording, new]
+    said = diagnose(model, some, reference=known, without=advice.removes)
+    left = effect_left(advice, said)
+    named = [row.effect for row in said.ranking]
+    return Settled(
+        experiment=advice.name,
+        setting=advice.setting,
+        minutes=advice.minutes,
+        expected=min(pair.after for pair in advice.pairs),
+        effect=left,
+        first=left or (named[0] if named else None),
+    )
+
+
+def settle_both(
+    case: Case, model: ArmModel, known: KnownError, recording: Recording, rivals: tuple[str, ...]
+) -> tuple[Settled, Settled]:
+    """As recommended, and as recommended where nobody may touch the bench."""
+    free = settle(case, model, known, recording, rivals)
+    if free.setting == AS_IT_STANDS:
+        return free, free
+    return free, settle(case, model, known, recording, rivals, (AS_IT_STANDS,))

@@ -1,0 +1,183 @@
+"""The benchmark of the diagnosis: many virtual robots, each with a truth that is known.
+
+Robots are specimens of the virtual rig; their hidden effects have other forms than the model's.
+Every robot draws: the hidden effect (or none, one outside the list, or two), its strength, noise,
+excitation and the surrogate's own error. An ambiguous case goes on with the recommended experiment;
+of some cases the model is amended by what was named.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+import surgisoft
+from benchmarks.diagnosis.amend import Amended, amended
+from benchmarks.diagnosis.cases import Case
+from benchmarks.diagnosis.experiment import Settled, settle_both
+from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.errors import InputError
+from surgisoft.surrogate.known_error import KnownError
+from surgisoft.workers import workers
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the diagnosis said of a case."""
+
+    case: Case
+    kind: str
+    effects: tuple[str, ...]
+    ranking: tuple[str, ...]
+    confidence: float
+    effect_mm: float
+    """RMS change of the key points by what is hidden, mm."""
+    surrogate_mm: float
+    """Validated error of the surrogate, mm."""
+    seconds: float
+    """Processor time of the diagnosis, s."""
+    statistics: dict
+    settled: Settled | None = None
+    """What the recommended experiment said; None where the case is not ambiguous."""
+    settled_untouched: Settled | None = None
+    """The same where the bench may not be changed."""
+    amended: Amended | None = None
+    """What amending by the answer was worth; None where it was not asked for."""
+    case_seconds: float = 0.0
+    """Processor time of the whole case, s."""
+
+
+def to_amend(some: list[Case], number: int) -> set[Case]:
+    """The first so many cases with one effect of the list; `cases` goes through them in turn."""
+    return set([case for case in some if case.single][:number])
+
+
+def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
+    """Record, bend the surrogate, diagnose; experiment where ambiguous; amend where asked for."""
+    begin = time.process_time()
+    torch.set_num_threads(1)
+    model = base_model(case.robot, folder, case.undertrained)
+    if case.surrogate_mm > model.validation["rmse_mm"]:
+        model = bent(model, case.robot, case.surrogate_mm, case.take)
+    known = KnownError.of(model, [validation_of(case.robot)])
+    recorded = record(case)
+    ready = time.process_time()
+    found = diagnose(model, [recorded.recording], reference=known)
+    seconds = time.process_time() - ready
+    verdict = found.verdict
+    settled = untouched = worth = None
+    if verdict.kind == "ambiguous":
+        settled, untouched = settle_both(case, model, known, recorded.recording, verdict.effects)
+    if amending:
+        worth = amended(model, recorded, _answer(verdict.kind, verdict.effects, settled))
+    return Outcome(
+        case=case,
+        kind=verdict.kind,
+        effects=verdict.effects,
+        ranking=tuple(row.effect for row in found.ranking),
+        confidence=found.ranking[0].confidence if found.ranking else 0.0,
+        effect_mm=recorded.effect_mm,
+        surrogate_mm=model.validation["rmse_mm"],
+        seconds=seconds,
+        statistics=found.statistics,
+        settled=settled,
+        settled_untouched=untouched,
+        amended=worth,
+        case_seconds=time.process_time() - begin,
+    )
+
+
+def _answer(kind: str, effects: tuple[str, ...], settled: Settled | None) -> tuple[str, ...]:
+    """The effects that a user would amend by, after the recommended experiment."""
+    if kind != "ambiguous":
+        return effects
+    return ((settled and settled.effect) or effects[0],)
+
+
+def run(
+    some: list[Case],
+    folder: Path,
+    processes: int,
+    report: Callable[[float, float, str], None],
+    amend: int = 0,
+) -> list[Outcome]:
+    """All outcomes; base models first, then the cases, over processes.
+
+    amend: cases whose model is amended too. What was said of a case is kept in the folder, so that
+    a run that was cut off goes on.
+    """
+    robots = sorted({(case.robot, case.undertrained) for case in some})
+    if not robots:
+        raise InputError("no cases: ask for at least one robot")
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / f"outcomes-{fingerprint()}.jsonl"
+    wanted = to_amend(some, amend)
+    known = {
+        case: outcome
+        for case, outcome in read_outcomes(log).items()
+        if outcome.amended is not None or case not in wanted
+    }
+    total, done = len(robots) + len(some), 0
+    answer = {case: known[case] for case in some if case in known}
+    with workers(processes) as pool:
+        for future in as_completed([pool.submit(base_model, r, folder, u) for r, u in robots]):
+            future.result()
+            done += 1
+            report(done, total, "base models")
+        done += len(answer)
+        jobs = [
+            pool.submit(run_case, case, folder, case in wanted)
+            for case in some
+            if case not in answer
+        ]
+        for future in as_completed(jobs):
+            outcome = future.result()
+            answer[outcome.case] = outcome
+            done += 1
+            report(done, total, f"{len(answer)} of {len(some)} robots")
+            with log.open("a") as file:
+                file.write(json.dumps(asdict(outcome)) + "\n")
+    return [answer[case] for case in some]
+
+
+def fingerprint() -> str:
+    """What the outcomes depend on: the code of the diagnosis, the effects, the rig, the cases."""
+    package = Path(surgisoft.__file__).parent
+    folders = ("diagnosis", "surrogate", "rig", "measurement/protocols")
+    files = [path for folder in folders for path in (package / folder).rglob("*.py")]
+    files += [p for p in Path(__file__).parent.glob("*.py") if "table" not in p.name]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        if "pages" not in path.parts:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def read_outcomes(log: Path) -> dict[Case, Outcome]:
+    """Outcomes that were kept; a line that was cut off is left out."""
+    answer = {}
+    for line in log.read_text().splitlines() if log.is_file() else []:
+        try:
+            values = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        case = values.pop("case")
+        hidden = tuple((name, strength) for name, strength in case.pop("hidden"))
+        for name in ("settled", "settled_untouched"):
+            values[name] = values[name] and Settled(**values[name])
+        worth = values.pop("amended")
+        outcome = Outcome(
+            case=Case(hidden=hidden, **case),
+            effects=tuple(values.pop("effects")),
+            ranking=tuple(values.pop("ranking")),
+            amended=worth and Amended(**worth | {"effects": tuple(worth["effects"])}),
+            **values,
+        )
+        answer[outcome.case] = outcome
+    return answer

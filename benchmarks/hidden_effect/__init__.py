@@ -1,0 +1,1 @@
+"""Benchmark `hidden-effect`: diagnose, amend and retrain on a rig that hides an effect."""

@@ -1,0 +1,85 @@
+"""Policies trained on a model, and all drivers played on the rig that hides something."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from benchmarks.cache import Kept, Meter, model_digest
+from benchmarks.control.policies import cost, plan_of, played, trained
+from surgisoft.agents.on_rig import RigConfig
+from surgisoft.tasks.registry import config_table, with_fields
+
+TASK = "track_circle"
+"""What the policies learn."""
+SIGHTS = ("blind", "cameras")
+"""Without the cameras' key points, where the model alone says where the body is, and with them."""
+TRAIN, PLAY = 100, 8
+"""Lengths of a training and of a driver's episodes, by the meter."""
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """How policies are trained, and the rig that drivers are played on."""
+
+    kept: Kept
+    """Where policies and results are kept."""
+    specimen: int
+    """Seed of the arm's casting."""
+    hidden: tuple[tuple[str, float], ...]
+    """Hidden effects of the rig and their strengths."""
+    steps: int
+    """Training steps of each policy."""
+    seed: int
+    """Seed of the training and of the episodes."""
+    episodes: int
+    """Episodes of each driver."""
+
+    def on_model(
+        self, title: str, arm: Path, meter: Meter, names: tuple[str, ...]
+    ) -> tuple[dict[str, dict], dict]:
+        """Drivers that know the arm by the model in a folder: NAME/SIGHT -> fields of `Summary` of
+        the episodes' mean errors [mm], and the `Cost` of the policy.
+
+        names: of `learned`, `scripted`, `random`.
+        """
+        plan = plan_of(TASK, self.seed, self.steps, arm)
+        told = _told(plan, arm)
+        tell = meter.stage(TRAIN, f"{title}: policy")
+        run = trained(self.kept.place(f"policies/{TASK}", told), plan, tell)
+        found = {}
+        for sight in SIGHTS:
+            rig = RigConfig(self.specimen, self.hidden, cameras=sight == "cameras")
+            for name in names:
+                driver = str(run.path) if name == "learned" else name
+                tell = meter.stage(PLAY, f"{title}: {name} on the rig, {sight}")
+                found[f"{name}/{sight}"] = self._played(
+                    f"{title.split(',')[0]}-{name}", driver, told, arm, rig, tell
+                )
+        return found, asdict(cost(run))
+
+    def _played(self, name: str, driver: str, told: dict, arm: Path, rig: RigConfig, tell) -> dict:
+        """Summary of the mean error of each episode on the rig, mm."""
+        about = {
+            "plan": told,
+            "learned": driver not in ("scripted", "random"),
+            "rig": config_table(rig),
+            "episodes": self.episodes,
+            "seed": self.seed,
+        }
+        return self.kept.values(
+            f"driven/{name}",
+            about,
+            lambda: played(TASK, driver, self.episodes, self.seed, rig, arm, tell)["error_mean_mm"],
+        )
+
+
+def _told(plan, arm: Path) -> dict:
+    """What a policy depends on; the arm by its content, not by its place."""
+    return {
+        "task": plan.task,
+        "config": config_table(with_fields(plan.task_config, arm=model_digest(arm))),
+        "hyper_parameters": asdict(plan.preset),
+        "steps": plan.steps,
+        "seed": plan.seed,
+    }

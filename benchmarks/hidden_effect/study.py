@@ -1,0 +1,334 @@
+"""The loop closed: a rig that hides an effect, a diagnosis, a better model, a better policy.
+
+For every effect: (1) a policy is trained on the model without it and played on the rig that has it;
+(2) the model is compared with recordings of that rig, diagnosed, asked for a further experiment
+where two effects cannot be told apart, and amended by what the diagnosis names, right or wrong;
+(3) a policy is trained anew on the amended model and played on the same rig. Beside it stands an
+oracle that was told the effect's name, and a recording of its own judges all models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from benchmarks.cache import Kept, Meter, Report, model_digest
+from benchmarks.hidden_effect.policies import PLAY, TRAIN, Drivers
+from benchmarks.hidden_effect.rates import by_rate
+from benchmarks.hidden_effect.rigs import Bench
+from surgisoft.diagnosis.amend import EVERY_ROW, amend, fall_of
+from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
+from surgisoft.diagnosis.improve import next_effects
+from surgisoft.diagnosis.next_experiment.catalogue import ON_THE_RIG
+from surgisoft.diagnosis.next_experiment.propose import recommend
+from surgisoft.diagnosis.problem import pose
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.histories import arm_spec, history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.fit import FitConfig, fit
+
+DEFAULT_SPECIMEN = 0
+"""The specimen that the default arm model was fitted on."""
+ORACLE_TAKES = 3
+"""Recordings that the oracle is fitted on; the diagnosis has one."""
+TAKE, JUDGING_TAKE, FURTHER_TAKE, PACED_TAKE = 1, 9, 20, 33
+"""Numbers of the recordings: diagnosed, judging, next experiment, circles at the task's pace."""
+MODELS = ("before", "after", "oracle")
+"""The model without the effect, the one amended by the diagnosis, the one told the name."""
+LASTING = ("learned", "scripted")
+"""Drivers that know the arm by a model."""
+STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
+"""Length of one effect, by the meter."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One effect that a model lacks."""
+
+    effect: str
+    """Its name in the model's list."""
+    hidden: bool
+    """Whether it is switched on in the rig after the model was fitted; else the arm has it anyway
+    and the model is one that leaves it out."""
+
+
+CASES: dict[str, Case] = {
+    "creep": Case("creep", True),
+    "line_lag": Case("line_lag", True),
+    "payload": Case("payload", True),
+    "hysteresis": Case("hysteresis", False),
+}
+"""Every effect of the study. Hysteresis is the friction that every arm of the rig has: the model
+without it is HAW-NN that sees pressure alone, and its oracle is fitted with the effect from the
+start."""
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """How large the study is."""
+
+    specimen: int = DEFAULT_SPECIMEN
+    """Seed of the arm's casting."""
+    strength: float = 1.0
+    """Strength of the hidden effects; 1 moves the tip by about 1 mm."""
+    steps: int = 1_000_000
+    """Training steps of each policy."""
+    seed: int = 0
+    """Seed of the training and of the episodes."""
+    episodes: int = 10
+    """Episodes of each driver on the rig."""
+    samples: int = 12000
+    """Samples of a recording, at 20 Hz."""
+    grid_points: int = 13824
+    """Settled points that a model is fitted to, where one has to be."""
+
+    def __post_init__(self):
+        if not 0.0 < self.strength <= 10.0:
+            raise InputError(f"strength is {self.strength}, expected more than 0, at most 10")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one effect; errors in mm."""
+
+    case: str
+    """Its name."""
+    verdicts: tuple[dict, ...]
+    """What `diagnose --json` says; a second one where an experiment was asked for."""
+    experiment: dict | None
+    """That experiment, as `next-experiment --json` tells it."""
+    amended: tuple[str, ...]
+    """The effects that were put in; none where no fall was claimed."""
+    parameters: tuple[dict, ...]
+    """Their parameters."""
+    claim: str
+    """What `amend` said."""
+    model_mm: dict[str, float]
+    """RMS distance of a key point on the judging recording: before, after, oracle, floor."""
+    falls: dict[str, dict]
+    """after, oracle -> `Fall` from before."""
+    rates: tuple[dict, ...]
+    """The models by the rate of the actuation, see `by_rate`."""
+    paced: dict | None
+    """Where drivers got worse: the same amended on circles at the task's pace instead."""
+    driven: dict[str, dict]
+    """MODEL/DRIVER/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
+    training: dict[str, dict]
+    """MODEL -> `Cost` of its policy."""
+
+
+class Study:
+    """One specimen; models, recordings, policies and results are kept in a folder."""
+
+    def __init__(self, config: StudyConfig, folder: Path):
+        self.config, self.kept = config, Kept(folder)
+
+    def run(self, name: str, meter: Meter) -> Outcome:
+        """All of one effect, or what of it was left to do."""
+        case, config = CASES[name], self.config
+        hidden = ((case.effect, config.strength),) if case.hidden else ()
+        before = self.base(case.hidden, meter.stage(15, f"{name}: base model"))
+        bench = Bench(self.kept, config.specimen, hidden, config.samples)
+        tell = meter.stage(15, f"{name}: recording and diagnosis")
+        seen = bench.mixed(TAKE, tell)
+        found = self._diagnosed(name, before, bench, seen)
+        after = self._amended(name, before, found, bench, seen)
+        tell = meter.stage(15, f"{name}: oracle")
+        oracle = self._oracle(case, before, bench, tell)
+        models = {"before": before, "after": after["model"] or before, "oracle": oracle}
+        judged = self._judged(name, models, bench)
+        about = {key: model_digest(folder) for key, folder in models.items()} | bench.about
+        rates = self.kept.values(
+            f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
+        )
+        drivers = Drivers(
+            self.kept, config.specimen, hidden, config.steps, config.seed, config.episodes
+        )
+        driven, training = self._driven(name, models, drivers, meter)
+        paced = None
+        if worse(driven):
+            paced = self._paced(name, before, found["effects"], bench, drivers, meter)
+        return Outcome(
+            case=name,
+            verdicts=tuple(found["verdicts"]),
+            experiment=found["experiment"],
+            amended=tuple(found["effects"] if after["model"] else ()),
+            parameters=tuple(after["parameters"]),
+            claim=after["claim"],
+            rates=tuple(rates),
+            paced=paced,
+            driven=driven,
+            training=training,
+            **judged,
+        )
+
+    def base(self, memory: bool, report: Report) -> Path:
+        """A model of the specimen as it was cast: with its hysteresis, or from pressure alone."""
+        config = self.config
+        about = {"specimen": config.specimen, "memory": memory, "points": config.grid_points}
+        name = "models/base" if memory else "models/pressure-only"
+        if memory and config.specimen == DEFAULT_SPECIMEN:
+            return self._model("models/default", {}, lambda: (default_arm(), None))
+
+        def make():
+            rig = VirtualRig(config.specimen)
+            seed, wanted = config.specimen, {"grid": config.grid_points, "validation": None}
+            train, valid = (
+                rig.record(make_protocol(key, rig.limits, points, seed=seed))[0]
+                for key, points in wanted.items()
+            )
+            how = FitConfig(
+                inputs="pressure+direction" if memory else "pressure",
+                effects=("hysteresis",) if memory else (),
+            )
+            result = fit(
+                history_of([train]),
+                history_of([valid]),
+                arm_spec([train]),
+                how,
+                lambda stage, epoch, of, loss: report(epoch, of, stage),
+            )
+            return result.model, result.report()
+
+        return self._model(name, about, make)
+
+    def _model(self, name: str, about: dict, make: Callable) -> Path:
+        """The folder of a model, made unless it is there; `make`: (model, its report)."""
+        folder = self.kept.place(name, about)
+        if not (folder / "config.json").is_file():
+            model, report = make()
+            save_model(model, folder, report)
+        return folder
+
+    def _diagnosed(self, name: str, before: Path, bench: Bench, seen: Recording) -> dict:
+        """Verdicts, the experiment between them, and the effects that are named in the end."""
+        about = {"model": model_digest(before), **bench.about}
+
+        def make() -> dict:
+            model = load_model(before)
+            found = [diagnose(model, [seen])]
+            plan = None
+            if found[0].verdict.kind == "ambiguous":
+                rivals = found[0].verdict.effects[:MOST_RIVALS]
+                asked = recommend(pose(model, [seen]), rivals, settings=ON_THE_RIG)
+                more = bench.record(asked.protocol, FURTHER_TAKE, asked.setting)
+                found.append(diagnose(model, [seen, more]))
+                plan = asked.to_json()
+            return {
+                "verdicts": [each.to_json() for each in found],
+                "experiment": plan,
+                "effects": list(next_effects(found[-1])),
+            }
+
+        return self.kept.values(f"diagnoses/{name}", about, make)
+
+    def _amended(self, name: str, before: Path, found: dict, bench: Bench, seen) -> dict:
+        """The amended model's folder (None: nothing is claimed), its parameters, the claim."""
+        effects = found["effects"]
+        if not effects:
+            return {"model": None, "parameters": [], "claim": "no effect was named"}
+        about = {"model": model_digest(before), "effects": effects, **bench.about}
+        folder = self.kept.place(f"models/{name}-amended", about)
+
+        def make() -> dict:
+            result = amend(load_model(before), [seen], effects)
+            if result.locked.claimed:
+                save_model(result.model, folder, result.to_json(), force=True)
+            return result.to_json()
+
+        told = self.kept.values(f"amendments/{name}", about, make)
+        return {
+            "model": folder if told["claimed"] else None,
+            "parameters": told["parameters"],
+            "claim": told["sentence"],
+        }
+
+    def _oracle(self, case: Case, before: Path, bench: Bench, report: Report) -> Path:
+        """A model that was told the effect's name: amended on more data, or fitted with it."""
+        if not case.hidden:
+            return self.base(True, report)
+        about = {"model": model_digest(before), "told": case.effect, **bench.about}
+        about["takes"] = ORACLE_TAKES
+
+        def make():
+            some = [bench.mixed(TAKE + k, report) for k in range(ORACLE_TAKES)]
+            result = amend(load_model(before), some, [case.effect])
+            return result.model, result.to_json()
+
+        return self._model(f"models/{case.effect}-oracle", about, make)
+
+    def _judged(self, name: str, models: dict[str, Path], bench: Bench) -> dict:
+        """The models' errors on a recording that none of them was fitted to."""
+        about = {key: model_digest(folder) for key, folder in models.items()}
+        about |= bench.about
+
+        def make() -> dict:
+            test = bench.mixed(JUDGING_TAKE)
+            first = pose(load_model(models["before"]), [test], EVERY_ROW, part="all")
+            falls = {
+                key: fall_of(first, first.with_model(load_model(models[key])))
+                for key in ("after", "oracle")
+            }
+            return {
+                "model_mm": {
+                    "before": falls["oracle"].before,
+                    "after": falls["after"].after,
+                    "oracle": falls["oracle"].after,
+                    "floor": falls["oracle"].floor,
+                },
+                "falls": {key: asdict(fall) for key, fall in falls.items()},
+            }
+
+        return self.kept.values(f"errors/{name}", about, make)
+
+    def _driven(self, name: str, models: dict[str, Path], drivers: Drivers, meter: Meter):
+        """MODEL/DRIVER/SIGHT -> summary, MODEL -> cost of its policy."""
+        driven, training = {}, {}
+        for key, arm in models.items():
+            names = ("learned", "scripted", "random") if key == "before" else LASTING
+            found, training[key] = drivers.on_model(f"{name}, model {key}", arm, meter, names)
+            driven |= {f"{key}/{which}": summary for which, summary in found.items()}
+        return driven, training
+
+    def _paced(self, name: str, before: Path, effects, bench: Bench, drivers: Drivers, meter):
+        """The same effects amended on circles at the task's own pace, where that is called for."""
+        about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
+        folder = self.kept.place(f"models/{name}-paced", about)
+        seen = bench.circles(PACED_TAKE)
+
+        def make() -> dict:
+            result = amend(load_model(before), [seen], effects)
+            save_model(result.model, folder, result.to_json(), force=True)
+            first = pose(load_model(before), [bench.mixed(JUDGING_TAKE)], EVERY_ROW, part="all")
+            return result.to_json() | {
+                "mixed_mm": fall_of(first, first.with_model(result.model)).after
+            }
+
+        told = self.kept.values(f"amendments/{name}-paced", about, make)
+        beside = Meter(lambda done, total, note: meter.stage(0, note), 1.0)
+        found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
+        return {
+            "claim": told["sentence"],
+            "parameters": told["parameters"],
+            "mixed_mm": told["mixed_mm"],
+            "driven": found,
+        }
+
+
+def worse(driven: dict[str, dict]) -> bool:
+    """Whether the script does worse with the amended model, beyond chance, without cameras."""
+    before, after = (driven[f"{key}/scripted/blind"] for key in ("before", "after"))
+    return after["low"] > before["high"]
+
+
+def run(names: list[str], config: StudyConfig, folder: Path, report: Report) -> list[Outcome]:
+    """The named effects one after the other; what the folder holds is not done again."""
+    for name in names:
+        if name not in CASES:
+            raise unknown_name("effect of this study", name, CASES)
+    study, meter = Study(config, folder), Meter(report, STAGES * max(len(names), 1))
+    return [study.run(name, meter) for name in names]

@@ -1,0 +1,285 @@
+"""The loop closed, as tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.hidden_effect.policies import SIGHTS, TASK
+from benchmarks.hidden_effect.study import CASES, MODELS, Outcome, StudyConfig
+from surgisoft.diagnosis.refinement.intervals import values_text
+from surgisoft.report.charts import BLUE, GREEN, RED, drawing
+from surgisoft.report.style import MUTED
+
+FORMS = {
+    "line_lag": "The rig's tube and the model's line follow other laws of flow, and the model's "
+    "fitted best where the error is largest: in quick motion. The circle is slow motion, where "
+    "its lag is another one than the rig's."
+}
+"""What is known of the two forms of an effect, the rig's and the model's."""
+COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}
+"""Of the three models, in every picture."""
+WORDS = {
+    "blind": "without the cameras (`--no-cameras`): the model alone says where the body is",
+    "cameras": "with the cameras: key points are measured and filtered",
+}
+"""What each sight means."""
+
+
+def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
+    """All tables as Markdown."""
+    parts = [_setting(outcomes, config), "## The model", _models(outcomes), *_said(outcomes)]
+    parts.append("## The policy")
+    for sight in SIGHTS:
+        parts += [f"On the rig, {WORDS[sight]}.", _driven(outcomes, sight)]
+    parts += ["### What retraining brought", "\n".join(_brought(outcomes)), *_why(outcomes)]
+    parts.append(_costs(outcomes))
+    return "\n\n".join(parts) + "\n"
+
+
+def _setting(outcomes: list[Outcome], config: StudyConfig) -> str:
+    names = [o.case for o in outcomes if CASES[o.case].hidden]
+    hidden = f" {', '.join(names)}: switched on in the rig at strength {config.strength:g} after "
+    hidden += "the model was fitted." if names else ""
+    own = " hysteresis: the friction that the arm has anyway; the model without it is HAW-NN on "
+    own += "pressure alone, its oracle HAW-NN fitted with the effect on the same settled points."
+    return (
+        f"Specimen {config.specimen} of the virtual rig."
+        + (hidden if names else "")
+        + (own if any(not CASES[o.case].hidden for o in outcomes) else "")
+        + f" Diagnosed and amended on one `mixed` recording of {config.samples / 1200:g} minutes; "
+        "`after` is amended by what the diagnosis named first, whether that is right or not. "
+        "The oracle was told the effect's name and has three such recordings. All models are "
+        "judged on another `mixed` recording. "
+        f"Policies: `{TASK}`, preset `fast`, {config.steps:,} steps each, seed {config.seed}; "
+        f"{config.episodes} episodes of each driver on the rig. The circle lies where the driver's "
+        "own model has the tip at 20 kPa, so each model has its own. One specimen, one seed: "
+        "differences of a few hundredths of a millimetre between policies are not told apart."
+    )
+
+
+def _models(outcomes: list[Outcome]) -> str:
+    """Verdicts and errors of the models."""
+    lines = [
+        "| hidden | verdict | put in | before | after | oracle | floor "
+        "| fall after (95 %) | share of the oracle's fall |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for o in outcomes:
+        e, fall = o.model_mm, o.falls["after"]
+        low, high = fall["ci95"]
+        share = (e["before"] - e["after"]) / (e["before"] - e["oracle"])
+        verdict = " -> ".join(_verdict(v) for v in o.verdicts)
+        lines.append(
+            f"| {o.case} | {verdict} | {' + '.join(o.amended) or 'nothing'} | "
+            + " | ".join(f"{e[key]:.3f}" for key in (*MODELS, "floor"))
+            + f" | {fall['fall']:.3f} ({low:.3f} to {high:.3f}) | {100 * share:.0f} % |"
+        )
+    lines += ["", "RMS distance of a key point in mm, on a recording that took no part."]
+    return "\n".join(lines)
+
+
+def _verdict(said: dict) -> str:
+    verdict = said["verdict"]
+    sure = said["ranking"][0]["confidence"] if said["ranking"] else 0.0
+    names = ", ".join(verdict["effects"])
+    return f"{verdict['kind']}: {names} ({sure:.2f})" if names else verdict["kind"]
+
+
+def _said(outcomes: list[Outcome]) -> list[str]:
+    """What was said of each effect, in words."""
+    answer = []
+    for o in outcomes:
+        lines = [f"**{o.case}**"]
+        lines += [f"- diagnose: {said['verdict']['sentence']}" for said in o.verdicts[:1]]
+        if o.experiment:
+            plan = o.experiment
+            pairs = ", ".join(" from ".join(pair) for pair in plan["separates"]) or "no pair surely"
+            lines.append(
+                f"- next experiment: {plan['name']}, {plan['minutes']:g} minutes, expected to tell "
+                f"{pairs}; played on the rig"
+            )
+            lines.append(f"- diagnose with it: {o.verdicts[-1]['verdict']['sentence']}")
+            if o.verdicts[-1]["verdict"]["kind"] == "ambiguous":
+                lines.append("- still ambiguous: the first one is put in")
+        lines.append(f"- amend: {o.claim}")
+        for p in o.parameters:
+            low, high = (values_text(end) for end in p["ci95"])
+            unit = f" {p['unit']}" if p["unit"] else ""
+            value = values_text(p["value"])
+            lines.append(f"- {p['effect']} {p['name']}: {value}{unit} ({low} to {high})")
+        answer.append("\n".join([lines[0], "", *lines[1:]]))
+    return answer
+
+
+def _driven(outcomes: list[Outcome], sight: str) -> str:
+    """Tracking errors of all drivers."""
+    lines = [
+        "| hidden | policy before | policy after | policy, oracle "
+        "| scripted before | scripted after | scripted, oracle | random |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for o in outcomes:
+        cells = [
+            _interval(o.driven[f"{key}/{driver}/{sight}"])
+            for driver in ("learned", "scripted")
+            for key in MODELS
+        ]
+        cells.append(f"{o.driven[f'before/random/{sight}']['mean']:.1f}")
+        lines.append(f"| {o.case} | " + " | ".join(cells) + " |")
+    lines += ["", "Mean distance of the tip from its target in mm, 95 % interval over episodes."]
+    return "\n".join(lines)
+
+
+def _interval(found: dict) -> str:
+    return f"{found['mean']:.3f} ({found['low']:.3f} to {found['high']:.3f})"
+
+
+def _brought(outcomes: list[Outcome]) -> list[str]:
+    """For each effect what the retrained policy gained or lost, as the intervals allow it."""
+    lines = []
+    for o in outcomes:
+        for sight in SIGHTS:
+            before, after = (o.driven[f"{key}/learned/{sight}"] for key in ("before", "after"))
+            change = 1.0 - after["mean"] / before["mean"]
+            if after["high"] < before["low"]:
+                what = f"helps: {100 * change:.0f} % less error"
+            elif after["low"] > before["high"]:
+                what = f"harms: {-100 * change:.0f} % more error"
+            else:
+                what = f"does not help beyond chance ({-100 * change:+.0f} %)"
+            lines.append(
+                f"- {o.case}, {'no cameras' if sight == 'blind' else 'cameras'}: retraining on the "
+                f"amended model {what} ({before['mean']:.3f} to {after['mean']:.3f} mm)"
+            )
+    return lines
+
+
+def _why(outcomes: list[Outcome]) -> list[str]:
+    """Where a driver got worse: whether the arm trails the models, by the rate of actuation."""
+    answer = []
+    for o in outcomes:
+        if o.paced is None:
+            continue
+        lines = [
+            f"**Why {o.case} gets worse.** By how much the arm trails the model (negative: the "
+            "model trails the arm), and the model's error, on the judging recording:",
+            "",
+            "| fastest chamber, kPa/s | rows | " + " | ".join(f"{key}" for key in MODELS) + " |",
+            "|---|---|" + "---|" * len(MODELS),
+        ]
+        for band in o.rates:
+            cells = [
+                f"{band[key]['trails_s']:+.3f} s, {band[key]['rmse_mm']:.3f} mm" for key in MODELS
+            ]
+            span = f"{band['low']:g} to {band['high']:g}"
+            lines.append(f"| {span} | {band['rows']} | " + " | ".join(cells) + " |")
+        answer.append("\n".join(lines))
+        if o.case in FORMS:
+            answer.append(FORMS[o.case])
+        found = o.paced["driven"]
+        cells = [
+            f"{driver} {_interval(found[f'{driver}/{sight}'])} mm {word}"
+            for sight, word in (("blind", "without cameras"), ("cameras", "with them"))
+            for driver in ("learned", "scripted")
+            if f"{driver}/{sight}" in found
+        ]
+        values = ", ".join(
+            f"{p['name']} {values_text(p['value'])} {p['unit']}".strip()
+            for p in o.paced["parameters"]
+        )
+        answer.append(
+            "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
+            f"slow circles instead: {o.paced['claim']} ({values}). On the mixed judging recording, "
+            f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
+            f"on it and script, on the rig: {'; '.join(cells)}."
+        )
+    return answer
+
+
+def _costs(outcomes: list[Outcome]) -> str:
+    each = [cost for o in outcomes for cost in o.training.values()]
+    cpu = sum(cost["cpu_s"] for cost in each) / len(each)
+    wall = sum(cost["wall_s"] for cost in each) / len(each)
+    return (
+        f"Training of a policy took {cpu:.0f} s of processor ({wall:.0f} s of wall time on shared "
+        "cores) on average. Effects that start from the same model share the policy before."
+    )
+
+
+def draw(outcomes: list[Outcome], folder: Path) -> list[Path]:
+    """Error bars of the models and of the policies as pictures; returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tracking = {
+        sight: {key: [o.driven[f"{key}/learned/{sight}"] for o in outcomes] for key in MODELS}
+        for sight in SIGHTS
+    }
+    return [_draw_models(outcomes, folder), _draw_tracking(outcomes, tracking, folder)]
+
+
+def _draw_models(outcomes: list[Outcome], folder: Path) -> Path:
+    from matplotlib import pyplot as plt
+
+    with drawing():
+        figure, axis = plt.subplots(figsize=(6.4, 3.4))
+        for k, key in enumerate(MODELS):
+            heights = [o.model_mm[key] for o in outcomes]
+            ends = None
+            if key in outcomes[0].falls:
+                falls = [(o.falls[key]["fall"], *o.falls[key]["ci95"]) for o in outcomes]
+                ends = [
+                    [high - fall for fall, _, high in falls],
+                    [fall - low for fall, low, _ in falls],
+                ]
+            _bars(axis, k, heights, ends, key)
+        for place, o in enumerate(outcomes):
+            axis.plot([place - 0.42, place + 0.42], [o.model_mm["floor"]] * 2, c=MUTED, ls="--")
+        axis.plot([], [], c=MUTED, ls="--", label="noise floor")
+        axis.set_ylabel("model error [mm]\n(bars: 95 % of the fall)")
+        axis.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.16))
+        _name(axis, outcomes)
+        return _saved(figure, folder / "hidden_model.png")
+
+
+def _draw_tracking(outcomes: list[Outcome], tracking: dict, folder: Path) -> Path:
+    from matplotlib import pyplot as plt
+
+    with drawing():
+        figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.6))
+        for axis, sight in zip(axes, SIGHTS, strict=True):
+            for k, (key, found) in enumerate(tracking[sight].items()):
+                means = [each["mean"] for each in found]
+                ends = [
+                    [each["mean"] - each["low"] for each in found],
+                    [each["high"] - each["mean"] for each in found],
+                ]
+                _bars(axis, k, means, ends, f"policy {key}")
+            scripted = [o.driven[f"after/scripted/{sight}"]["mean"] for o in outcomes]
+            axis.plot(range(len(outcomes)), scripted, "k_", ms=22, label="scripted after")
+            axis.set_title("model alone" if sight == "blind" else "with cameras")
+            axis.set_ylabel("tracking error on the rig [mm]")
+            _name(axis, outcomes)
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=4, loc="outside upper center")
+        return _saved(figure, folder / "hidden_tracking.png")
+
+
+def _bars(axis, k: int, heights, ends, label: str) -> None:
+    places = [place + 0.28 * (k - 1) for place in range(len(heights))]
+    key = label.removeprefix("policy ")
+    bars = axis.bar(places, heights, 0.26, yerr=ends, color=COLOURS[key], label=label, capsize=2)
+    axis.bar_label(bars, fmt="%.2f", fontsize=7, padding=2)
+
+
+def _name(axis, outcomes: list[Outcome]) -> None:
+    axis.set_xticks(range(len(outcomes)), [o.case for o in outcomes])
+    axis.grid(visible=False, axis="x")
+    axis.set_axisbelow(True)
+    axis.margins(y=0.15)
+
+
+def _saved(figure, path: Path) -> Path:
+    from matplotlib import pyplot as plt
+
+    figure.savefig(path, dpi=130, facecolor="white")
+    plt.close(figure)
+    return path

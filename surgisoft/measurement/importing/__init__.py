@@ -1,0 +1,1 @@
+"""Conversion of raw laboratory files into recordings."""

@@ -1,0 +1,380 @@
+"""Somebody else's files into recordings, as a map says.
+
+The steps: every file gets its role, files that belong together form a set, a set's files are joined
+to one row a sample, positions are brought into the arm's base frame, rows are tidied, and the sets
+become the runs of one recording or a recording each.
+"""
+
+import fnmatch
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing.align import Joined, join
+from surgisoft.measurement.importing.map_file import factor
+from surgisoft.measurement.importing.motive import is_motive, motive_table
+from surgisoft.measurement.importing.points import (
+    key_point_maps,
+    needed_columns,
+    quaternions,
+    read_points,
+)
+from surgisoft.measurement.importing.rows import (
+    Draft,
+    point_numbers,
+    run_numbers,
+    tidy,
+    without_frozen,
+    without_spikes,
+)
+from surgisoft.measurement.importing.spec import (
+    ActuationMap,
+    Column,
+    ContextMap,
+    FileRole,
+    ImportMap,
+)
+from surgisoft.measurement.importing.tables import RawTable, parquet_table, text_table
+from surgisoft.measurement.importing.timing import timing_notes
+from surgisoft.measurement.recordings.recording import Recording
+
+_ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A recording and what was done to get it."""
+
+    recording: Recording
+    """The recording, not yet saved."""
+    notes: list[str]
+    """What was left out, joined or fitted, in words."""
+
+
+def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> list[Imported]:
+    """All files as the runs of one recording of this name, or (no name) each set as a recording."""
+    parts = [_import_set(files, spec) for files in sets_of_files(paths, spec)]
+    if name is None:
+        named = [
+            replace(p, recording=_started_at(p.recording, spec, float(p.recording.t_s[0])))
+            for p in parts
+        ]
+        _check_names(named)
+        return [_finished(part, spec) for part in named]
+    return [_finished(_as_runs(parts, spec, name), spec)]
+
+
+def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path]]:
+    """The files that belong together: one of each role, in the order in which they are given.
+
+    A role with one file serves every set.
+    """
+    by_role: dict[str, list[Path]] = {role.name: [] for role in spec.files}
+    for path in _files(paths, spec):
+        by_role[_role_of(path, spec).name].append(path)
+    main = by_role[spec.files[0].name]
+    needed = {s.file for s in (spec.measured, spec.commanded, spec.key_points) if s}
+    for role in spec.files:
+        count = len(by_role[role.name])
+        if count == 0 and (role is spec.files[0] or role.name in needed):
+            raise InputError(
+                f"no file for [file.{role.name}] of the map, expected one that matches "
+                f"'{role.match}'" + (" and is a Motive export" * (role.format == "motive"))
+            )
+        if count not in (0, 1, len(main)):
+            raise InputError(
+                f"{count} files for [file.{role.name}] and {len(main)} for "
+                f"[file.{spec.files[0].name}], expected one, or one for each"
+            )
+    return [
+        {name: files[i if len(files) > 1 else 0] for name, files in by_role.items() if files}
+        for i in range(len(main))
+    ]
+
+
+def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
+    """The files given, and those of folders that have a role."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.is_file() and _roles_of(p, spec))
+            if not inside:
+                raise InputError(f"{path}: no file here fits the map, expected {_patterns(spec)}")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise InputError(f"{path}: no such file, expected a raw file to import")
+    if not found:
+        raise InputError("no raw file given, expected at least one")
+    return found
+
+
+def _roles_of(path: Path, spec: ImportMap) -> list[FileRole]:
+    """The roles whose pattern and format fit."""
+    return [
+        role
+        for role in spec.files
+        if fnmatch.fnmatch(path.name, role.match) and (role.format != "motive" or is_motive(path))
+    ]
+
+
+def _role_of(path: Path, spec: ImportMap) -> FileRole:
+    """The first role that fits."""
+    roles = _roles_of(path, spec)
+    if not roles:
+        raise InputError(f"{path}: fits no file of the map, expected {_patterns(spec)}")
+    return roles[0]
+
+
+def _patterns(spec: ImportMap) -> str:
+    return "one of " + ", ".join(f"[file.{role.name}] '{role.match}'" for role in spec.files)
+
+
+def _open(path: Path, role: FileRole) -> RawTable:
+    if role.format == "motive":
+        return motive_table(path, role)
+    if role.format == "parquet" or (role.format == "auto" and path.suffix == ".parquet"):
+        return parquet_table(path)
+    if path.suffix == ".tsv" and role.separator == ",":
+        role = replace(role, separator="\t")
+    return text_table(path, role)
+
+
+def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
+    """One set of files as a recording on the main file's own clock."""
+    tables = {name: _open(path, spec.role(name)) for name, path in files.items()}
+    measured = _with_columns(spec.measured, tables, "p")
+    commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
+    commanded = commanded if commanded and commanded.columns else None
+    _check_actuation(measured, commanded, tables)
+    points = key_point_maps(spec.key_points, tables[spec.key_points.file])
+    needed: dict[str, list[Column]] = {name: [] for name in tables}
+    needed[measured.file] += measured.columns
+    needed[spec.key_points.file] += needed_columns(points, spec.frame)
+    held: set[tuple[str, Column]] = set()
+    if commanded:
+        needed[commanded.file] += commanded.columns
+        held = {(commanded.file, column) for column in commanded.columns}
+    main = spec.files[0].name
+    needed[main] += [c.column for c in spec.context.values() if c.column is not None]
+    needed = {name: list(dict.fromkeys(columns)) for name, columns in needed.items()}
+    turns = {spec.key_points.file: quaternions(points, spec.frame)}
+    joined = join(tables, spec, held, needed, turns)
+    unit_mm = spec.key_points.unit or tables[spec.key_points.file].unit
+    if not unit_mm:
+        raise InputError(
+            f"{tables[spec.key_points.file].path}: does not say the positions' unit, "
+            "expected unit in [key_points] of the map"
+        )
+    placed = read_points(joined, spec.key_points, points, spec.frame, unit_mm)
+    draft = Draft(
+        row=joined.rows,
+        t_s=joined.t_s,
+        measured=_actuation(joined, measured),
+        key_points_mm=placed.key_points_mm,
+        commanded=_actuation(joined, commanded) if commanded else None,
+        context=_context(joined, spec, main),
+        run=_runs(joined, spec),
+        point=_settled_points(joined, spec),
+    )
+    draft, notes = tidy(draft, spec, joined.main.cells.place)
+    recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
+    return Imported(recording, [*joined.notes, *placed.notes, *notes])
+
+
+def _with_columns(spec: ActuationMap, tables: dict[str, RawTable], letter: str) -> ActuationMap:
+    """The map's columns, or those named as in a recording, with the unit of their suffix."""
+    if spec.columns:
+        return spec
+    table = tables[spec.file]
+    pattern = re.compile(rf"{letter}([1-9][0-9]*)_([A-Za-z%][A-Za-z0-9%]*)")
+    found = sorted(
+        (int(match[1]), match[2], name)
+        for name in table.names
+        if (match := pattern.fullmatch(name))
+    )
+    units = {unit for _, unit, _ in found}
+    if len(units) > 1 or [number for number, _, _ in found] != list(range(1, len(found) + 1)):
+        raise InputError(
+            f"{table.path}: columns {', '.join(name for _, _, name in found)}, expected "
+            f"{letter}1_UNIT, {letter}2_UNIT, ... of one unit without gaps, or columns in the map"
+        )
+    if not found and letter == "p":
+        raise InputError(
+            f"{table.path}: no column 'p1_kPa' or with another unit, expected the measured "
+            "actuation; name its columns in [measured] of the map"
+        )
+    return replace(spec, columns=tuple(n for _, _, n in found), unit=units.pop() if units else "")
+
+
+def _check_actuation(
+    measured: ActuationMap, commanded: ActuationMap | None, tables: dict[str, RawTable]
+) -> None:
+    if commanded is None:
+        return
+    path = tables[commanded.file].path
+    if len(commanded.columns) != len(measured.columns):
+        raise InputError(
+            f"{path}: {len(commanded.columns)} commanded columns, expected "
+            f"{len(measured.columns)} as in [measured] of the map"
+        )
+    units = [spec.to or spec.unit for spec in (measured, commanded)]
+    if units[0] != units[1]:
+        raise InputError(
+            f"{path}: command in {units[1]} but measured in {units[0]}, expected one unit; "
+            "use 'to' in the map"
+        )
+
+
+def _actuation(joined: Joined, spec: ActuationMap) -> np.ndarray:
+    """(T, m) in the unit that the map asks for; untouched where it asks for nothing."""
+    values = joined.take(spec.file, spec.columns)
+    if spec.scale:
+        values = values * np.array(spec.scale)
+    if spec.offset:
+        values = values + np.array(spec.offset)
+    by = factor(spec.unit, spec.to) if spec.to else 1.0
+    if by is None:
+        raise InputError(f"{joined.main.path}: '{spec.unit}' cannot be converted to '{spec.to}'")
+    return values if by == 1.0 else values * by
+
+
+def _context(joined: Joined, spec: ImportMap, main: str) -> np.ndarray:
+    """(T, 2) temperature and payload, NaN where the map says nothing."""
+    values = np.full((len(joined.t_s), 2), np.nan)
+    for i, name in enumerate(("temp_C", "payload_g")):
+        if name in spec.context:
+            values[:, i] = _context_value(joined, spec.context[name], name, main)
+    return values
+
+
+def _context_value(joined: Joined, spec: ContextMap, name: str, main: str) -> np.ndarray | float:
+    if spec.column is not None:
+        return joined.columns[main, spec.column]
+    if not spec.from_name:
+        return spec.value
+    match = re.search(spec.from_name, joined.main.path.name)
+    if match is None and spec.value is not None:
+        return spec.value
+    try:
+        return float(match[1])
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{joined.main.path}: no number for {name} in the file's name by {spec.from_name!r}, "
+            "expected one, or 'otherwise' in the map"
+        ) from error
+
+
+def _runs(joined: Joined, spec: ImportMap) -> np.ndarray:
+    labels = joined.texts(spec.runs.column) if spec.runs.column is not None else None
+    return run_numbers(joined.t_s, labels, spec.runs.gap_s, spec.runs.time_restarts)
+
+
+def _settled_points(joined: Joined, spec: ImportMap) -> np.ndarray:
+    if spec.rows.average is None:
+        return np.zeros(len(joined.t_s), np.int64)
+    return point_numbers(joined.texts(spec.rows.average))
+
+
+def _recording(
+    draft: Draft, spec: ImportMap, unit: str, gravity: np.ndarray | None, joined: Joined
+) -> Recording:
+    about = dict(spec.sidecar)
+    if spec.rows.average is not None:
+        about.setdefault("kind", "settled")
+    if gravity is not None:
+        about.setdefault("gravity", gravity)
+    if np.isnan(draft.key_points_mm).all():
+        raise InputError(
+            f"{joined.main.path}: every key point is missing in every row, expected positions"
+        )
+    return Recording(
+        name=_stem(joined.main.path),
+        t_s=draft.t_s,
+        measured=draft.measured,
+        key_points_mm=draft.key_points_mm,
+        commanded=draft.commanded,
+        run=draft.run,
+        unit=unit,
+        temp_C=draft.context[:, 0] if "temp_C" in spec.context else None,
+        payload_g=draft.context[:, 1] if "payload_g" in spec.context else None,
+        **about,
+    )
+
+
+def _stem(path: Path) -> str:
+    name = path.name
+    while Path(name).suffix in _ENDINGS and Path(name).stem:
+        name = Path(name).stem
+    return name
+
+
+def _started_at(recording: Recording, spec: ImportMap, zero: float) -> Recording:
+    """Times that count from the file's start, the recording's start, or as they are."""
+    if spec.time.zero == "none":
+        return recording
+    start = recording.t_s[0] if spec.time.zero == "file" else zero
+    return replace(recording, t_s=recording.t_s - start)
+
+
+def _as_runs(parts: list[Imported], spec: ImportMap, name: str) -> Imported:
+    """The sets as runs of one recording, numbered in the order of the files."""
+    recordings = [part.recording for part in parts]
+    first = recordings[0]
+    for other in recordings[1:]:
+        if (other.chambers, other.key_points, other.unit) != (
+            first.chambers,
+            first.key_points,
+            first.unit,
+        ):
+            raise InputError(
+                f"{other.name}: {other.chambers} channels in {other.unit} and "
+                f"{other.key_points} key points, expected {first.chambers} in {first.unit} and "
+                f"{first.key_points} as in {first.name}"
+            )
+    placed = [_started_at(r, spec, float(first.t_s[0])) for r in recordings]
+    before = np.cumsum([0, *(int(r.run[-1]) + 1 for r in recordings)])
+    stacked = {
+        field: np.concatenate([getattr(r, field) for r in placed])
+        for field in ("t_s", "measured", "key_points_mm", "commanded", "temp_C", "payload_g")
+        if all(getattr(r, field) is not None for r in placed)
+    }
+    run = np.concatenate([r.run + b for r, b in zip(recordings, before, strict=False)])
+    gravity = _common_gravity(recordings)
+    whole = replace(first, name=name, run=run, gravity=gravity, **({"commanded": None} | stacked))
+    notes = [f"{p.recording.name}: {n}" if len(parts) > 1 else n for p in parts for n in p.notes]
+    return Imported(whole, notes)
+
+
+def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
+    """(3,) mean direction of the files' directions; each file has its own rest pose."""
+    if recordings[0].gravity is None:
+        return None
+    mean = np.mean([recording.gravity for recording in recordings], axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _check_names(parts: list[Imported]) -> None:
+    names = [part.recording.name for part in parts]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{names.count(name)} files would become the recording '{name}', expected names "
+                "that differ"
+            )
+
+
+def _finished(part: Imported, spec: ImportMap) -> Imported:
+    recording, notes = part.recording, part.notes
+    if spec.rows.frozen == "drop":
+        recording, left_out = without_frozen(recording)
+        notes = [*notes, *left_out]
+    if spec.key_points.spikes == "missing":
+        recording, marked = without_spikes(recording)
+        notes = [*notes, *marked]
+    return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])

@@ -1,0 +1,335 @@
+"""Moves of the body regressed on moves of the actuation, at shifts in time between the two."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from surgisoft.measurement.importing.align import renewal_s, renewed_rows, without_holds
+from surgisoft.measurement.recordings.recording import Recording
+
+BACK_S = 0.5
+"""Largest shift at which the body moves first [s]."""
+AHEAD_S = 3.0
+"""Largest shift at which the actuation moves first [s]."""
+LEAST_STEP_S = 0.005
+"""Shortest time between samples [s]."""
+ROWS = 4000
+"""Moves that are looked at, evenly over the recording."""
+LEAST_ROWS = 200
+"""Fewest moves."""
+STEPS = 25
+"""Shifts on each side of zero, before those around the best one."""
+BLOCKS = 30
+"""Blocks of time whose errors are told apart."""
+FOLDS = 5
+"""Parts that take turns in judging."""
+MOVE_SHARE = 0.25
+"""The longest moves last until their mean square is this share of twice the body's variance."""
+LONGEST_S = 5.0
+"""No move lasts longer [s]."""
+LIVE_SHARE = 0.02
+"""A channel is looked at that moves by more than this share of the widest range."""
+BODY_SHARE = 0.05
+"""A coordinate is looked at that moves by more than this share of the one that moves most."""
+GAP_S = 0.2
+"""Key points are on a line over gaps up to this, or up to five samples [s]."""
+RIDGE = 1e-4
+"""Ridge of the regression, as a share of the features' mean square."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """A recording's runs on an even clock."""
+
+    step_s: float
+    """Time between samples [s]."""
+    actuation: list[np.ndarray]
+    """Each run's actuation (G, m), scaled to [-1, 1]."""
+    body: list[np.ndarray]
+    """Each run's coordinates (G, d) [mm], NaN where missing."""
+    longest: int
+    """Length of the longest moves, in samples."""
+
+    @classmethod
+    def of(cls, recording: Recording) -> "Moves | None":
+        """The runs that are long enough; None where too little moves."""
+        low, high = recording.measured.min(axis=0), recording.measured.max(axis=0)
+        live = high - low > LIVE_SHARE * (high - low).max()
+        steps = [np.diff(recording.t_s[run]) for run in recording.runs]
+        if not live.any() or not len(np.concatenate(steps)):
+            return None
+        step = max(float(np.median(np.concatenate(steps))), LEAST_STEP_S)
+        scaled = (2 * (recording.measured - low) / np.where(live, high - low, 1.0) - 1)[:, live]
+        actuation, body = [], []
+        for run in recording.runs:
+            t_s = recording.t_s[run]
+            grid = np.arange(t_s[0], t_s[-1] + 1e-9, step)
+            if len(grid) > 4 * BACK_S / step:
+                actuation.append(_on(grid, t_s, scaled[run]))
+                points = recording.key_points_mm[run]
+                body.append(
+                    np.concatenate(
+                        [_seen_on(grid, t_s, points[:, j], step) for j in range(points.shape[1])],
+                        axis=1,
+                    )
+                )
+        if not body:
+            return None
+        spread = np.array([_spread(column) for column in np.concatenate(body).T])
+        moving = spread > BODY_SHARE * spread.max()
+        if not moving.any():
+            return None
+        body = [part[:, moving] for part in body]
+        moves = cls(step, actuation, body, _longest(body, spread[moving], step))
+        return moves if len(moves._rows(moves.longest)[1]) >= LEAST_ROWS else None
+
+    def power(self, length: int) -> float:
+        """Sum of squares of the moves of this length, mm^2."""
+        return float(np.square(self._rows(length)[1]).sum())
+
+    def search(self, length: int) -> tuple[np.ndarray, int, np.ndarray]:
+        """Shifts (K,) in samples, the place of the best one, and squared errors (K, BLOCKS) mm^2.
+
+        A positive shift: the body follows its actuation.
+        """
+        rows, moved = self._rows(length)
+        back, ahead = round(BACK_S / self.step_s), self._ahead(length)
+        coarse = max(1, -(-back // STEPS))
+        near = np.arange(-back, min(back, ahead) + 1, coarse)
+        far = np.geomspace(back, ahead, 12).round().astype(int) if ahead > back else []
+        shifts = np.union1d(np.union1d(near, far), [0]).astype(int)
+        errors = {s: self._errors(rows, moved, length, s) for s in shifts.tolist()}
+        best = min(errors, key=lambda s: errors[s].sum())
+        for s in range(best - coarse, best + coarse + 1):
+            if -back <= s <= ahead and s not in errors:
+                errors[s] = self._errors(rows, moved, length, s)
+        shifts = np.array(sorted(errors))
+        table = np.stack([errors[s] for s in shifts.tolist()])
+        return shifts, int(table.sum(axis=1).argmin()), table
+
+    def _ahead(self, length: int) -> int:
+        """Largest shift, in samples, that leaves two thirds of a usual run to look at."""
+        usual = int(np.median([len(part) for part in self.body]))
+        return max(1, min(round(AHEAD_S / self.step_s), usual // 3 - length))
+
+    def _rows(self, length: int) -> tuple[list[np.ndarray], np.ndarray]:
+        """Where moves end in each run, and the moves of the body (S, d) [mm] that are known."""
+        back, ahead = round(BACK_S / self.step_s), self._ahead(length)
+        every = max(1, sum(len(part) for part in self.body) // ROWS)
+        rows, moved = [], []
+        for part in self.body:
+            at = np.arange(ahead + length, len(part) - back, every)
+            move = part[at] - part[at - length]
+            known = ~np.isnan(move).any(axis=1)
+            rows.append(at[known])
+            moved.append(move[known])
+        return rows, np.concatenate(moved)
+
+    def _errors(self, rows, moved: np.ndarray, length: int, shift: int) -> np.ndarray:
+        """(BLOCKS,) squared error of moves (S, d), each judged without its own part [mm^2]."""
+        parts = zip(self.actuation, rows, strict=True)
+        features = np.concatenate(
+            [_features(p[at - shift]) - _features(p[at - shift - length]) for p, at in parts]
+        )
+        block = np.arange(len(moved)) * BLOCKS // len(moved)
+        fold = block % FOLDS
+        grams = [features[fold == k].T @ features[fold == k] for k in range(FOLDS)]
+        pulls = [features[fold == k].T @ moved[fold == k] for k in range(FOLDS)]
+        square = np.empty(len(moved))
+        for k in range(FOLDS):
+            gram, pull = sum(grams) - grams[k], sum(pulls) - pulls[k]
+            gram += max(RIDGE * np.trace(gram) / len(gram), 1e-12) * np.eye(len(gram))
+            left = moved[fold == k] - features[fold == k] @ np.linalg.solve(gram, pull)
+            square[fold == k] = np.square(left).sum(axis=1)
+        return np.bincount(block, square, BLOCKS)
+
+
+def _features(actuation: np.ndarray) -> np.ndarray:
+    """(S, k) of actuation (S, m): itself and all products of two."""
+    first, second = np.triu_indices(actuation.shape[1])
+    return np.concatenate([actuation, actuation[:, first] * actuation[:, second]], axis=1)
+
+
+def _on(grid: np.ndarray, t_s: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(G, c) of values (T, c) at times t_s (T,), on a line between them."""
+    return np.stack([np.interp(grid, t_s, column) for column in values.T], axis=1)
+
+
+def _seen_on(grid: np.ndarray, t_s: np.ndarray, point: np.ndarray, step: float) -> np.ndarray:
+    """(G, 3) of a key point (T, 3), missing before, after and in long gaps of what is known."""
+    known = ~np.isnan(point).any(axis=1)
+    if known.sum() < 2:
+        return np.full((len(grid), 3), np.nan)
+    own = t_s[known]
+    after = np.clip(np.searchsorted(own, grid), 1, len(own) - 1)
+    lost = own[after] - own[after - 1] > max(GAP_S, 5 * step)
+    lost |= (grid < own[0]) | (grid > own[-1])
+    return np.where(lost[:, None], np.nan, _on(grid, own, point[known]))
+
+
+def _spread(column: np.ndarray) -> float:
+    """Standard deviation of what is known."""
+    known = column[~np.isnan(column)]
+    return float(known.std()) if len(known) else 0.0
+
+
+def _longest(body: list[np.ndarray], spread: np.ndarray, step: float) -> int:
+    """The length, in samples, from which on moves have their share of the body's variance."""
+    wanted = MOVE_SHARE * 2 * np.square(spread).sum()
+    length = 1
+    while True:
+        moved = [part[length:] - part[:-length] for part in body if len(part) > length]
+        longer = max(length + 1, round(1.3 * length))
+        if not moved or longer * step > LONGEST_S:
+            return length
+        every = np.square(np.concatenate(moved))
+        if np.nanmean(every, axis=0).sum() >= wanted:
+            return length
+        length = longer
+
+
+LEAST_SHARE = 0.05
+"""Least share of the squared error that a lead must remove beyond every lag."""
+LEAST_T = 4.0
+"""Least mean over standard error, over blocks, of what a lead removes."""
+LEAST_SPEED_R2 = 0.3
+"""A length of move counts where its actuation explains at least this share of it."""
+SAME_LEAD = 0.6
+"""Least lead of shorter moves, as a share of that of the longest ones."""
+
+HELD_RANGE = (0.5, 1.6)
+"""A held reading lasts so many times the usual period."""
+HELD_REGULAR = 0.8
+"""Least share of readings that last so long, for the sensor to be called slow."""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """By how much time the body leads its measured actuation."""
+
+    seconds: float
+    """Best estimate; the arm's own lag comes on top [s]."""
+    ci95_s: tuple[float, float]
+    """95 % interval, by a jackknife over blocks of time [s]."""
+
+
+def held_period_s(recording: Recording) -> float | None:
+    """The period of a sensor that is slower than the log while the body moves on [s], if it is.
+
+    Not where readings come irregularly, as quantised or resting ones do, nor where the command
+    changes in the very same rows: then the actuation may be a staircase indeed.
+    """
+    if recording.kind == "settled":
+        return None
+    gaps, alive, same = [], [], []
+    for run in recording.runs:
+        fresh = renewed_rows(recording.measured[run])
+        gaps.append(np.diff(fresh))
+        points = recording.key_points_mm[run].reshape(run.stop - run.start, -1)
+        moved = (np.diff(points, axis=0) != 0) & ~np.isnan(np.diff(points, axis=0))
+        held = np.setdiff1d(np.arange(1, len(points)), fresh)
+        alive.append(moved[held - 1].any(axis=1))
+        if recording.commanded is not None:
+            same.append(np.isin(fresh[1:], renewed_rows(recording.commanded[run])[1:]))
+    steps = np.concatenate(gaps)
+    usual = np.median(steps) if len(steps) >= LEAST_ROWS else 1.0
+    if usual < 2 or np.concatenate(alive).mean() < 0.5:
+        return None
+    low, high = (factor * usual for factor in HELD_RANGE)
+    if ((steps >= low) & (steps <= high)).mean() < HELD_REGULAR:
+        return None
+    if same and np.concatenate(same).mean() > 0.9 and _staircase(recording, usual):
+        return None
+    return renewal_s([(recording.t_s[run], recording.measured[run]) for run in recording.runs])
+
+
+def _staircase(recording: Recording, usual: float) -> bool:
+    """Whether the command is renewed as seldom as the measurement."""
+    steps = [np.diff(renewed_rows(recording.commanded[run])) for run in recording.runs]
+    return bool(np.median(np.concatenate(steps)) >= 0.8 * usual)
+
+
+def released(recording: Recording, period_s: float) -> Recording:
+    """The recording with readings on a line between those of a slow sensor."""
+    measured = recording.measured.copy()
+    for run in recording.runs:
+        measured[run] = without_holds(recording.t_s[run], measured[run], period_s)
+    return replace(recording, measured=measured)
+
+
+def body_lead(recording: Recording) -> Lead | None:
+    """The body's lead before its measured actuation, where the recording shows one beyond doubt.
+
+    Moves of the body x(t) - x(t - w) are regressed on those of a quadratic function of the
+    actuation, shifted in time; judged on blocks that took no part. A lead is called one where it
+    leaves less than every lag (so that a periodic motion, whose lead is as good as a lag, shows
+    none), and where shorter moves show it too: a late log shifts every speed of motion alike,
+    whereas an arm's relaxation, or a readings' hold, shifts some of them only.
+    """
+    if recording.kind == "settled":
+        return None
+    moves = Moves.of(recording)
+    if moves is None:
+        return None
+    first, best, error = moves.search(moves.longest)
+    causal = error[first >= 0].sum(axis=1)
+    won = error[first >= 0][causal.argmin()] - error[best]
+    if first[best] >= 0 or won.sum() < LEAST_SHARE * causal.min():
+        return None
+    if won.mean() < LEAST_T * won.std(ddof=1) / np.sqrt(len(won)):
+        return None
+    length = moves.longest
+    while length > 1:
+        length = length // 2
+        shifts, at, losses = moves.search(length)
+        explained = 1 - losses[at].sum() / moves.power(length)
+        if explained >= LEAST_SPEED_R2 and shifts[at] > SAME_LEAD * first[best]:
+            return None
+    seconds, spread = _jackknife(first, error)
+    if seconds + 2 * spread >= 0:
+        return None
+    step = moves.step_s
+    return Lead(-seconds * step, (-(seconds + 2 * spread) * step, -(seconds - 2 * spread) * step))
+
+
+def timing_notes(recording: Recording, delay_s: float) -> list[str]:
+    """What the data say about the actuation's clock, with what to put into the import's map.
+
+    delay_s: by how much the map has already taken the actuation's log to be late [s].
+    """
+    notes = []
+    period = held_period_s(recording)
+    if period is not None:
+        recording = released(recording, period)
+        notes.append(
+            f"measured actuation is renewed every {period:.4g} s only and held in between, while "
+            'the body moves on: if its sensor is slower than the log, set repeated = "interpolate" '
+            "in [measured] of the map"
+        )
+    lead = body_lead(recording)
+    if lead is not None:
+        low, high = lead.ci95_s
+        notes.append(
+            f"the body moves {lead.seconds:.3f} s ({low:.3f} to {high:.3f}) before its measured "
+            "actuation, which no arm that follows it can: if the actuation was logged late, set "
+            f"delay_s = {delay_s + lead.seconds:.3f} in [measured] of the map"
+        )
+    return notes
+
+
+def _jackknife(shifts: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """The best of shifts (K,), in samples, by errors (K, blocks), and its standard error."""
+    total = error.sum(axis=1)
+    blocks = error.shape[1]
+    without = [_lowest(shifts, total - error[:, k]) for k in range(blocks)]
+    spread = np.sqrt((blocks - 1) / blocks * np.square(without - np.mean(without)).sum())
+    return _lowest(shifts, total), float(spread)
+
+
+def _lowest(shifts: np.ndarray, total: np.ndarray) -> float:
+    """Where the parabola through the lowest of totals (K,) and its two neighbours is lowest."""
+    at = int(total.argmin())
+    if at in (0, len(total) - 1):
+        return float(shifts[at])
+    a, b, _ = np.polyfit(shifts[at - 1 : at + 2] - shifts[at], total[at - 1 : at + 2], 2)
+    return float(shifts[at] - b / (2 * a)) if a > 0 else float(shifts[at])

@@ -1,0 +1,1 @@
+"""Recordings: their columns, files, sidecars and data-quality warnings."""

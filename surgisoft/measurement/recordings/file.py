@@ -1,0 +1,231 @@
+"""Recordings from and to files: finding, reading with every check, writing as a whole or not."""
+
+import itertools
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import table
+from surgisoft.measurement.recordings.columns import Layout, parse_header
+from surgisoft.measurement.recordings.quality import find_oddities
+from surgisoft.measurement.recordings.recording import (
+    Recording,
+    first_run_again,
+    first_time_backwards,
+)
+from surgisoft.measurement.recordings.sidecar import read_sidecar, sidecar_of, sidecar_text
+
+Warn = Callable[[str], None]
+
+
+def find(paths: list[Path], warn: Warn) -> list[Path]:
+    """The recordings that files and folders name, folders in the order of their files' names."""
+    if not paths:
+        raise InputError("no recording given, expected a file or a folder of recordings")
+    found: list[Path] = []
+    seen: set[Path] = set()
+    for path in paths:
+        for file in _in_folder(path) if path.is_dir() else [path]:
+            if file.resolve() in seen:
+                warn(f"{file}: given twice, read once")
+                continue
+            seen.add(file.resolve())
+            found.append(file)
+    return found
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    files = sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix in table.SUFFIXES and file.is_file() and not file.name.startswith(".")
+    )
+    if not files:
+        raise InputError(f"{folder}: no .csv or .parquet in this folder, expected recordings")
+    for before, after in itertools.pairwise(files):
+        if before.stem == after.stem:
+            raise InputError(
+                f"{folder}: both {before.name} and {after.name}, expected a recording once; "
+                "remove one of them or name the files"
+            )
+    return files
+
+
+def read(path: Path, warn: Warn) -> Recording:
+    """One recording with every check of the format."""
+    if path.suffix not in table.SUFFIXES and path.exists() and not path.is_dir():
+        raise InputError(
+            f"{path}: suffix '{path.suffix}', expected .csv or .parquet; "
+            "'surgisoft import' reads other files"
+        )
+    table.check_is_file(path)
+    names = table.read_header(path)
+    layout = parse_header(names, table.header_place(path))
+    for name in layout.ignored:
+        warn(f"{path}: column '{name}' is not part of the format and was left out")
+    cells = table.read_numbers(path, names, layout.used)
+    if len(cells) == 0:
+        raise InputError(f"{path}: the table is empty, expected at least one row of numbers")
+    at = {column: i for i, column in enumerate(layout.used)}
+    _check_finite(path, cells, layout)
+    rows = _rows_with_actuation(path, cells, layout, at, warn)
+    recording = _assemble(path, cells[rows], rows, layout, at)
+    for oddity in find_oddities(recording):
+        warn(f"{table.row_place(path, int(rows[oddity.sample]))}: {oddity.text}")
+    return recording
+
+
+def _check_finite(path: Path, cells: np.ndarray, layout: Layout) -> None:
+    """No infinite cell anywhere; no missing time or run."""
+    needed = [i for i in (layout.time, layout.run) if i is not None]
+    strict = np.isin(layout.used, needed)
+    bad = np.isinf(cells) | (np.isnan(cells) & strict)
+    if bad.any():
+        row, column = np.argwhere(bad)[0].tolist()
+        value = cells[row, column]
+        got = "a missing value" if np.isnan(value) else f"{value}"
+        raise InputError(
+            f"{table.row_place(path, row)}, column '{layout.names[layout.used[column]]}': "
+            f"got {got}, expected a finite number"
+        )
+
+
+def _rows_with_actuation(
+    path: Path, cells: np.ndarray, layout: Layout, at: dict[int, int], warn: Warn
+) -> np.ndarray:
+    """Indices of the rows where all of the actuation is known; the others are left out."""
+    channels = [*layout.measured, *layout.commanded]
+    missing = np.isnan(cells[:, [at[i] for i in channels]])
+    if missing.any():
+        row, channel = np.argwhere(missing)[0].tolist()
+        count = int(missing.any(axis=1).sum())
+        place = f"{table.row_place(path, row)}, column '{layout.names[channels[channel]]}'"
+        if count == len(cells):
+            raise InputError(f"{place}: the actuation is missing in every row, expected numbers")
+        warn(f"{place}: actuation missing here, {count} such rows of {len(cells)} left out")
+    return np.flatnonzero(~missing.any(axis=1))
+
+
+def _assemble(
+    path: Path, cells: np.ndarray, rows: np.ndarray, layout: Layout, at: dict[int, int]
+) -> Recording:
+    """The recording from its cells (T, columns) and the rows (T,) that they stand in."""
+
+    def column(position: int | None) -> np.ndarray | None:
+        return None if position is None else np.ascontiguousarray(cells[:, at[position]])
+
+    def columns(positions: tuple[int, ...]) -> np.ndarray:
+        return np.ascontiguousarray(cells[:, [at[i] for i in positions]])
+
+    points = columns(layout.key_points)
+    points = points if layout.mm_per_unit == 1 else points * layout.mm_per_unit
+    t_s = column(layout.time)
+    run = _run_ids(path, column(layout.run), rows)
+    _check_order(path, t_s, run, rows)
+    recording = Recording(
+        name=path.stem,
+        t_s=t_s,
+        measured=columns(layout.measured),
+        key_points_mm=points.reshape(len(cells), -1, 3),
+        commanded=columns(layout.commanded) if layout.commanded else None,
+        run=run,
+        unit=layout.unit,
+        temp_C=column(layout.temp),
+        payload_g=column(layout.payload),
+        source=path,
+        **read_sidecar(sidecar_of(path)),
+    )
+    if np.isnan(recording.key_points_mm).all():
+        raise InputError(f"{path}: every key point is missing in every row, expected positions")
+    return recording
+
+
+def _run_ids(path: Path, values: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
+    if values is None:
+        return np.zeros(len(rows), np.int64)
+    odd = np.flatnonzero((values != np.round(values)) | (np.abs(values) >= 2**53))
+    if len(odd):
+        place = table.row_place(path, int(rows[odd[0]]))
+        raise InputError(f"{place}, column 'run': got {values[odd[0]]}, expected an integer")
+    return values.astype(np.int64)
+
+
+def _check_order(path: Path, t_s: np.ndarray, run: np.ndarray, rows: np.ndarray) -> None:
+    again = first_run_again(run)
+    if again is not None:
+        raise InputError(
+            f"{table.row_place(path, int(rows[again]))}, column 'run': run {run[again]} comes back "
+            "after another run, expected the rows of a run in one block"
+        )
+    back = first_time_backwards(t_s, run)
+    if back is not None:
+        raise InputError(
+            f"{table.row_place(path, int(rows[back]))}, column 't_s': {float(t_s[back])!r} s after "
+            f"{float(t_s[back - 1])!r} s, expected time to increase inside a run; "
+            "give separate runs a column 'run'"
+        )
+
+
+def check_writable(path: Path, force: bool) -> None:
+    """Raise where a recording cannot go to this path."""
+    if path.suffix not in table.SUFFIXES:
+        raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")
+    for target in (path, sidecar_of(path)):
+        if target.is_dir():
+            raise InputError(f"{target}: is a folder, expected the name of a file")
+        if target.exists() and not force:
+            raise InputError(f"{target}: exists already; choose another name or use --force")
+
+
+def write(recording: Recording, path: Path, force: bool) -> None:
+    """Table and sidecar: both complete under temporary names first, then both put in place."""
+    check_writable(path, force)
+    sidecar = sidecar_of(path)
+    part, sidecar_part = (t.with_name(f".{t.name}.{os.getpid()}.part") for t in (path, sidecar))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write_table(_to_arrow(recording), part, path.suffix)
+        sidecar_part.write_text(sidecar_text(recording), encoding="utf-8")
+        os.replace(sidecar_part, sidecar)
+        os.replace(part, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+        sidecar_part.unlink(missing_ok=True)
+
+
+def _write_table(content: pa.Table, part: Path, suffix: str) -> None:
+    if suffix == ".parquet":
+        pq.write_table(content, part, compression="zstd")
+        return
+    with part.open("wb") as file:
+        file.write((",".join(content.column_names) + "\n").encode())
+        pyarrow.csv.write_csv(content, file, pyarrow.csv.WriteOptions(include_header=False))
+
+
+def _to_arrow(recording: Recording) -> pa.Table:
+    """The table in the order of the format; missing values are nulls."""
+    columns: dict[str, np.ndarray] = {"t_s": recording.t_s}
+    for letter, values in (("p", recording.measured), ("c", recording.commanded)):
+        for i in range(recording.chambers if values is not None else 0):
+            columns[f"{letter}{i + 1}_{recording.unit}"] = values[:, i]
+    for j in range(recording.key_points):
+        for a, axis in enumerate("xyz"):
+            columns[f"k{j}_{axis}_mm"] = recording.key_points_mm[:, j, a]
+    columns["run"] = recording.run
+    for name in ("temp_C", "payload_g"):
+        if getattr(recording, name) is not None:
+            columns[name] = getattr(recording, name)
+    arrays = {
+        name: pa.array(np.ascontiguousarray(v), from_pandas=True) for name, v in columns.items()
+    }
+    content = pa.table(arrays)
+    parse_header(content.column_names, recording.label)
+    return content

@@ -1,0 +1,430 @@
+"""What is odd but usable in a recording: channels that froze and jumps in the marker data.
+
+A frozen signal repeats one value bit for bit, for longer than it ever does otherwise, while other
+signals live on. A jump is one step of a key point that neither the rows around it, nor the other
+key points, nor the actuation explain; settled rows stand for themselves, so there each key point is
+compared with a smooth function of the actuation instead of with the row before.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.measurement.recordings.recording import Recording
+
+LEAST_FROZEN_ROWS = 20
+"""Shorter repeats are never called frozen."""
+FROZEN_RATIO = 5.0
+"""How many times longer than its usual longest repeat (99 % quantile) a frozen signal repeats."""
+JUMP_RATIO = 6.0
+"""How many times larger than the usual steps before and after it a jump is."""
+JUMP_SHARE = 0.02
+"""The least jump, as a share of the arm's largest motion."""
+ACTUATION_SHARE = 0.25
+"""The least move of the actuation that explains a step, each as a share of its whole motion."""
+STEP_WINDOW = 12
+"""Steps before and steps after that say what is usual."""
+SPIKE_ROWS = 12
+"""A key point that comes back within so many rows has made a spike."""
+SPIKE_RETURN = 0.5
+"""How near a spike ends to where it began, as a share of its size."""
+SETTLED_RATIO = 15.0
+"""How many robust standard deviations a settled key point lies off before it is called a jump."""
+SETTLED_SHARE = 0.1
+"""The least deviation of a settled key point called a jump, as a share of its motion."""
+
+
+@dataclass(frozen=True)
+class Oddity:
+    """One finding, in words, and where it starts."""
+
+    sample: int
+    """Index of the sample where it starts."""
+    text: str
+    """What is odd, in one line."""
+
+
+def find_oddities(recording: Recording) -> list[Oddity]:
+    """The findings, in the order of their samples."""
+    jumps = _settled_jumps if recording.kind == "settled" else _continuous_jumps
+    with np.errstate(over="ignore", invalid="ignore"):  # finite numbers of any size are read
+        found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
+    return sorted(found, key=lambda oddity: oddity.sample)
+
+
+# --- frozen signals ----------------------------------------------------------------------------
+
+
+def _changes(signal: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """(T,) bool: where a signal (T, d) differs from the row before or a run (T,) starts."""
+    with np.errstate(invalid="ignore"):
+        differs = (signal[1:] != signal[:-1]).any(axis=1)
+    known = ~np.isnan(signal).any(axis=1)
+    differs |= ~(known[1:] & known[:-1])
+    return np.concatenate([[True], differs | (run[1:] != run[:-1])])
+
+
+def _long_repeats(changed: np.ndarray) -> list[slice]:
+    """The stretches that repeat one value for much longer than the signal usually does."""
+    starts = np.flatnonzero(changed)
+    lengths = np.diff(np.append(starts, len(changed)))
+    others = np.sort(lengths)[:-1]
+    usual = np.quantile(others, 0.99, method="lower") if len(others) else 0
+    least = max(LEAST_FROZEN_ROWS, FROZEN_RATIO * usual)
+    return [
+        slice(int(start), int(start + length))
+        for start, length in zip(starts, lengths, strict=True)
+        if length >= least
+    ]
+
+
+def _lives(changed: np.ndarray, stretch: slice) -> bool:
+    """Whether a signal with these changes (T,) changes in at least a tenth of the stretch."""
+    inside = changed[stretch][1:]
+    return bool(inside.mean() >= 0.1)
+
+
+def _outside(stretch: slice, rows: int) -> np.ndarray:
+    mask = np.ones(rows, bool)
+    mask[stretch] = False
+    return mask
+
+
+def _flickers(channel: np.ndarray, changed: np.ndarray) -> bool:
+    """Whether a reading (T,) zigzags like noise over the rows (T,) where it changes.
+
+    Two turns on end: 5 in 12 of white noise, none of a smooth signal.
+    """
+    steps = np.sign(np.diff(channel[changed]))
+    zigzags = (steps[1:-1] * steps[:-2] < 0) & (steps[1:-1] * steps[2:] < 0)
+    return len(zigzags) > 10 and zigzags.mean() > 0.05
+
+
+def _channel_froze(recording: Recording, i: int, changed: np.ndarray, stretch: slice) -> bool:
+    """Whether this repeat of channel i is a fault: its command moves, or it is never at rest."""
+    outside = _outside(stretch, recording.samples)
+    if recording.commanded is None:
+        return _flickers(recording.measured[:, i], changed & outside)
+    command = recording.commanded[:, i]
+    rest = ~_changes(command[:, None], recording.run)
+    if _flickers(recording.measured[:, i], changed & outside & rest):
+        return True
+    moves = np.abs(command[stretch] - command[stretch.start]) > 0.01 * np.ptp(command)
+    return int(moves.sum()) >= LEAST_FROZEN_ROWS
+
+
+def frozen_channels(recording: Recording) -> list[tuple[list[int], slice]]:
+    """Channels (counted from 0) that froze together, and the samples that repeat one reading."""
+    channels = [
+        _changes(recording.measured[:, i : i + 1], recording.run) for i in range(recording.chambers)
+    ]
+    points = _key_point_changes(recording)
+    frozen: list[tuple[int, slice]] = []
+    for i, changed in enumerate(channels):
+        others = [*channels[:i], *channels[i + 1 :], *points]
+        for stretch in _long_repeats(changed):
+            alive = any(_lives(other, stretch) for other in others)
+            if alive and _channel_froze(recording, i, changed, stretch):
+                frozen.append((i, stretch))
+    return _merged(frozen)
+
+
+def _frozen_channels(recording: Recording) -> list[Oddity]:
+    return [
+        Oddity(
+            stretch.start,
+            f"{', '.join(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
+            f"{_duration(recording, stretch)} while other signals move; frozen?",
+        )
+        for members, stretch in frozen_channels(recording)
+    ]
+
+
+def _merged(frozen: list[tuple[int, slice]]) -> list[tuple[list[int], slice]]:
+    """Signals that froze together, as one finding: most of one stretch lies inside the other."""
+    groups: list[tuple[list[int], slice]] = []
+    for i, stretch in sorted(frozen, key=lambda item: (item[1].start, item[0])):
+        for members, first in groups:
+            common = min(first.stop, stretch.stop) - max(first.start, stretch.start)
+            if i not in members and common > 0.8 * (stretch.stop - stretch.start):
+                members.append(i)
+                break
+        else:
+            groups.append(([i], stretch))
+    return [(sorted(members), stretch) for members, stretch in groups]
+
+
+def _duration(recording: Recording, stretch: slice) -> str:
+    seconds = recording.t_s[stretch.stop - 1] - recording.t_s[stretch.start]
+    return f"{stretch.stop - stretch.start} rows ({seconds:.3g} s)"
+
+
+def _key_point_changes(recording: Recording) -> list[np.ndarray]:
+    return [
+        _changes(recording.key_points_mm[:, j], recording.run) for j in range(recording.key_points)
+    ]
+
+
+def _actuation_moves(recording: Recording, rows: slice, share: float) -> bool:
+    """Whether any channel moves by this share of its whole range within the rows."""
+    for values in (recording.measured, recording.commanded):
+        if values is not None and len(values[rows]):
+            moved = np.ptp(values[rows], axis=0)
+            if (moved > share * np.maximum(np.ptp(values, axis=0), 1e-300)).any():
+                return True
+    return False
+
+
+def _frozen_key_points(recording: Recording) -> list[Oddity]:
+    changes = _key_point_changes(recording)
+    frozen: list[tuple[int, slice]] = []
+    for j, changed in enumerate(changes):
+        if j == 0 and not changed[_outside_run_starts(recording)].any():
+            continue  # the base may be fixed
+        for stretch in _long_repeats(changed):
+            known = not np.isnan(recording.key_points_mm[stretch.start, j]).any()
+            others = any(_lives(c, stretch) for c in (*changes[:j], *changes[j + 1 :]))
+            if known and (others or _actuation_moves(recording, stretch, 0.05)):
+                frozen.append((j, stretch))
+    return [
+        Oddity(
+            stretch.start,
+            f"key point {', '.join(f'k{j}' for j in members)} repeats bit-equal for "
+            f"{_duration(recording, stretch)} while other signals move; frozen?",
+        )
+        for members, stretch in _merged(frozen)
+    ]
+
+
+def _outside_run_starts(recording: Recording) -> np.ndarray:
+    mask = np.ones(recording.samples, bool)
+    mask[[run.start for run in recording.runs]] = False
+    return mask
+
+
+# --- jumps of key points -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Track:
+    """The fresh positions of one key point in one run: known, and not the stale row before."""
+
+    rows: np.ndarray
+    """(F,) sample index of each fresh position."""
+    steps_mm: np.ndarray
+    """(F - 1,) length of the step to each fresh position from the one before, per row [mm]."""
+
+    def ratios(self, at: np.ndarray) -> np.ndarray:
+        """Steps `at` (C,) against the usual steps before and after each, whichever is the larger.
+
+        0 where fewer than three steps stand on a side.
+        """
+        usual = np.maximum(self._usual(at - STEP_WINDOW), self._usual(at + 1))
+        good = (at >= 3) & (at < len(self.steps_mm) - 3)
+        return np.where(good, self.steps_mm[at] / np.maximum(usual, 1e-12), 0.0)
+
+    def _usual(self, first: np.ndarray) -> np.ndarray:
+        """(C,) median of the steps in the window that begins at each of these, as far as known."""
+        padding = np.full(STEP_WINDOW, np.nan)
+        padded = np.concatenate([padding, self.steps_mm, padding])
+        usual = np.zeros(len(first))
+        for some in np.array_split(np.arange(len(first)), len(first) // 100_000 + 1):
+            windows = padded[first[some, None] + STEP_WINDOW + np.arange(STEP_WINDOW)]
+            whole = ~np.isnan(windows).any(axis=1)
+            usual[some[whole]] = np.median(windows[whole], axis=1)
+            for i, window in zip(some[~whole], windows[~whole], strict=True):
+                known = window[~np.isnan(window)]
+                usual[i] = np.median(known) if len(known) else 0.0
+        return usual
+
+    def ratio_near(self, row: int) -> float:
+        """The largest ratio of the steps that end within one fresh position of a sample."""
+        at = int(np.searchsorted(self.rows[1:], row))
+        near = np.arange(max(0, at - 1), min(len(self.steps_mm), at + 2))
+        return float(self.ratios(near).max(initial=0.0))
+
+
+def _track(points: np.ndarray, start: int) -> _Track:
+    """The track of positions (R, 3) [mm] of a run that begins at sample `start`."""
+    known = np.flatnonzero(~np.isnan(points).any(axis=1))
+    fresh = known[_changes(points[known], np.zeros(len(known)))] if len(known) else known
+    steps = np.linalg.norm(np.diff(points[fresh], axis=0), axis=1)
+    return _Track(fresh + start, steps / np.diff(fresh) if len(fresh) > 1 else steps)
+
+
+def _motion_mm(points: np.ndarray) -> np.ndarray:
+    """(n,) diagonal of the box that holds 98 % of each key point's positions (T, n, 3) [mm]."""
+    seen = ~np.isnan(points).any(axis=(0, 2)) | (~np.isnan(points).all(axis=0)).all(axis=1)
+    motion = np.zeros(points.shape[1])
+    if seen.any():
+        low, high = np.nanquantile(points[:, seen], [0.01, 0.99], axis=0)
+        motion[seen] = np.linalg.norm(high - low, axis=1)
+    return motion
+
+
+def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
+    """By key point, the samples that it jumps to and how far [mm]; for continuous recordings."""
+    points = recording.key_points_mm
+    motion_mm = _motion_mm(points).max()
+    hits: dict[int, list[tuple[int, float]]] = {}
+    for run in recording.runs:
+        tracks = [_track(points[run, j], run.start) for j in range(recording.key_points)]
+        for j, track in enumerate(tracks):
+            others = [*tracks[:j], *tracks[j + 1 :]]
+            large = np.flatnonzero(track.steps_mm > JUMP_SHARE * motion_mm)
+            for at in large[track.ratios(large) > JUMP_RATIO].tolist():
+                row = int(track.rows[at + 1])
+                size = float(np.linalg.norm(points[row, j] - points[int(track.rows[at]), j]))
+                if not _explained(recording, others, run, row, size / motion_mm):
+                    hits.setdefault(j, []).append((row, size))
+    return hits
+
+
+def _continuous_jumps(recording: Recording) -> list[Oddity]:
+    return [_jump(j, found) for j, found in key_point_jumps(recording).items()]
+
+
+def spikes(recording: Recording) -> np.ndarray:
+    """(T, n) bool: where a key point has jumped away and jumps back within a few samples."""
+    away = np.zeros((recording.samples, recording.key_points), bool)
+    for j, hits in key_point_jumps(recording).items():
+        known = np.flatnonzero(~np.isnan(recording.key_points_mm[:, j, 0]))
+        points = recording.key_points_mm[known, j]
+        for row, size in hits:
+            at = int(np.searchsorted(known, row))
+            if not away[row, j] and not away[known[at - 1], j]:
+                start, stop = _spike(points, at, size)
+                away[known[start:stop], j] = True
+    return away
+
+
+def _spike(points: np.ndarray, at: int, size: float) -> tuple[int, int]:
+    """The known positions (K, 3) [mm], from and to, of the spike that the jump to `at` begins, or
+    else the one that it ends; empty where there is none."""
+    for end in range(at + 1, min(at + 1 + SPIKE_ROWS, len(points))):
+        if _comes_back(points[at - 1], points[end - 1], points[end], size):
+            return at, end
+    for start in range(at - 1, max(at - 1 - SPIKE_ROWS, 0), -1):
+        if _comes_back(points[at], points[start], points[start - 1], size):
+            return start, at
+    return at, at
+
+
+def _comes_back(true: np.ndarray, away: np.ndarray, next_: np.ndarray, size: float) -> bool:
+    """Whether the step from `away` to the next position leads back to the true one."""
+    near = np.linalg.norm(next_ - true) < SPIKE_RETURN * size
+    return bool(near and np.linalg.norm(next_ - away) > SPIKE_RETURN * size)
+
+
+def _explained(
+    recording: Recording, others: list[_Track], run: slice, row: int, share: float
+) -> bool:
+    """Whether a step of this share of the motion comes with a move of the actuation in the second
+    before, and with steps of the other key points where there are any."""
+    if others and max(other.ratio_near(row) for other in others) <= JUMP_RATIO / 2:
+        return False
+    early = np.searchsorted(recording.t_s[run], recording.t_s[row] - 1.0) + run.start
+    rows = slice(int(max(run.start, min(early, row - 5))), row + 1)
+    return _actuation_moves(recording, rows, ACTUATION_SHARE * share)
+
+
+def _jump(j: int, found: list[tuple[int, float]]) -> Oddity:
+    row, size = found[0]
+    more = f", and {len(found) - 1} more times" if len(found) > 1 else ""
+    return Oddity(row, f"key point k{j} jumps by {size:.3g} mm{more}; markers swapped or lost?")
+
+
+def _settled_jumps(recording: Recording) -> list[Oddity]:
+    """Settled rows against the quadratic function of the actuation that fits them all."""
+    channels = [
+        recording.measured[:, i]
+        for i in range(recording.chambers)
+        if np.ptp(recording.measured[:, i]) > 0
+    ]
+    scaled = [(c - c.mean()) / np.ptp(c) for c in channels]
+    products = [a * b for i, a in enumerate(scaled) for b in scaled[i:]]
+    basis = np.column_stack([np.ones(recording.samples), *scaled, *products])
+    found = []
+    motion = _motion_mm(recording.key_points_mm)
+    for j in range(recording.key_points):
+        points = recording.key_points_mm[:, j]
+        known = np.flatnonzero(~np.isnan(points).any(axis=1))
+        if len(known) < 5 * basis.shape[1]:
+            continue
+        fit = basis[known] @ np.linalg.lstsq(basis[known], points[known], rcond=None)[0]
+        off = np.linalg.norm(points[known] - fit, axis=1)
+        least = max(SETTLED_RATIO * 1.4826 * np.median(off), SETTLED_SHARE * motion[j])
+        hits = np.flatnonzero(off > least)
+        if len(hits):
+            found.append(_jump(j, [(int(known[i]), float(off[i])) for i in hits]))
+    return found
+
+
+def summary(recording: Recording) -> list[str]:
+    """Lines of text: size, runs, rate, ranges of actuation and motion, missing values, context."""
+    unit = recording.unit
+    lines = [
+        f"{recording.label}: {recording.kind}, {_count(recording.samples, 'row')}, "
+        f"{_count(len(recording.runs), 'run')}, {_count(recording.chambers, 'channel')} in {unit}, "
+        f"{_count(recording.key_points, 'key point')}",
+        _times(recording),
+        f"  measured {unit}: {_ranges(recording.measured)}",
+    ]
+    if recording.commanded is not None:
+        lines.append(f"  commanded {unit}: {_ranges(recording.commanded)}")
+    lines += [_key_point(recording, j) for j in range(recording.key_points)]
+    for name in ("temp_C", "payload_g"):
+        values = getattr(recording, name)
+        if values is not None and not np.isnan(values).all():
+            lines.append(f"  {name}: {_ranges(values[:, None])}")
+    lines += _about(recording)
+    return lines
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + "s" * (number != 1)
+
+
+def _times(recording: Recording) -> str:
+    seconds = sum(recording.t_s[run][-1] - recording.t_s[run][0] for run in recording.runs)
+    steps = np.concatenate([np.diff(recording.t_s[run]) for run in recording.runs])
+    if not len(steps):
+        return f"  time: {seconds:.4g} s"
+    return (
+        f"  time: {seconds:.4g} s in all, one row each {np.median(steps):.4g} s (median; "
+        f"{steps.min():.4g} to {steps.max():.4g} s)"
+    )
+
+
+def _ranges(values: np.ndarray) -> str:
+    """Least to largest of each column (T, c)."""
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    return ", ".join(
+        f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}" for a, b in zip(low, high, strict=True)
+    )
+
+
+def _key_point(recording: Recording, j: int) -> str:
+    points = recording.key_points_mm[:, j]
+    missing = int(np.isnan(points).any(axis=1).sum())
+    if missing == recording.samples:
+        return f"  k{j}: missing in every row"
+    axes = zip("xyz", np.nanmin(points, axis=0), np.nanmax(points, axis=0), strict=True)
+    ranges = ", ".join(f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in axes)
+    lost = f", missing in {missing} rows ({missing / recording.samples:.1%})" if missing else ""
+    return f"  k{j} mm: {ranges}{lost}"
+
+
+def _about(recording: Recording) -> list[str]:
+    arm = recording.arm
+    stated = {
+        "length": f"{arm.length_mm:g} mm" if arm.length_mm else None,
+        "diameter": f"{arm.diameter_mm:g} mm" if arm.diameter_mm else None,
+        "noise": f"{recording.noise_mm:g} mm" if recording.noise_mm is not None else None,
+        "weight along": None
+        if recording.gravity is None
+        else "(" + ", ".join(f"{v:.3f}" for v in recording.gravity + 0.0) + ")",
+        "note": recording.note or None,
+    }
+    known = [f"{name} {value}" for name, value in stated.items() if value]
+    return [f"  {'; '.join(known)}"] if known else []

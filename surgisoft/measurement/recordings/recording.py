@@ -1,0 +1,271 @@
+"""Recordings: what a lab measured on one arm, in memory and on disk.
+
+The file format is described in docs/recordings.md. A recording that could be loaded is whole:
+times, actuation and run ids have no missing values; a key point is either known in x, y and z or
+missing (NaN) as a whole.
+"""
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.errors import InputError
+
+KINDS = ("continuous", "settled")
+
+UNIT_TOLERANCE = 0.01
+"""How far the length of gravity's direction may be from 1 before it is taken for an error."""
+
+
+@dataclass(frozen=True)
+class ArmInfo:
+    """The arm's size, where the lab stated it."""
+
+    length_mm: float | None = None
+    """Length of the arm at rest [mm]."""
+    diameter_mm: float | None = None
+    """Outer diameter of the arm [mm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One table of measurements: T samples of m actuation channels and n key points."""
+
+    name: str
+    """What messages and reports call it; the file's stem where it came from a file."""
+    t_s: np.ndarray
+    """(T,) float64, time since the start of the recording [s], strictly increasing inside a run."""
+    measured: np.ndarray
+    """(T, m) float64, measured actuation [`unit`]."""
+    key_points_mm: np.ndarray
+    """(T, n, 3) float64, key points base to tip, arm base frame [mm]; NaN where missing."""
+    commanded: np.ndarray | None = None
+    """(T, m) float64, commanded actuation [`unit`]."""
+    run: np.ndarray | None = None
+    """(T,) int64 id of each sample's run, equal ids in one block; None becomes one run, id 0."""
+    unit: str = "kPa"
+    """Unit of the actuation: the suffix of the table's columns."""
+    temp_C: np.ndarray | None = None
+    """(T,) float64 temperature [degrees Celsius], NaN where missing."""
+    payload_g: np.ndarray | None = None
+    """(T,) float64 mass attached to the arm [g], NaN where missing."""
+    arm: ArmInfo = field(default_factory=ArmInfo)
+    """The arm's size."""
+    gravity: np.ndarray | None = None
+    """(3,) unit vector along the weight, arm base frame."""
+    kind: str = "continuous"
+    """"continuous", or "settled" where each sample is one settled point."""
+    noise_mm: float | None = None
+    """Standard deviation of a key point's coordinate as the lab knows it [mm]."""
+    note: str = ""
+    """Free text."""
+    source: Path | None = None
+    """The file that it was read from."""
+
+    def __post_init__(self) -> None:
+        run = np.zeros(np.shape(self.t_s), np.int64) if self.run is None else self.run
+        points = _with_whole_key_points(np.asarray(self.key_points_mm, np.float64))
+        object.__setattr__(self, "run", np.asarray(run, np.int64))
+        object.__setattr__(self, "key_points_mm", points)
+        for name in ("t_s", "measured", "commanded", "temp_C", "payload_g", "gravity"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
+        if self.gravity is not None:
+            object.__setattr__(self, "gravity", with_unit_length(self.gravity))
+        _check(self)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples T."""
+        return len(self.t_s)
+
+    @property
+    def chambers(self) -> int:
+        """Number of actuation channels m."""
+        return self.measured.shape[1]
+
+    @property
+    def key_points(self) -> int:
+        """Number of key points n."""
+        return self.key_points_mm.shape[1]
+
+    @cached_property
+    def runs(self) -> list[slice]:
+        """The samples of each run, in order."""
+        edges = [0, *(np.flatnonzero(np.diff(self.run)) + 1).tolist(), self.samples]
+        return [slice(a, b) for a, b in itertools.pairwise(edges)]
+
+    @property
+    def label(self) -> str:
+        """What an error message calls it: the file where there is one."""
+        return str(self.source) if self.source else f"recording '{self.name}'"
+
+
+def _with_whole_key_points(points: np.ndarray) -> np.ndarray:
+    """The key points (T, n, 3) with a partly missing one missing as a whole."""
+    missing = np.isnan(points)
+    partly = missing.any(axis=-1) & ~missing.all(axis=-1)
+    return np.where(partly[..., None], np.nan, points) if partly.any() else points
+
+
+def with_unit_length(vector: np.ndarray) -> np.ndarray:
+    """The direction (3,) at length 1, where its length is 1 within the tolerance; else as it is."""
+    off = abs(np.linalg.norm(vector) - 1)
+    return vector / np.linalg.norm(vector) if 1e-12 < off <= UNIT_TOLERANCE else vector
+
+
+def _check(recording: Recording) -> None:
+    _check_shapes(recording)
+    _check_values(recording)
+    _check_sidecar_values(recording)
+
+
+def _fail(recording: Recording, message: str) -> None:
+    raise InputError(f"{recording.label}: {message}")
+
+
+def _check_shapes(recording: Recording) -> None:
+    samples = len(recording.t_s) if recording.t_s.ndim == 1 else -1
+    if samples < 1:
+        _fail(recording, f"times have shape {recording.t_s.shape}, expected (T,) with T >= 1")
+    if recording.measured.ndim != 2 or recording.measured.shape[1] < 1:
+        shape = recording.measured.shape
+        _fail(recording, f"measured actuation has shape {shape}, expected (T, m) with m >= 1")
+    shape = recording.key_points_mm.shape
+    if len(shape) != 3 or shape[1] < 1 or shape[2] != 3:
+        _fail(recording, f"key points have shape {shape}, expected (T, n, 3) with n >= 1")
+    expected = {
+        "measured": (samples, recording.chambers),
+        "commanded": (samples, recording.chambers),
+        "key_points_mm": (samples, recording.key_points, 3),
+        "run": (samples,),
+        "temp_C": (samples,),
+        "payload_g": (samples,),
+        "gravity": (3,),
+    }
+    for name, wanted in expected.items():
+        array = getattr(recording, name)
+        if array is not None and array.shape != wanted:
+            _fail(recording, f"{name} has shape {array.shape}, expected {wanted}")
+
+
+def _check_values(recording: Recording) -> None:
+    for name in ("t_s", "measured", "commanded"):
+        array = getattr(recording, name)
+        if array is not None and not np.isfinite(array).all():
+            row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
+            _fail(recording, f"{name} of sample {row} is not finite; leave such samples out")
+    for name in ("key_points_mm", "temp_C", "payload_g"):
+        array = getattr(recording, name)
+        if array is not None and np.isinf(array).any():
+            row = int(np.argwhere(np.isinf(array))[0][0])
+            _fail(recording, f"{name} of sample {row} is infinite; NaN means missing")
+    back = first_time_backwards(recording.t_s, recording.run)
+    if back is not None:
+        before, now = recording.t_s[back - 1], recording.t_s[back]
+        _fail(recording, f"time of sample {back} is {now} s after {before} s, expected an increase")
+    again = first_run_again(recording.run)
+    if again is not None:
+        _fail(recording, f"run {recording.run[again]} comes back at sample {again} after another")
+
+
+def _check_sidecar_values(recording: Recording) -> None:
+    if recording.kind not in KINDS:
+        _fail(recording, f"kind is '{recording.kind}', expected one of {', '.join(KINDS)}")
+    if recording.gravity is not None and abs(np.linalg.norm(recording.gravity) - 1) > 1e-6:
+        _fail(recording, f"gravity is {recording.gravity.tolist()}, expected a unit vector")
+    sizes = {"length_mm": recording.arm.length_mm, "diameter_mm": recording.arm.diameter_mm}
+    for name, value in sizes.items():
+        if value is not None and not (np.isfinite(value) and value > 0):
+            _fail(recording, f"{name} is {value}, expected a positive number")
+    noise = recording.noise_mm
+    if noise is not None and not (np.isfinite(noise) and noise >= 0):
+        _fail(recording, f"noise_mm is {noise}, expected a number >= 0")
+
+
+def first_time_backwards(t_s: np.ndarray, run: np.ndarray) -> int | None:
+    """Index of the first sample that is not later than the one before it in its run.
+
+    t_s: (T,) [s]; run: (T,) ids.
+    """
+    bad = np.flatnonzero((np.diff(t_s) <= 0) & (np.diff(run) == 0))
+    return int(bad[0]) + 1 if len(bad) else None
+
+
+def first_run_again(run: np.ndarray) -> int | None:
+    """Index of the first sample where a run's id (T,) comes back after another run."""
+    starts = np.flatnonzero(np.diff(run, prepend=run[0] - 1) != 0)
+    seen: set[int] = set()
+    for start in starts.tolist():
+        if int(run[start]) in seen:
+            return start
+        seen.add(int(run[start]))
+    return None
+
+
+def save_recording(recording: Recording, path: str | Path, force: bool = False) -> None:
+    """Write the table (.csv or .parquet by the suffix) and its sidecar (.toml) beside it.
+
+    Both are written to temporary files first. Existing files are kept unless `force` is set.
+    """
+    from surgisoft.measurement.recordings import file as recording_file
+
+    recording_file.write(recording, Path(path), force)
+
+
+def check_writable(path: str | Path, force: bool = False) -> None:
+    """Raise where `save_recording` would refuse this path."""
+    from surgisoft.measurement.recordings import file as recording_file
+
+    recording_file.check_writable(Path(path), force)
+
+
+def load_recording(path: str | Path, on_warning: Callable[[str], None] | None = None) -> Recording:
+    """Read one recording; what is odd but usable goes to `on_warning` (default: warnings.warn)."""
+    from surgisoft.measurement.recordings import file as recording_file
+
+    return recording_file.read(Path(path), on_warning or _warn)
+
+
+def load_recordings(
+    paths: Iterable[str | Path] | str | Path, on_warning: Callable[[str], None] | None = None
+) -> list[Recording]:
+    """Read files, and every recording of folders in the order of their names."""
+    from surgisoft.measurement.recordings import file as recording_file
+
+    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    files = recording_file.find([Path(p) for p in given], on_warning or _warn)
+    return [load_recording(file, on_warning) for file in files]
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, stacklevel=2)
+
+
+def check_same_arm(recordings: list[Recording]) -> None:
+    """Raise where the recordings differ in channels, key points or unit of the actuation."""
+    for other in recordings[1:]:
+        first = recordings[0]
+        for what, a, b in (
+            ("actuation channels", first.chambers, other.chambers),
+            ("key points", first.key_points, other.key_points),
+            ("as unit of the actuation", first.unit, other.unit),
+        ):
+            if a != b:
+                raise InputError(
+                    f"{other.label} has {b} {what}, expected {a} as in {first.label}; "
+                    "recordings of one arm belong together"
+                )
+
+
+def check_rows(recordings: list[Recording], least: int, purpose: str) -> None:
+    """Raise where the recordings together have fewer samples than `purpose` needs."""
+    rows = sum(recording.samples for recording in recordings)
+    if rows < least:
+        names = ", ".join(recording.label for recording in recordings) or "no recording"
+        raise InputError(f"{names}: {rows} rows, expected at least {least} to {purpose}")

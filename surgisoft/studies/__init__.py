@@ -1,1 +1,0 @@
-"""Long studies, each one command: what they print is committed under docs/results."""

@@ -1,0 +1,235 @@
+"""HAW-NN: the Hysteresis-Aware Whole-body Neural Network (Chen et al. 2025, sec. III-A)."""
+
+import itertools
+import math
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.arm import centre_and_half
+
+HIDDEN = (128, 128, 128, 128)
+"""Best of the paper's six architectures: 4 hidden layers of 128 neurons."""
+
+
+def parse_widths(text: str) -> tuple[int, ...]:
+    """Widths of hidden layers from text such as `128,128`."""
+    try:
+        widths = tuple(int(word) for word in text.replace("x", ",").split(","))
+    except ValueError:
+        widths = ()
+    if not widths or min(widths) < 1:
+        raise InputError(f"hidden widths '{text}': expected whole numbers such as 128,128,128,128")
+    return widths
+
+
+class HawNN(nn.Module):
+    """[p_1..p_m, d_1..d_m] -> n key points; with `directions` false, [p_1..p_m] -> n key points.
+
+    Inputs and outputs are normalised inside: pressures by the arm's range to [-1, 1], key points
+    by mean and standard deviation of the data the network was fitted to. The paper does not name
+    its activation; SiLU (Elfwing et al. 2018) is smooth, so that Jacobians are too, and fast.
+    """
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        key_points: int,
+        hidden: tuple[int, ...] = HIDDEN,
+        directions: bool = True,
+    ):
+        """Pressure range low, high (m,) in the arm's unit; `key_points` is n."""
+        super().__init__()
+        chambers = len(low)
+        self.key_points = key_points
+        self.hidden = tuple(hidden)
+        self.directions = directions
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.register_buffer("use", torch.ones(chambers))
+        self.register_buffer("mean", torch.zeros(3 * key_points))
+        self.register_buffer("scale", torch.ones(3 * key_points))
+        widths = [chambers * (2 if directions else 1), *hidden]
+        layers = []
+        for before, after in itertools.pairwise(widths):
+            layers += [nn.Linear(before, after), nn.SiLU()]
+        layers.append(nn.Linear(widths[-1], 3 * key_points))
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        """Key points (..., n, 3) in mm, base frame, from pressure and direction, each (..., m)."""
+        x = (pressure - self.centre) / self.half_range
+        if self.directions:
+            x = torch.cat([x, direction * self.use], dim=-1)
+        y = torch.addcmul(self.mean, self.layers(x), self.scale)
+        return y.unflatten(-1, (self.key_points, 3))
+
+    @torch.no_grad()
+    def with_directions(self, use: Tensor) -> "HawNN":
+        """The same function with direction inputs added, whose weights start at zero.
+
+        `use` (m,) is 1 for each chamber whose direction the data supports, 0 elsewhere.
+        """
+        grown = HawNN(
+            self.centre - self.half_range,
+            self.centre + self.half_range,
+            self.key_points,
+            self.hidden,
+            directions=True,
+        )
+        state = self.state_dict()
+        first = state["layers.0.weight"]
+        state["layers.0.weight"] = torch.cat(
+            [first[:, : len(use)], torch.zeros(len(first), len(use))], dim=1
+        )
+        state["use"] = use.to(first)
+        grown.load_state_dict(state)
+        return grown
+
+
+def range_weights(key_points: Tensor) -> Tensor:
+    """Weights of the motion-range weighted MSE (Chen et al. 2025, eqs. 4-5).
+
+    w_i = 1 + N dY_i / sum_i dY_i over the N = 3n output coordinates, dY_i their motion range.
+    Key points (S, n, 3) in mm, NaN where missing; answer (n, 3), without unit, mean 2.
+    """
+    low = key_points.nan_to_num(nan=float("inf")).amin(0)
+    high = key_points.nan_to_num(nan=float("-inf")).amax(0)
+    span = (high - low).clamp(min=0).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    return 1 + span.numel() * span / span.sum().clamp(min=1e-12)
+
+
+def weighted_mse(predicted: Tensor, measured: Tensor, weights: Tensor) -> Tensor:
+    """Motion-range weighted MSE in mm^2 (Chen et al. 2025, eq. 6); missing values do not count.
+
+    Shapes: predicted, measured (S, n, 3) in mm, weights (n, 3).
+    """
+    seen = ~measured.isnan()
+    error = (predicted - measured.nan_to_num()) * seen
+    return (weights * error.square()).sum() / seen.sum().clamp(min=1)
+
+
+def _rotation(vector: Tensor) -> Tensor:
+    """(..., 3, 3) rotation matrices from rotation vectors (..., 3) in rad (Rodrigues 1840)."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.linalg.matrix_exp(cross)
+
+
+def arc_point(bend: Tensor, length: Tensor) -> Tensor:
+    """End of an arc that starts at the origin along z.
+
+    bend (..., 2) in rad is the arc's angle times its direction in x and y, length (...,) in mm;
+    answer (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
+    """
+    square = bend.square().sum(-1)
+    angle = (square + 1e-12).sqrt()
+    across = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
+    along = torch.sinc(angle / math.pi)
+    return torch.cat([(length * across)[..., None] * bend, (length * along)[..., None]], -1)
+
+
+def arc_rotation(bend: Tensor) -> Tensor:
+    """(..., 3, 3) rotation from the start to the end of an arc of bend (..., 2) rad, no twist."""
+    x, y = bend.unbind(-1)
+    return _rotation(torch.stack([-y, x, torch.zeros_like(x)], -1))
+
+
+class ConstantCurvature(nn.Module):
+    """Key points of a chain of constant-curvature arcs; ignores directions."""
+
+    directions = False
+
+    def __init__(self, low: Tensor, high: Tensor, key_points: int, sections: int = 0):
+        """Pressure range (m,) in the arm's unit; `sections` 0 means one for every 3 chambers."""
+        super().__init__()
+        chambers = len(low)
+        sections = sections or max(1, math.ceil(chambers / 3))
+        if key_points < 2:
+            raise InputError("constant curvature needs at least 2 key points; this arm has 1")
+        self.key_points, self.sections = key_points, sections
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.fraction = nn.Parameter(torch.linspace(0, 1, key_points))
+        self.register_buffer("length", torch.ones(()))
+        self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))
+        self.base_turn = nn.Parameter(torch.zeros(3))
+        self.base_mm = nn.Parameter(torch.zeros(3))
+
+    def set_rest(self, rest: Tensor) -> None:
+        """Lengths from the key points at rest, (n, 3) in mm, base frame."""
+        steps = rest.diff(dim=0).norm(dim=-1)
+        if not float(steps.sum()) > 0:
+            raise InputError("constant curvature: all key points coincide, expected a chain")
+        self.length.copy_(steps.sum())
+        self.fraction.data.copy_(torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum())
+        self.base_mm.data.copy_(rest[0])
+
+    def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        """Key points (..., n, 3) in mm, base frame, from pressure (..., m)."""
+        x = (pressure - self.centre) / self.half_range
+        x = torch.cat([x, torch.ones_like(x[..., :1])], -1)
+        values = torch.einsum("scm,...m->...sc", self.table, x)
+        turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
+        start = self.base_mm.expand(*x.shape[:-1], 3)
+        points = [start] * self.key_points
+        for section in range(self.sections):
+            bend = values[..., section, :2]
+            length = self.length / self.sections * values[..., section, 2].exp()
+            for k in range(self.key_points):
+                share = self.fraction[k] * self.sections - section
+                last = section == self.sections - 1
+                if (share >= 0 or section == 0) and (share < 1 or last):
+                    local = arc_point(bend * share, length * share)
+                    points[k] = start + (turn @ local[..., None])[..., 0]
+            start = start + (turn @ arc_point(bend, length)[..., None])[..., 0]
+            turn = turn @ arc_rotation(bend)
+        return torch.stack(points, -2)
+
+
+class RecurrentArm(nn.Module):
+    """[p, d] at each row -> hidden state -> key points."""
+
+    directions = True
+
+    def __init__(self, low: Tensor, high: Tensor, key_points: int, width: int = 64):
+        """Pressure range low, high (m,) in the arm's unit; `width` of the hidden state."""
+        super().__init__()
+        chambers = len(low)
+        self.key_points, self.width = key_points, width
+        centre, half = centre_and_half(low, high)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.register_buffer("mean", torch.zeros(3 * key_points))
+        self.register_buffer("scale", torch.ones(3 * key_points))
+        self.cell = nn.GRU(2 * chambers, width, batch_first=True)
+        self.readout = nn.Sequential(
+            nn.Linear(width + 2 * chambers, 128), nn.SiLU(), nn.Linear(128, 3 * key_points)
+        )
+
+    def _inputs(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        return torch.cat([(pressure - self.centre) / self.half_range, direction], dim=-1)
+
+    def rest(self, pressure: Tensor) -> Tensor:
+        """(B, width) hidden state of an arm without history, for pressure (B, m)."""
+        return pressure.new_zeros(len(pressure), self.width)
+
+    def advance(self, memory: Tensor, pressure: Tensor, direction: Tensor) -> Tensor:
+        """(B, width) hidden state after one row of pressure and direction, each (B, m)."""
+        x = self._inputs(pressure, direction).unsqueeze(1)
+        return self.cell(x, memory.unsqueeze(0))[1].squeeze(0)
+
+    def scan(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
+        """(R, T, width) hidden states along pressure and direction, each (R, T, m)."""
+        start = None if memory is None else memory.unsqueeze(0)
+        return self.cell(self._inputs(pressure, direction), start)[0]
+
+    def forward(self, pressure: Tensor, direction: Tensor, memory: Tensor) -> Tensor:
+        """Key points (..., n, 3) in mm from pressure, direction (..., m), memory (..., width)."""
+        y = self.readout(torch.cat([memory, self._inputs(pressure, direction)], dim=-1))
+        return torch.addcmul(self.mean, y, self.scale).unflatten(-1, (self.key_points, 3))

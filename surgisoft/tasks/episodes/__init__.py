@@ -1,0 +1,1 @@
+"""Episodes: their log, its parts, and the file that keeps it."""

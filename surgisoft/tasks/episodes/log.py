@@ -1,0 +1,362 @@
+"""One episode of any task as numpy arrays: what replays draw and reports read.
+
+A log has T rows: row 0 is the start, row k the state after k steps. World frame, mm, s, kPa. It
+stands alone: the scene's bodies, the dose's triangles and the camera are in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from torch import Tensor
+
+from surgisoft.tasks.base import Outcome, Task, TaskState
+from surgisoft.tasks.episodes.parts import (
+    ArmLog,
+    BeamLog,
+    BodyLog,
+    CameraLog,
+    DoseLog,
+    Event,
+)
+from surgisoft.tasks.world.scene import ENDOSCOPE, Surroundings
+
+NO_DIAMETER_MM = 15.0
+"""Outer diameter of an arm of which neither scene nor model says it: the paper's arm (mm)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeLog:
+    """One episode; T rows. What a task does not have is None or empty."""
+
+    task: str
+    """The task's name in the registry."""
+    agents: tuple[str, ...]
+    """Who acted: names of arms."""
+    driver: str
+    """Who drove: `scripted`, `random`, or a policy's name."""
+    on: str
+    """`simulation` or `rig`."""
+    seed: int
+    """Seed of the batch that the episode was part of."""
+    episode: int
+    """Number of the episode within that seed."""
+    scene: str | None
+    """Folder of the scene."""
+    dt_s: float
+    """Time of a step, s."""
+    time_s: np.ndarray
+    """(T,) s since the episode began."""
+    arms: dict[str, ArmLog]
+    """Each arm by name."""
+    targets_mm: np.ndarray
+    """(T, k, 3) mm: where the task's points should be; k is 1 but for tasks of a whole body."""
+    actuals_mm: np.ndarray
+    """(T, k, 3) mm: where they are."""
+    path_mm: np.ndarray
+    """(M, 3) mm: the closed path that is asked for; (0, 3) where there is none but the targets."""
+    measures: dict[str, np.ndarray]
+    """The task's measures: name with unit -> (T,); nan where one does not apply."""
+    rewards: dict[str, dict[str, np.ndarray]]
+    """agent -> reward term -> (T,); nan in row 0."""
+    limits: dict[str, float]
+    """The scene's limits: `clearance_mm`, `view_fraction`, `time_s`; empty without a scene."""
+    beam: BeamLog | None = None
+    """The laser's beam."""
+    camera: CameraLog | None = None
+    """The endoscope's camera."""
+    clearance_mm: np.ndarray | None = None
+    """(T,) mm: least distance of any arm from a body or the other arm."""
+    view_fraction: np.ndarray | None = None
+    """(T,) 0..1: share of the ring that the endoscope sees."""
+    dose: DoseLog | None = None
+    """What the beam has done."""
+    bodies: tuple[BodyLog, ...] = ()
+    """The bodies of the scene."""
+    events: tuple[Event, ...] = ()
+    """What happened, in order of time."""
+
+    @property
+    def rows(self) -> int:
+        """T."""
+        return len(self.time_s)
+
+    @property
+    def target_mm(self) -> np.ndarray:
+        """(T, 3) mm: where the task's point (of a whole body the tip) should be."""
+        return self.targets_mm[:, -1]
+
+    @property
+    def actual_mm(self) -> np.ndarray:
+        """(T, 3) mm: where it is."""
+        return self.actuals_mm[:, -1]
+
+    @property
+    def error_mm(self) -> np.ndarray:
+        """(T,) mm: mean distance of the task's points from where they should be."""
+        return np.linalg.norm(self.targets_mm - self.actuals_mm, axis=-1).mean(axis=1)
+
+
+class EpisodeRecorder:
+    """Makes the log of one episode out of a batch that runs; it copies what it keeps.
+
+    Built on the state in which the episode starts; `step` after each step; then `log`. Steps after
+    the episode's end are left out, so a batch may run on.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        state: TaskState,
+        environment: int = 0,
+        *,
+        driver: str,
+        seed: int,
+        episode: int | None = None,
+        on: str = "simulation",
+    ):
+        """`environment` is the episode's row of the batch, `episode` its number in the seed.
+
+        Without `episode` they are the same.
+        """
+        self.task, self.done, self.environment = task, False, environment
+        self._about = {"driver": driver, "seed": int(seed), "on": on}
+        self._about["episode"] = environment if episode is None else int(episode)
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._dose: list[tuple[np.ndarray, np.ndarray]] = []
+        self._last_dose: np.ndarray | None = None
+        self._mounts = {name: self._of(part.mount) for name, part in state.world.arms.items()}
+        lesion = state.world.scenery.lesion
+        self._lesion = 0 if lesion is None else int(self._of(lesion))
+        self._ending = ""
+        self._add(state, task.measures(state), {}, {})
+
+    def step(
+        self,
+        state: TaskState,
+        outcome: Outcome,
+        actions: Mapping[str, Tensor],
+        environment: int | None = None,
+    ) -> None:
+        """The state that a step came to, before any reset, and the actions that led there.
+
+        `environment` is given where the episode's row of the batch has changed.
+        """
+        if self.done:
+            return
+        self.environment = self.environment if environment is None else environment
+        self._add(state, outcome.measures, actions, outcome.terms)
+        self.done = bool(self._of(outcome.done))
+        if bool(self._of(state.world.failed)):
+            self._ending = "failed"
+        elif self.done:
+            self._ending = "ended" if bool(self._of(outcome.terminated)) else "time out"
+
+    def log(self) -> EpisodeLog:
+        """The episode so far."""
+        task, config = self.task, self.task.world.config
+        scene = getattr(getattr(task, "config", None), "scene", None)
+        around = task.world.surroundings
+        near = around if isinstance(around, Surroundings) else None
+        rows = {name: self._column(name) for name in self._rows[-1]}
+        log = EpisodeLog(
+            task=task.name,
+            agents=tuple(task.agents),
+            **self._about,
+            scene=None if scene is None else str(scene),
+            dt_s=config.dt_s,
+            time_s=config.dt_s * np.arange(len(self._rows)),
+            arms={name: self._arm(name, rows) for name in task.world.arms},
+            targets_mm=rows["targets"],
+            actuals_mm=rows["actuals"],
+            path_mm=self._path(near),
+            measures=_below(rows, "measures/"),
+            rewards={agent: _below(rows, f"rewards/{agent}/") for agent in task.agents},
+            limits={} if near is None else _limits(near),
+        )
+        if near is not None:
+            log = replace(log, **self._surroundings(near, rows))
+        elif around is not None:
+            bodies = tuple(_body(body) for body in around.geometry.bodies)
+            limits = {"clearance_mm": around.clearance_mm}
+            log = replace(log, bodies=bodies, limits=limits, clearance_mm=rows["clearance"])
+        return replace(log, events=find_events(log, self._ending))
+
+    def _of(self, tensor: Tensor) -> np.ndarray:
+        """This episode's row of a tensor, as a copy."""
+        return tensor[self.environment].detach().cpu().numpy().copy()
+
+    def _add(self, state: TaskState, measures, actions, terms) -> None:
+        targets, actuals = self.task.trace(state)
+        row = {"targets": targets, "actuals": actuals}
+        for name, part in state.world.arms.items():
+            row |= {f"{name}/{field}": getattr(part, field) for field in _ARM_ROWS}
+        row |= {f"{name}/action": action for name, action in actions.items()}
+        row |= {f"measures/{name}": value for name, value in measures.items()}
+        for agent, parts in terms.items():
+            row |= {f"rewards/{agent}/{term}": value for term, value in parts.items()}
+        near = state.world.scenery
+        if near.clearance is not None:
+            row["clearance"] = near.clearance.least_mm
+        if near.hit is not None:
+            row |= {"end": near.hit.point_mm, "hits": near.hit.on_organ}
+        if near.view is not None:
+            row["view"] = near.view.fraction
+        if near.dose is not None:
+            row["delivered"] = near.dose.delivered_j
+            self._add_dose(self._of(near.dose.dose))
+        self._rows.append({name: self._of(value) for name, value in row.items()})
+
+    def _add_dose(self, dose: np.ndarray) -> None:
+        last = np.zeros_like(dose) if self._last_dose is None else self._last_dose
+        changed = np.flatnonzero(dose != last).astype(np.int32)
+        self._dose.append((changed, dose[changed]))
+        self._last_dose = dose
+
+    def _column(self, name: str) -> np.ndarray:
+        """All rows of one value; nan in row 0 for what only a step brings."""
+        values = [row[name] for row in self._rows if name in row]
+        missing = len(self._rows) - len(values)
+        return np.stack([np.full_like(values[0], np.nan)] * missing + values)
+
+    def _arm(self, name: str, rows: Mapping[str, np.ndarray]) -> ArmLog:
+        world, arm = self.task.world, self.task.world.arms[name]
+        if world.surroundings is not None:
+            radius = world.surroundings.geometry.radius_mm(name)
+        else:
+            radius = 0.5 * (arm.model.spec.diameter_mm or NO_DIAMETER_MM)
+        pressure = rows[f"{name}/pressure"]
+        return ArmLog(
+            command_kPa=rows[f"{name}/command"],
+            pressure_kPa=pressure,
+            action_kPa=rows.get(f"{name}/action", np.full_like(pressure, np.nan)),
+            **{field: rows[f"{name}/{field}"] for field in _ARM_ROWS[2:]},
+            mount=self._mounts[name],
+            radius_mm=float(radius),
+            shaft_mm=float(-arm.shaft[0, 2]) if len(arm.shaft) else 0.0,
+        )
+
+    def _surroundings(self, near: Surroundings, rows: Mapping[str, np.ndarray]) -> dict:
+        """The log's fields that only a scene has."""
+        burnt = np.diff(rows["delivered"], prepend=rows["delivered"][:1])
+        beam = BeamLog(burnt / self.task.world.config.dt_s, rows["end"], rows["hits"])
+        camera = CameraLog(near.camera.fov_rad, tuple(map(float, near.camera.range_mm)))
+        return {
+            "beam": beam,
+            "camera": camera if ENDOSCOPE in self.task.world.arms else None,
+            "clearance_mm": rows["clearance"],
+            "view_fraction": rows["view"],
+            "dose": self._dose_log(near),
+            "bodies": tuple(_body(body) for body in near.geometry.bodies),
+        }
+
+    def _path(self, near: Surroundings | None) -> np.ndarray:
+        """(M, 3) mm: the ring's path of this episode's lesion."""
+        if near is None:
+            return np.zeros((0, 3), np.float32)
+        return near.paths_mm[self._lesion].detach().cpu().numpy().copy()
+
+    def _dose_log(self, near: Surroundings) -> DoseLog:
+        ablation, patch = near.ablation, near.ablation.patches[self._lesion]
+        counts = np.array([len(sample) for sample, _ in self._dose])
+        rows = np.flatnonzero(counts)
+        samples, doses = zip(*self._dose, strict=True)
+        return DoseLog(
+            body=near.geometry.bodies[near.organ].name,
+            points_mm=patch.points_mm.astype(np.float32),
+            normals=patch.normals.astype(np.float32),
+            areas_mm2=patch.areas_mm2.astype(np.float32),
+            faces=patch.faces.astype(np.int32),
+            offset_mm=patch.offset_mm.astype(np.float32),
+            station=patch.station.astype(np.int32),
+            zone=patch.zone,
+            stations=patch.stations,
+            ring_length_mm=patch.ring_length_mm,
+            threshold_j_per_mm2=float(ablation.threshold),
+            cut_j_per_mm2=float(ablation.cut_dose),
+            rows=rows,
+            starts=np.concatenate(([0], np.cumsum(counts[rows]))),
+            sample=np.concatenate(samples),
+            dose_j_per_mm2=np.concatenate(doses),
+        )
+
+
+_ARM_ROWS = ("command", "pressure", "points_mm", "seen_mm", "line_mm", "tip_direction")
+"""What of a `world_arm.ArmPart` is kept in every row."""
+
+
+def _below(rows: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The values whose names begin so, by the rest of their names."""
+    return {name[len(prefix) :]: value for name, value in rows.items() if name.startswith(prefix)}
+
+
+def _limits(near: Surroundings) -> dict[str, float]:
+    limits = near.spec.limits
+    return {name: float(getattr(limits, name)) for name in vars(limits)}
+
+
+def _body(body) -> BodyLog:
+    mesh = body.world_mesh
+    vertices, faces = mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.int32)
+    return BodyLog(body.name, body.role, vertices, faces)
+
+
+if TYPE_CHECKING:
+    from surgisoft.tasks.episodes.log import EpisodeLog
+
+
+def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
+    """Beam on and off, lesion in and out of sight, too close, contact, cut, and the end.
+
+    `ending` is how the recorder saw it end: `ended` by the task, `time out`, `failed`, or "" where
+    it was still running.
+    """
+    found: list[Event] = []
+    found.append(Event(0.0, "info", f"{log.task} by {log.driver} in {log.on}, seed {log.seed}"))
+    if log.beam is not None:
+        found += _changes(log, log.beam.on, ("info", "beam on"), ("info", "beam off"))
+    if log.view_fraction is not None:
+        seen = log.view_fraction >= log.limits["view_fraction"]
+        found += _changes(log, seen, ("info", "lesion in sight"), ("warning", "lesion lost"))
+    if log.clearance_mm is not None:
+        if "clearance_mm" in log.limits:
+            least = log.limits["clearance_mm"]
+            close = ("warning", f"closer than {least:g} mm"), ("info", f"{least:g} mm clear again")
+            found += _changes(log, log.clearance_mm < least, *close)
+        found += _changes(
+            log, log.clearance_mm < 0.0, ("error", "contact"), ("info", "contact ended")
+        )
+    collided = log.measures.get("collided")
+    if collided is not None and log.clearance_mm is not None:
+        folded = (collided > 0.0) & ~(log.clearance_mm < 0.0)
+        found += _changes(log, folded, ("error", "an arm touches itself"), ("info", "arm unfolded"))
+    completion = log.measures.get("completion")
+    if completion is not None and len(whole := np.flatnonzero(completion >= 1.0)):
+        found.append(Event(float(log.time_s[whole[0]]), "info", "ring cut all around"))
+    if ending:
+        found.append(Event(float(log.time_s[-1]), *_end(log, ending)))
+    return tuple(sorted(found, key=lambda event: event.time_s))
+
+
+def _changes(
+    log: EpisodeLog, holds: np.ndarray, begins: tuple[str, str], ends: tuple[str, str]
+) -> list[Event]:
+    """An event wherever (T,) bool `holds` changes; not holding at the start is no event."""
+    before = np.concatenate(([False], holds[:-1]))
+    return [
+        Event(float(log.time_s[row]), *(begins if holds[row] else ends))
+        for row in np.flatnonzero(holds != before)
+    ]
+
+
+def _end(log: EpisodeLog, ending: str) -> tuple[str, str]:
+    """Level and text of the episode's end."""
+    if ending == "failed":
+        return "error", "an arm is no longer finite"
+    success = log.measures.get("success")
+    if success is None or success[-1] > 0.0:
+        return "info", "done"
+    return ("warning", "the time is out") if ending == "time out" else ("error", "ended early")

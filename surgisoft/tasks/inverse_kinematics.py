@@ -1,0 +1,150 @@
+"""The scripted solver: damped least squares on the differentiable arm model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from surgisoft.tasks.world.arm import Arm, ArmPart
+from surgisoft.tasks.world.pytree import rows, tree_map
+
+
+def least_squares(
+    residual: Callable[[Tensor], Tensor],
+    start: Tensor,
+    low: Tensor,
+    high: Tensor,
+    damping: float = 1e-3,
+    iterations: int = 5,
+) -> Tensor:
+    """(B, m) within low, high (B, m) that make the residuals (B, r) small; the best one tried.
+
+    Steps (J^T J + lambda D)^-1 J^T r with D the mean of J^T J's diagonal (Levenberg 1944; Wampler
+    1986 for arms), held to the box. Where a step does not help, its environment's damping grows
+    tenfold, else it falls tenfold. `residual` maps (B, m) to (B, r), row by row.
+    """
+    best = torch.minimum(torch.maximum(start, low), high)
+    factor = best.new_full((len(best), 1, 1), damping)
+    error, jacobian = _linearised(residual, best)
+    eye = torch.eye(best.shape[1], dtype=best.dtype, device=best.device)
+    for _ in range(iterations):
+        normal = jacobian.mT @ jacobian
+        size = normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None].clamp(min=1e-12)
+        pull = (jacobian.mT @ error[..., None])[..., 0]
+        move = torch.linalg.solve_ex(normal + factor * size * eye, pull)[0]
+        tried = torch.minimum(torch.maximum(best - move, low), high)
+        new_error, new_jacobian = _linearised(residual, tried)
+        better = new_error.square().sum(1) < error.square().sum(1)
+        best = torch.where(better[:, None], tried, best)
+        error = torch.where(better[:, None], new_error, error)
+        jacobian = torch.where(better[:, None, None], new_jacobian, jacobian)
+        factor = torch.where(better[:, None, None], 0.1 * factor, 10.0 * factor).clamp(1e-6, 1e6)
+    return best
+
+
+def _linearised(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals (B, r) and their Jacobians (B, r, m) at (B, m); works under inference_mode."""
+    with torch.inference_mode(False), torch.enable_grad():
+        place = at.clone().requires_grad_(True)
+        value = residual(place)
+        one = torch.eye(value.shape[1], dtype=value.dtype, device=value.device)
+        each = one[:, None].expand(-1, len(value), -1)
+        slopes = torch.autograd.grad(value, place, each, is_grads_batched=True)[0]
+    return value.detach(), slopes.movedim(0, 1)
+
+
+STUCK_MM = 1e-3
+"""A solver that leaves more than this tries again (mm)."""
+OFFSETS_KPA = (1.0, -1.0)
+"""Where it begins then, beside the present pressures (kPa): beyond every dead band."""
+
+Error = Callable[[Tensor, Tensor], Tensor]
+"""Key points (B, n, 3) mm and targets (B, ...) to what should vanish, (B, r) mm."""
+
+
+def seek(
+    arm: Arm, part: ArmPart, target_mm: Tensor, error: Error, dt_s: float, stuck_mm=STUCK_MM
+) -> Tensor:
+    """(B, m) kPa: the action after which the error is least, by damped least squares.
+
+    The direction of change makes the arm jump where a chamber turns round, so where the solver is
+    stuck it tries again from pressures that turn all chambers one way or the other.
+    """
+    with torch.inference_mode(False):
+        part, target = tree_map(torch.clone, part), target_mm.clone()
+        best, left = _solved(arm, part, target, error, dt_s, 0.0)
+        stuck = (left > stuck_mm).nonzero()[:, 0]
+        for offset in OFFSETS_KPA if len(stuck) else ():
+            tried, missed = _solved(arm, rows(part, stuck), target[stuck], error, dt_s, offset)
+            better = missed < left[stuck]
+            best = best.index_copy(0, stuck, tried.where(better[:, None], best[stuck]))
+            left = left.index_copy(0, stuck, missed.where(better, left[stuck]))
+        return arm.action_for(part, best, dt_s)
+
+
+def _solved(arm, part, target, error, dt_s, offset) -> tuple[Tensor, Tensor]:
+    """Pressures (B, m) kPa, sought from `offset` kPa off, and the errors (B,) that they leave."""
+    low, high = arm.within_reach(part, dt_s)
+
+    def residual(pressure: Tensor) -> Tensor:
+        return error(arm.foresee(part, pressure, dt_s), target)
+
+    pressure = least_squares(residual, part.pressure + offset, low, high)
+    return pressure, residual(pressure).norm(dim=1)
+
+
+class Aim:
+    """How far an arm's axis passes from a target, and the scripted aim; holds no state."""
+
+    def __init__(self, arm: Arm, dt_s: float):
+        self.arm, self.dt_s = arm, dt_s
+
+    def miss(self, points_mm: Tensor, target_mm: Tensor) -> Tensor:
+        """(B, 3) mm from the axis to targets (B, 3) mm, across it, for key points (B, n, 3) mm.
+
+        For a target behind the tip the axis ends at the tip.
+        """
+        aim = self.arm.backbone.tip_direction(points_mm)
+        away = target_mm - points_mm[:, -1]
+        along = (away * aim).sum(1, keepdim=True).clamp(min=0.0)
+        return away - along * aim
+
+    def action(self, part: ArmPart, target_mm: Tensor) -> Tensor:
+        """(B, m) kPa: damped least squares for the axis through targets (B, 3) a step from now."""
+        with torch.inference_mode(False):
+            part, target = tree_map(torch.clone, part), target_mm.clone()
+            low, high = self.arm.within_reach(part, self.dt_s)
+
+            def residual(pressure: Tensor) -> Tensor:
+                return self.miss(self.arm.foresee(part, pressure, self.dt_s), target)
+
+            wanted = least_squares(residual, part.pressure, low, high)
+            return self.arm.action_for(part, wanted, self.dt_s)
+
+
+def body_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
+    """What an arm knows of itself, each (B, ...): measured shape, commands, pressures, directions.
+
+    The shape is in lengths of 50 mm from the arm's nominal base.
+    """
+    shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
+    return shape, *pressure_part(arm, part)
+
+
+def pressure_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
+    """Commands, pressures, directions of change and ways back, each (B, m).
+
+    Commands and measured pressures are -1..1 over the range. A way back is how far a pressure has
+    come from where its chamber last moved on, in dead bands: beyond -1 or 1 the direction of change
+    turns over, and the arm jumps.
+    """
+    half = 0.5 * (arm.high - arm.low)
+    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
+    return (
+        (part.command - arm.low) / half - 1.0,
+        (part.seen_kPa - arm.low) / half - 1.0,
+        part.arm.direction,
+        back.clamp(-1.5, 1.5),
+    )

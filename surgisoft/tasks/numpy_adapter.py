@@ -1,0 +1,75 @@
+"""A task as numpy sees it: what both adapters share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.world.random import joined, streams
+
+Bounds = tuple[Any, Any, tuple[int, ...], Any]
+"""Lowest, highest, shape and type: the arguments of a Box."""
+
+
+def unseeded() -> int:
+    """A seed from the operating system's entropy."""
+    return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
+
+
+class Port:
+    """Episodes in and out of numpy; holds no state. Arrays have the batch in front."""
+
+    def __init__(self, task: Task):
+        self.task, self.episodes = task, Episodes(task)
+        self._width = {
+            agent: seen.shape[1] for agent, seen in self.observations(self.seeded([0])).items()
+        }
+
+    def observed(self, agent: str) -> Bounds:
+        """Bounds of one agent's observation in one environment."""
+        return -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (self._width[agent],), np.float32
+
+    def acted(self, agent: str) -> Bounds:
+        """Bounds of one agent's action in one environment, kPa."""
+        arm = self.task.world.arms[agent]
+        limit = arm.pneumatics.step_kPa
+        return -limit, limit, (arm.chambers,), np.float32
+
+    @torch.inference_mode()
+    def seeded(self, seeds: Sequence[int]) -> TaskState:
+        """Fresh episodes, one for each seed."""
+        parts = [streams(int(seed), 1, 0, self.task.world.device) for seed in seeds]
+        return self.episodes.start(joined(parts))
+
+    @torch.inference_mode()
+    def again(self, state: TaskState, mask: torch.Tensor | None = None) -> TaskState:
+        """Fresh episodes where mask (B,) is set (None: everywhere), each from its own stream."""
+        mask = torch.ones_like(state.world.failed) if mask is None else mask
+        return self.episodes.reset(state, mask, in_place=True)
+
+    @torch.inference_mode()
+    def step(
+        self, state: TaskState, actions: Mapping[str, np.ndarray]
+    ) -> tuple[TaskState, Outcome]:
+        """One step with actions (B, m), kPa; the state given is given up."""
+        count, held = len(state.world.steps), {}
+        for agent in self.task.agents:
+            expected = (count, self.task.world.arms[agent].chambers)
+            if np.shape(actions[agent]) != expected:
+                raise InputError(
+                    f"action of '{agent}' has shape {np.shape(actions[agent])}, expected {expected}"
+                )
+            held[agent] = torch.tensor(
+                np.asarray(actions[agent]), dtype=torch.float32, device=self.task.world.device
+            )
+        return self.episodes.step(state, held, in_place=True)
+
+    @torch.inference_mode()
+    def observations(self, state: TaskState) -> dict[str, np.ndarray]:
+        """agent -> (B, D) float32; fresh arrays."""
+        return {agent: seen.cpu().numpy() for agent, seen in self.episodes.observe(state).items()}

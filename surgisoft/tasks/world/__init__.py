@@ -1,0 +1,1 @@
+"""The batched world: arms, their scene, and the step that joins them."""

@@ -1,0 +1,293 @@
+"""Pressures of the chambers: what a command asks for, and how fast the pumps follow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.tasks.world.random import Stream
+
+
+@dataclass(frozen=True)
+class Pneumatics:
+    """A first-order lag between commanded pressure and chamber pressure.
+
+    dp/dt = (command - p) / tau, solved exactly over a step in which the command is held:
+    p(t + dt) = command + (p(t) - command) exp(-dt / tau).
+    """
+
+    step_kPa: float = 3.0
+    """Largest change of a command in one step, kPa (Chen et al. 2025, sec. IV-A)."""
+    tau_s: float = 0.2
+    """Time constant, s: the virtual rig's pumps have gone 63 % of a 3 kPa step after 0.27 s at
+    0 kPa, 0.19 s at 20 kPa and 0.15 s at 40 kPa. 0: the chamber has the pressure at once."""
+
+    def __post_init__(self):
+        if not (math.isfinite(self.step_kPa) and self.step_kPa > 0.0):
+            raise InputError(f"pneumatics: step_kPa is {self.step_kPa}, expected more than 0 kPa")
+        if not (math.isfinite(self.tau_s) and self.tau_s >= 0.0):
+            raise InputError(f"pneumatics: tau_s is {self.tau_s}, expected 0 s or more")
+
+    def share(self, dt_s: float) -> float:
+        """Share of the way to the command that the chamber goes in dt_s seconds."""
+        return 1.0 if self.tau_s == 0.0 else -math.expm1(-dt_s / self.tau_s)
+
+    def command(self, command: Tensor, action: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """(B, m) kPa: the command (B, m) changed by the action (B, m), within low, high (m,)."""
+        change = action.clamp(-self.step_kPa, self.step_kPa)
+        return torch.minimum(torch.maximum(command + change, low), high)
+
+    def follow(self, pressure: Tensor, command: Tensor, dt_s: float) -> Tensor:
+        """(B, m) kPa: chamber pressure dt_s seconds later, with the command held."""
+        return pressure + self.share(dt_s) * (command - pressure)
+
+    def action_for(self, command: Tensor, pressure: Tensor, wanted: Tensor, dt_s: float) -> Tensor:
+        """(B, m) kPa: the action after which the chambers have `wanted` (B, m), were it free."""
+        return pressure + (wanted - pressure) / self.share(dt_s) - command
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """What differs from episode to episode; all zero: nothing does."""
+
+    history: int = 3
+    """Random pressures that an arm goes through before an episode, so that its memory differs."""
+    start_kPa: float = 2.0
+    """Half width of the even spread of the first pressures, kPa."""
+    mount_mm: float = 0.0
+    """Standard deviation of each coordinate of a mount, mm."""
+    mount_rad: float = 0.0
+    """Standard deviation of a mount's turn about each axis of its base, rad."""
+    gain: float = 0.0
+    """Standard deviation of the factor between a chamber's pressure and what the model is given."""
+    noise_mm: float = 0.0
+    """Standard deviation of each coordinate of a measured key point, mm."""
+    noise_kPa: float = 0.0
+    """Standard deviation of a measured pressure, kPa."""
+    delay: int = 0
+    """Most steps that an action is late; each episode has a whole number of its own."""
+    lesion_mm: float = 0.0
+    """Greatest distance of an episode's lesion from the scene's own, along the surface, mm."""
+    lesion_size: float = 0.0
+    """Half width of the even spread of a lesion's diameter, as a share of it; below 1."""
+    lesions: int = 16
+    """Number of lesions that are laid out for that, once; each episode draws one of them."""
+
+    def __post_init__(self):
+        if self.lesions < 1:
+            raise InputError(f"randomisation: lesions is {self.lesions}, expected at least 1")
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"randomisation: {name} is {value}, expected 0 or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Mounted:
+    """An arm model in its place."""
+
+    model: ArmModel
+    """The arm, driven in kPa."""
+    pose: Tensor
+    """(4, 4) base frame to world frame, mm."""
+    start_kPa: tuple[float, ...] | None = None
+    """(m,) pressures at the start of an episode, kPa; None: at rest."""
+    shaft_mm: float = 0.0
+    """Straight rigid shaft behind the base, mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPart:
+    """A batch of one arm at one instant; world frame."""
+
+    command: Tensor
+    """(B, m) kPa: commanded pressure."""
+    pressure: Tensor
+    """(B, m) kPa: pressure in the chambers."""
+    queue: Tensor
+    """(B, D, m) kPa: the last D actions, newest last, for actions that come late."""
+    delay: Tensor
+    """(B,) int64: steps that this episode's actions are late, at most D."""
+    gain: Tensor
+    """(B, m): this episode's factor between chamber pressure and what the model is given."""
+    mount: Tensor
+    """(B, 4, 4): this episode's base frame to world frame, mm."""
+    arm: ArmState
+    """The model's state, its effects' memory included."""
+    points_mm: Tensor
+    """(B, n, 3) mm: key points, base to tip."""
+    line_mm: Tensor
+    """(B, K, 3) mm: centreline, base to tip, led by the far end of the shaft where there is one."""
+    tip_direction: Tensor
+    """(B, 3): unit tangent at the tip."""
+    seen_mm: Tensor
+    """(B, n, 3) mm: key points as measured."""
+    seen_kPa: Tensor
+    """(B, m) kPa: chamber pressure as measured."""
+    offset_mm: Tensor
+    """(B, n, 3) mm: what the key points are known to lie off the model; 0 where it is the truth."""
+
+    @property
+    def tip_mm(self) -> Tensor:
+        """(B, 3) mm: the last key point."""
+        return self.points_mm[:, -1]
+
+
+class Arm:
+    """How one arm starts, steps and is foreseen; holds no state."""
+
+    def __init__(
+        self,
+        name: str,
+        mounted: Mounted,
+        pneumatics: Pneumatics,
+        randomisation: Randomisation,
+        samples: int,
+        device: torch.device,
+    ):
+        """`samples` is the number K of centreline points."""
+        spec = mounted.model.spec
+        if spec.unit != "kPa":
+            raise InputError(f"arm '{name}' is driven in {spec.unit}, expected a model in kPa")
+        start = spec.rest if mounted.start_kPa is None else mounted.start_kPa
+        if len(start) != spec.chambers:
+            raise InputError(
+                f"arm '{name}': {len(start)} pressures to start with, expected {spec.chambers}"
+            )
+        self.name, self.device, self.vary = name, device, randomisation
+        self.chambers, self.key_points = spec.chambers, spec.key_points
+        self.model = mounted.model.to(device)
+        self.backbone = self.model.backbone(samples)
+        # A model of commanded pressure has the pumps' lag in it already.
+        late = spec.actuation == "measured"
+        self.pneumatics = pneumatics if late else replace(pneumatics, tau_s=0.0)
+        row = {"dtype": torch.float32, "device": device}
+        self.low, self.high = torch.tensor(spec.low, **row), torch.tensor(spec.high, **row)
+        self.first = torch.tensor(start, **row)
+        self.pose = mounted.pose.to(**row)
+        self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
+        self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
+
+    def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
+        """Arms at the start of an episode, each with the parameters that its stream draws."""
+        vary, m, count = self.vary, self.chambers, len(stream.key)
+        stream, share = stream.uniform(0.0, 1.0, vary.history, m)
+        stream, spread = stream.uniform(-1.0, 1.0, m)
+        stream, normal = stream.normal(m)
+        stream, turn = stream.normal(6)
+        stream, late = stream.uniform(0.0, vary.delay + 1.0)
+        gain = 1.0 + vary.gain * normal
+        pressure = (self.first + vary.start_kPa * spread).clamp(self.low, self.high)
+        passed = (self.low + (self.high - self.low) * share).unbind(1)
+        state = self.model.initial_state(count)
+        for target in (*passed, pressure):
+            state, points = self.model.step(state, gain * target - state.pressure, 1.0)
+        mount = self._moved(turn)
+        points = frames.apply(mount, points)
+        part = ArmPart(
+            command=pressure,
+            pressure=pressure,
+            queue=pressure.new_zeros(count, vary.delay, m),
+            delay=late.long().clamp(max=vary.delay),
+            gain=gain,
+            mount=mount,
+            arm=state,
+            points_mm=points,
+            line_mm=self._line(points, mount),
+            tip_direction=self.backbone.tip_direction(points),
+            seen_mm=points,
+            seen_kPa=pressure,
+            offset_mm=torch.zeros_like(points),
+        )
+        return self._measured(stream, part)
+
+    def step(
+        self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
+    ) -> tuple[Stream, ArmPart]:
+        """One step with changes of pressure (B, m), kPa, asked for now."""
+        queue, action = self._due(part, action)
+        command = self.pneumatics.command(part.command, action, self.low, self.high)
+        pressure = self.pneumatics.follow(part.pressure, command, dt_s)
+        state, points = self.bent(part, pressure, dt_s)
+        part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
+        return self._measured(stream, self.posed(part, points))
+
+    def foresee(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """Key points (B, n, 3) mm, world frame, if the chambers had (B, m) kPa a step from now.
+
+        Differentiable by the pressure; knows the episode's true gain, mount and memory.
+        """
+        return self.bent(part, pressure, dt_s)[1] + part.offset_mm
+
+    def settled(self, pressure: Tensor) -> Tensor:
+        """Key points (B, n, 3) mm, world frame, nominal mount: (B, m) kPa held since ever.
+
+        What the model gives without any change of pressure before; its memory adds to that.
+        """
+        state = self.model.initial_state(len(pressure), pressure)
+        _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
+        return frames.apply(self.pose, points)
+
+    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
+        """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
+        state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
+        return state, frames.apply(part.mount, points)
+
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The part with its body where the key points (B, n, 3) mm, world frame, are."""
+        return replace(
+            part,
+            points_mm=points_mm,
+            line_mm=self._line(points_mm, part.mount),
+            tip_direction=self.backbone.tip_direction(points_mm),
+        )
+
+    def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
+        """Lowest and highest pressure (B, m) kPa that the chambers can have a step from now."""
+        pump = self.pneumatics
+        ends = [
+            pump.follow(
+                part.pressure, pump.command(part.command, change, self.low, self.high), dt_s
+            )
+            for change in (
+                part.command.new_tensor(-pump.step_kPa),
+                part.command.new_tensor(pump.step_kPa),
+            )
+        ]
+        return ends[0], ends[1]
+
+    def action_for(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """(B, m) kPa: the action after which the chambers have `pressure` (B, m), if in reach."""
+        return self.pneumatics.action_for(part.command, part.pressure, pressure, dt_s)
+
+    def _due(self, part: ArmPart, action: Tensor) -> tuple[Tensor, Tensor]:
+        """The queue with this action in it, and the action that is due now."""
+        queue = torch.cat((part.queue, action[:, None]), 1)
+        place = (self.vary.delay - part.delay)[:, None, None].expand(-1, 1, self.chambers)
+        return queue[:, 1:], queue.gather(1, place)[:, 0]
+
+    def _line(self, points: Tensor, mount: Tensor) -> Tensor:
+        line = self.backbone.centreline(points)
+        return torch.cat((frames.apply(mount, self.shaft), line), 1) if len(self.shaft) else line
+
+    def _moved(self, normal: Tensor) -> Tensor:
+        """(B, 4, 4) mounts moved by (B, 6) standard normals: three shifts, three turns."""
+        turn = self.vary.mount_rad * normal[:, 3:]
+        rotation = frames.rotation_from_axis_angle(turn, frames.norm(turn))
+        return self.pose @ frames.pose_from(rotation, self.vary.mount_mm * normal[:, :3])
+
+    def _measured(self, stream: Stream, part: ArmPart) -> tuple[Stream, ArmPart]:
+        vary = self.vary
+        if vary.noise_mm == 0.0 and vary.noise_kPa == 0.0:
+            return stream, replace(part, seen_mm=part.points_mm, seen_kPa=part.pressure)
+        stream, points = stream.normal(self.key_points, 3)
+        stream, pressure = stream.normal(self.chambers)
+        seen_mm = part.points_mm + vary.noise_mm * points
+        seen_kPa = part.pressure + vary.noise_kPa * pressure
+        return stream, replace(part, seen_mm=seen_mm, seen_kPa=seen_kPa)

@@ -1,0 +1,91 @@
+"""`surgisoft collect` from the command line: what it writes, says and refuses."""
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.rig.hidden import HIDDEN
+
+
+def test_collects_writes_and_says_one_line(tmp_path, capsys):
+    out = tmp_path / "r.csv"
+    args = ["collect", "mixed", "-o", str(out), "--points", "200", "--seed", "3"]
+    args += ["--hidden", "creep", "--strength", "0.5", "--hidden", "thermal_drift"]
+    args += ["--strength", "1", "--payload-g", "2", "--gravity", "0", "0", "1"]
+    assert run(args) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1
+    assert "200 continuous samples" in lines[0]
+    assert "hidden creep 0.5" in lines[0]
+    recording = load_recording(out)
+    assert recording.samples == 200
+    assert (recording.payload_g == 2.0).all()
+    np.testing.assert_allclose(recording.gravity, [0, 0, 1])
+    assert recording.temp_C is not None
+    assert "creep" not in out.with_suffix(".toml").read_text()  # hidden stays hidden
+
+
+def test_same_seed_same_file_other_take_other_data(tmp_path):
+    files = [tmp_path / f"{k}.parquet" for k in range(3)]
+    for file, take in zip(files, "001", strict=True):
+        args = ["collect", "validation", "-o", str(file), "--points", "20", "--take", take]
+        assert run(args) == 0
+    one, again, other = (load_recording(file) for file in files)
+    np.testing.assert_array_equal(one.key_points_mm, again.key_points_mm)
+    assert (one.commanded != other.commanded).any()
+    assert (one.key_points_mm != other.key_points_mm).all()
+
+
+def test_a_schedule_of_ones_own(tmp_path):
+    plan, out = tmp_path / "plan.csv", tmp_path / "r.parquet"
+    plan.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,9,0,0\n2,9,3,0\n")
+    assert run(["collect", str(plan), "-o", str(out)]) == 0
+    recording = load_recording(out)
+    assert recording.samples == 40
+    np.testing.assert_allclose(recording.commanded[20], [9, 0, 0], atol=1e-9)
+
+
+def test_lists(capsys):
+    assert run(["collect", "--list-hidden"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(HIDDEN)
+    assert run(["collect", "--list-protocols"]) == 0
+    assert "grid" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["gird"], "unknown protocol 'gird'"),
+        (["mixed", "--hidden", "crep"], "unknown hidden effect 'crep': known are breathing,"),
+        (["mixed", "--hidden", "creep", "--strength", "-1"], "strength of 'creep' is -1.0"),
+        (
+            ["mixed", "--hidden", "creep", "--hidden", "drift", "--strength", "1"],
+            "2 --hidden and 1",
+        ),
+        (["mixed", "--strength", "1"], "0 --hidden and 1 --strength"),
+        (["mixed", "--points", "2"], "--points is 2"),
+        (["mixed", "--payload-g", "99"], "payload is 99.0 g"),
+        (["mixed", "--gravity", "0", "0", "0"], "gravity is [0.0, 0.0, 0.0]"),
+        (["mixed", "--noise-scale", "-1"], "noise scale is -1.0"),
+        (["none.csv"], "cannot read the schedule"),
+    ],
+)
+def test_bad_input_is_one_line_exit_2_and_nothing_written(tmp_path, capsys, args, says):
+    out = tmp_path / "r.parquet"
+    assert run(["collect", *args, "-o", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_refuses_to_overwrite_and_unknown_suffixes_before_working(tmp_path, capsys):
+    out = tmp_path / "r.parquet"
+    out.write_text("mine")
+    assert run(["collect", "grid", "-o", str(out)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    assert run(["collect", "grid", "-o", str(tmp_path / "r.xlsx")]) == 2
+    assert "expected .csv or .parquet" in capsys.readouterr().err

@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_json, write_text
+from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import read_recordings, under_weight
 from surgisoft.cli.options import Force, JsonFile, Model
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
 """Chambers and unit of the arm that the virtual rig has."""
@@ -66,7 +67,7 @@ def next_experiment(
         answer = recommend(problem, rivals or likely_rivals(problem), minutes, settings)
     else:
         answer = propose(arm, rivals, minutes, settings)
-    write_text(output, schedule_text(answer.protocol))
+    write_atomically(output, schedule_text(answer.protocol))
     if json_file:
         write_json(json_file, answer.to_json())
     _show(answer, arm.spec, model, recordings or [], output)

@@ -8,7 +8,8 @@ from pathlib import Path
 from benchmarks.cache import Kept, Meter, model_digest
 from benchmarks.control.policies import cost, plan_of, played, trained
 from surgisoft.agents.on_rig import RigConfig
-from surgisoft.tasks.registry import config_table, with_fields
+from surgisoft.config import to_table
+from surgisoft.tasks.registry import with_fields
 
 TASK = "track_circle"
 """What the policies learn."""
@@ -63,7 +64,7 @@ class Drivers:
         about = {
             "plan": told,
             "learned": driver not in ("scripted", "random"),
-            "rig": config_table(rig),
+            "rig": to_table(rig),
             "episodes": self.episodes,
             "seed": self.seed,
         }
@@ -78,7 +79,7 @@ def _told(plan, arm: Path) -> dict:
     """What a policy depends on; the arm by its content, not by its place."""
     return {
         "task": plan.task,
-        "config": config_table(with_fields(plan.task_config, arm=model_digest(arm))),
+        "config": to_table(with_fields(plan.task_config, arm=model_digest(arm))),
         "hyper_parameters": asdict(plan.preset),
         "steps": plan.steps,
         "seed": plan.seed,

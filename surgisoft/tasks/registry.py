@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from surgisoft.config import Where, from_table, read_toml
+from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
@@ -36,19 +36,10 @@ def config_of(task: str) -> Any:
     return CONFIGS[task]
 
 
-def config_table(config: Any) -> Any:
-    """A configuration as dicts, lists, numbers and text, for JSON; a path becomes text."""
-    if dataclasses.is_dataclass(config):
-        return {f.name: config_table(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    if isinstance(config, tuple):
-        return [config_table(item) for item in config]
-    return str(config) if isinstance(config, Path) else config
-
-
 def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
     """The named task's configuration with the fields of a table changed; `file` is for errors."""
     own = config_of(task)
-    whole = _merged(config_table(own), table)
+    whole = merged(to_table(own), table)
     try:
         return from_table(type(own), whole, Where(file, text))
     except InputError as error:
@@ -87,12 +78,6 @@ def _with_fields(config: Any, values: dict[str, Any]) -> tuple[Any, set[str]]:
             changes[field.name], inner = _with_fields(part, values)
             found |= inner
     return dataclasses.replace(config, **changes), found
-
-
-def _merged(base: Any, changes: Any) -> Any:
-    if not (isinstance(base, dict) and isinstance(changes, dict)):
-        return changes
-    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
 
 
 TASKS: dict[str, Callable[..., Task]] = {

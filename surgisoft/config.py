@@ -42,6 +42,21 @@ class Rule:
     holds: typing.Callable[[object], bool]
 
 
+def one_of(names: typing.Iterable[str]) -> Rule:
+    """A text out of a list."""
+    known = tuple(names)
+    return Rule(f"one of {', '.join(known)}", lambda value: value in known)
+
+
+def at_least(least: int) -> Rule:
+    """An integer from this one upwards."""
+    return Rule(f"an integer >= {least}", lambda value: value >= least)
+
+
+POSITIVE = Rule("a number > 0", lambda value: value > 0)
+"""For lengths, times, rates."""
+
+
 @dataclass(frozen=True)
 class Where:
     """A place in a file, for messages."""

@@ -15,7 +15,7 @@ from surgisoft.diagnosis.problem import Problem, pose
 from surgisoft.diagnosis.refinement.effects import fit_effects
 from surgisoft.diagnosis.refinement.intervals import Parameter
 from surgisoft.diagnosis.refinement.network import retune
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 LEAST_FALL = 0.05

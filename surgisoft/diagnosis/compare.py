@@ -13,7 +13,7 @@ from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, 
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 WORST = 5

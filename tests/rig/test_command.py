@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig.hidden import HIDDEN
 
 

@@ -12,7 +12,7 @@ import pytest
 import surgisoft.rig as package
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import ArmInfo, load_recordings, save_recording
+from surgisoft.measurement.recordings import ArmInfo, load_recordings, save_recording
 from surgisoft.rig import Sample, VirtualRig, collect
 from surgisoft.rig.hidden import HIDDEN
 

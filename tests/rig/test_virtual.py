@@ -228,7 +228,7 @@ def test_rig_shares_nothing_with_the_models_it_judges():
             for name in names:
                 assert not name.startswith(("torch", "surgisoft.surrogate", "surgisoft.diagnosis"))
     script = (
-        "import sys, surgisoft.measurement.rig; "
+        "import sys, surgisoft.rig; "
         "print([m for m in sys.modules if m == 'torch' or m.startswith('surgisoft.surrogate')])"
     )
     loaded = subprocess.run(

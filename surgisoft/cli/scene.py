@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import Force, SaveReplay, Screenshot, Web
+from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
@@ -80,6 +80,7 @@ def check(
         Path | None,
         typer.Option("--map", metavar="FILE.png", help="Write a picture of the reachability here."),
     ] = None,
+    effect_files: EffectFiles = None,
 ) -> int:
     """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
     from surgisoft.cli.arms import reaches_of
@@ -105,6 +106,7 @@ def show(
     web: Web = False,
     screenshot: Screenshot = None,
     save: SaveReplay = None,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
     from surgisoft.cli.arms import reaches_of

@@ -61,7 +61,7 @@ COMMANDS = {
     "scene check": "scene check scene",
     "scene show": "scene show scene --save view.rrd",
     "experiment check": "experiment check short.toml",
-    "experiment run": "experiment run short.toml --processes 2 --no-replays -o results",
+    "experiment run": "experiment run short.toml --processes 2 --no-replays -o results --force",
 }
 """What opens a model that holds the effect of the documentation, by command."""
 

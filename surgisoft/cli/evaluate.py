@@ -12,6 +12,7 @@ from surgisoft.cli.inputs import hidden_effects, warn
 from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
+    EffectFiles,
     Hidden,
     JsonFile,
     Replay,
@@ -66,6 +67,7 @@ def evaluate(
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,
+    effect_files: EffectFiles = None,
     json_file: JsonFile = None,
     replay: Replay = None,
     report: Report = None,

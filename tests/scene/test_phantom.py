@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from surgisoft.cli.arms import reaches_of
 from surgisoft.scene.check import check_scene
 from surgisoft.scene.folder import open_scene
+from surgisoft.tasks.world.reach import reaches_of
 
 FOLDER = Path(__file__).resolve().parents[2] / "scenes" / "phantom_liver"
 

@@ -7,10 +7,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, write_text
+from surgisoft.cli.files import check_folder
 from surgisoft.cli.options import EffectFiles, ExperimentFile
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 
 commands = typer.Typer(
     no_args_is_help=True, help="Scripted experiments on a scene: run, check, list."
@@ -164,7 +165,7 @@ def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
     if replays:
         files += _replays(results)
     text = markdown(results)
-    write_text(output / "summary.md", text)
+    write_atomically(output / "summary.md", text)
     print(text)
     return [*files, output / "summary.md"]
 

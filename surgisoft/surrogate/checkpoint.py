@@ -2,8 +2,6 @@
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.resources import as_file, files
@@ -14,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import make_effect, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
@@ -85,9 +84,7 @@ def save_model(
         "effect_files": files_of(model.effects),
         "validation": model.validation,
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         save_file(weights, fresh / "weights.safetensors")
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
@@ -95,21 +92,6 @@ def save_model(
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
         if known is not None:
             known.save(fresh)
-        fresh.chmod(0o755)
-        if folder.exists():
-            for kept in folder.iterdir():
-                if kept.name not in OWN_FILES:
-                    copy = shutil.copytree if kept.is_dir() else shutil.copy2
-                    copy(kept, fresh / kept.name)
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            os.replace(folder, old / "old")
-            os.replace(fresh, folder)
-            shutil.rmtree(old)
-        else:
-            os.replace(fresh, folder)
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
 
 
 def _place(folder: str | Path) -> Path:

@@ -136,7 +136,7 @@ def _rig_config(
     from surgisoft.agents.on_rig import RigConfig
 
     own = RigConfig(seed=specimen or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
-    return own if trust is None else replace(own, trust=trust)
+    return own if trust is None else replace(own, observer_gain=trust)
 
 
 def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | None, scene):

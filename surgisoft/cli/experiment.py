@@ -8,7 +8,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
-from surgisoft.cli.options import ExperimentFile
+from surgisoft.cli.options import EffectFiles, ExperimentFile
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
@@ -45,6 +45,7 @@ def run(
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Play an experiment; write tables, logs, pictures, replays and one HTML report."""
     from surgisoft.experiments.plan import settings
@@ -70,6 +71,7 @@ def run(
 @commands.command("check")
 def check(
     file: ExperimentFile,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Say what an experiment would play; a bad file is one line with its line and field."""
     from surgisoft.experiments.plan import settings

@@ -10,11 +10,11 @@ from surgisoft.diagnosis.comparing.axes import AxisShare, shares
 from surgisoft.diagnosis.comparing.bands import Band, bands
 from surgisoft.diagnosis.comparing.ceiling import Ceiling, ceiling
 from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, repeat_floor
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings import Recording
-from surgisoft.surrogate.model import ArmModel
 
 WORST = 5
 """Worst moments that are listed."""
@@ -84,6 +84,8 @@ class Comparison:
     """Error and bias in bands of every axis."""
     worst: tuple[Moment, ...]
     """The worst moments, each from another stretch of time."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def explainable(self) -> float | None:
@@ -144,8 +146,9 @@ class Comparison:
         return json_safe(values)
 
 
-def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, Residuals]:
-    """Evaluate a model on recordings."""
+def compare(model: Model, recordings: Recordings) -> tuple[Comparison, Residuals]:
+    """Evaluate a model on recordings; both may be given by their paths."""
+    model, recordings, notes = open_inputs(model, recordings)
     rest = residuals(model, recordings)
     square = np.square(rest.error_mm)
     seen = ~np.isnan(square).all(axis=1)
@@ -177,6 +180,7 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
             missing=int((~seen).sum()),
             bands=tuple(bands(rest)),
             worst=tuple(_worst(rest, recordings)),
+            notes=notes,
         ),
         rest,
     )

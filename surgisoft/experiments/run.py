@@ -11,6 +11,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -21,6 +22,7 @@ from surgisoft.experiments.plan import Setting, scene_of, settings
 from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
 from surgisoft.files import write_json
+from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.workers import workers
 
@@ -152,7 +154,8 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
     from concurrent.futures.process import BrokenProcessPool
 
     try:
-        with workers(processes) as pool:
+        prepare = partial(register_effect_files, registered_files())
+        with workers(processes, prepare) as pool:
             waiting = {pool.submit(_play, spec, folder, job): job for job in left}
             for future in as_completed(waiting):
                 future.result()

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -13,7 +14,7 @@ from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects import make_effect, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
 from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
 from surgisoft.surrogate.known_error import KnownError
@@ -69,8 +70,10 @@ def save_model(
 ) -> None:
     """Write the model whole or not at all.
 
-    `report` (JSON-able) and `known`, where the model is known to be off, are kept beside it.
+    `report` (JSON-able) and the training residuals are kept beside it: `known`, or without that
+    those of the model itself.
     """
+    known = model.training_residuals if known is None else known
     folder = claim_folder(folder, force)
     config = {
         "format": FORMAT,
@@ -97,11 +100,22 @@ def _place(folder: str | Path) -> Path:
     return DEFAULT_FOLDER if str(folder) == DEFAULT and not folder.exists() else folder
 
 
-def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmModel:
+def load_model(
+    folder: str | Path | ArmModel,
+    device: str | torch.device = "cpu",
+    effect_files: Iterable[str | Path] = (),
+) -> ArmModel:
     """The model in a folder, ready to evaluate; bit-equal to what was saved.
 
-    `default`, where there is no such folder, is the arm that comes with the package.
+    `default`, where there is no such folder, is the arm that comes with the package. A model that
+    is open already is returned as it is.
+
+    effect_files: files of user-defined effects that the model may hold. They are run, so name only
+    files that you trust.
     """
+    register_effect_files(effect_files)
+    if isinstance(folder, ArmModel):
+        return folder.to(device)
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
@@ -147,11 +161,12 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
         raise InputError(
             f"{folder}: damaged model ({type(error).__name__}: {str(error)[:120]}); fit it again"
         ) from error
+    model.training_residuals = load_known_error(folder)
     return model.to(device).eval().requires_grad_(False)
 
 
 def load_known_error(folder: str | Path) -> KnownError | None:
-    """Where the model in a folder is known to be off; None where that was not kept."""
+    """The training residuals in a model's folder; None where they were not kept."""
     try:
         return KnownError.load(_place(folder))
     except Exception as error:

@@ -12,7 +12,7 @@ import lzma
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -27,6 +27,8 @@ MISSING = ("", "NaN", "nan", "NAN")
 """Texts that mean a missing value."""
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?inf(inity)?", re.I)
 """A number as text files write it, with a decimal point."""
+BLOCK_BYTES = 1 << 20
+"""Text of up to this size is read cell by cell where pyarrow refuses it; more goes in parts."""
 _COMPRESSED = {b"\x1f\x8b": gzip, b"BZh": bz2, b"\xfd7zXZ": lzma}
 
 
@@ -145,7 +147,9 @@ class DelimitedText:
         try:
             columns = self._read(positions, pa.float64())
         except pa.ArrowInvalid:
-            return self._numbers_by_cell(positions)
+            if b'"' in self.body or len(self.body) <= BLOCK_BYTES:
+                return self._numbers_by_cell(positions)
+            return np.concatenate([block.numbers(positions) for block in self._blocks()])
         return np.column_stack([c.to_numpy() for c in columns]).astype(np.float64, copy=False)
 
     def texts(self, position: int) -> list[str]:
@@ -160,6 +164,15 @@ class DelimitedText:
             if index == row:
                 return f"{self.path}, line {line}"
         return f"{self.path}, row {row + 1}"
+
+    def _blocks(self) -> Iterator["DelimitedText"]:
+        """Parts of whole lines, so that only the part with an unusual cell is read by cells."""
+        start, line = 0, self.first_line
+        while start < len(self.body):
+            end = self.body.find(b"\n", start + BLOCK_BYTES // 2) + 1 or len(self.body)
+            block = self.body[start:end]
+            yield replace(self, body=block, first_line=line)
+            start, line = end, line + block.count(b"\n")
 
     def _read(self, positions: Sequence[int], kind: pa.DataType) -> list[pa.ChunkedArray]:
         wanted = [f"f{i}" for i in positions]
@@ -219,7 +232,8 @@ class DelimitedText:
         if not NUMBER.fullmatch(text):
             raise InputError(
                 f"{self.path}, line {line}, column {label(self.names, position)}: "
-                f"got {cell.strip()[:40]!r}, expected a number "
-                "(a missing value is an empty cell or NaN)"
+                f"got {cell.strip()[:40]!r}, expected a number"
+                + " (a missing value is an empty cell or NaN)"
+                * bool(self.missing)
             )
         return float(text)

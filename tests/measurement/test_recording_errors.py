@@ -211,3 +211,18 @@ def test_what_is_no_file(tmp_path):
         load_recording(tmp_path)
     with pytest.raises(InputError, match="no recording given"):
         load_recordings([])
+
+
+def test_one_unusual_cell_far_down_is_read_with_its_neighbours(tmp_path):
+    path = tmp_path / "long.csv"
+    rows = np.column_stack([np.arange(60_000.0), np.zeros((60_000, 4))])
+    lines = [",".join(f"{x:.6f}" for x in row) for row in rows]
+    lines[50_000] = lines[50_000].replace(",0.000000", ", 7. ", 1)
+    path.write_text("\n".join([HEAD, *lines]))
+    assert path.stat().st_size > 2**21
+    measured = load_recording(path, lambda _: None).measured[:, 0]
+    assert np.flatnonzero(measured).tolist() == [50_000]
+    assert measured[50_000] == 7.0
+    lines[59_000] = "59000,1,2,3"
+    path.write_text("\n".join([HEAD, *lines]))
+    assert "long.csv, line 59002: 4 cells, expected 5 as in the header" in error_of(path)

@@ -24,8 +24,8 @@ from surgisoft.errors import InputError
 from surgisoft.rig import VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import Arm, ArmPart
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.random_streams import Stream
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class RigArm:
     The benches are no part of the state: an episode finds its own by its stream's key.
     """
 
-    def __init__(self, arm: Arm, config: RigConfig, dt_s: float):
+    def __init__(self, arm: ModelArm, config: RigConfig, dt_s: float):
         self.arm, self.config = arm, config
         rig = VirtualRig(config.seed, hidden=config.hidden, noise=config.noise)
         if (rig.chambers, rig.key_planes) != (arm.chambers, arm.key_points):

@@ -63,7 +63,7 @@ def test_without_noise_cameras_see_the_truth(task):
     part = state.world.arms["arm"]
     torch.testing.assert_close(part.seen_mm, part.points_mm)
     # What is foreseen for the present pressure is what is seen: the offset takes the model there.
-    foreseen = task.arm.foresee(part, part.pressure, 1e-3)
+    foreseen = task.arm.predict(part, part.pressure, 1e-3)
     torch.testing.assert_close(foreseen, part.seen_mm, atol=2e-2, rtol=0.0)
 
 

@@ -1,32 +1,102 @@
-"""States are trees of tensors: frozen dataclasses, mappings and tuples, with the batch in front."""
+"""Pytree operations on states: frozen dataclasses, dicts and tuples of tensors, batch in front."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
-from typing import TypeVar
+from dataclasses import Field, dataclass, fields, is_dataclass, replace
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 Tree = TypeVar("Tree")
+Item = TypeVar("Item")
+
+
+class TensorDataclass(Protocol):
+    """A frozen dataclass whose fields are tensors (B, ...) or pytrees of them."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectBatch(Generic[Item]):
+    """One Python object for each of B environments, carried in a state beside its tensors.
+
+    `rows` and `with_rows` select and replace objects as they do rows of tensors; `tree_map` leaves
+    them alone. An object that changes in a step (a simulated rig) is shared by the old state and
+    the new one, so the old state must not be stepped again.
+    """
+
+    items: tuple[Item, ...]
+    """B objects."""
 
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
-    """The tree with `function` applied to each tensor and its counterparts in `others`.
+    """Apply `function` to each tensor of a pytree and its counterparts in `others`.
 
-    What is no tensor (a name, None) is kept as it is in `tree`.
+    A leaf that is no tensor (a name, None, an `ObjectBatch`) is kept as it is in `tree`.
     """
+    return _mapped(function, lambda objects, *_: objects, tree, *others)
+
+
+def rows(tree: Tree, index: Tensor) -> Tree:
+    """The environments at index (R,) int64."""
+
+    def chosen(objects: ObjectBatch) -> ObjectBatch:
+        return ObjectBatch(tuple(objects.items[i] for i in index.tolist()))
+
+    return _mapped(lambda value: value.index_select(0, index), chosen, tree)
+
+
+def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
+    """The pytree with the environments at index (R,) int64 replaced by those of `fresh`.
+
+    Out of place; values are copied, never blended, so a nan that is replaced leaves no trace.
+    """
+
+    def replaced(old: ObjectBatch, new: ObjectBatch) -> ObjectBatch:
+        items = list(old.items)
+        for place, item in zip(index.tolist(), new.items, strict=True):
+            items[place] = item
+        return ObjectBatch(tuple(items))
+
+    def copied(old: Tensor, new: Tensor) -> Tensor:
+        return old.index_copy(0, index, new.to(old.dtype))
+
+    return _mapped(copied, replaced, tree, fresh)
+
+
+def overwritable(tensor: Tensor) -> bool:
+    """Whether PyTorch allows a write here: a tensor made under inference_mode only inside one."""
+    return torch.is_inference_mode_enabled() or not tensor.is_inference()
+
+
+def _mapped(
+    of_tensors: Callable[..., Tensor],
+    of_objects: Callable[..., ObjectBatch],
+    tree: Any,
+    *others: Any,
+) -> Any:
+    """The pytree with one function applied to its tensors and one to its object batches."""
     if isinstance(tree, Tensor):
-        return function(tree, *others)
+        return of_tensors(tree, *others)
+    if isinstance(tree, ObjectBatch):
+        return of_objects(tree, *others)
     if isinstance(tree, dict):
         return {
-            key: tree_map(function, value, *(other[key] for other in others))
+            key: _mapped(of_tensors, of_objects, value, *(other[key] for other in others))
             for key, value in tree.items()
         }
     if isinstance(tree, tuple):
-        return tuple(tree_map(function, *values) for values in zip(tree, *others, strict=True))
-    if is_dataclass(tree):
+        return tuple(
+            _mapped(of_tensors, of_objects, *values) for values in zip(tree, *others, strict=True)
+        )
+    if is_dataclass(tree) and not isinstance(tree, type):
         parts = {
-            field.name: tree_map(
-                function,
+            field.name: _mapped(
+                of_tensors,
+                of_objects,
                 getattr(tree, field.name),
                 *(getattr(other, field.name) for other in others),
             )
@@ -34,16 +104,3 @@ def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree
         }
         return replace(tree, **parts)
     return tree
-
-
-def rows(tree: Tree, index: Tensor) -> Tree:
-    """The environments at index (R,) int64."""
-    return tree_map(lambda value: value.index_select(0, index), tree)
-
-
-def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
-    """The tree with the environments at index (R,) int64 replaced by those of `fresh`.
-
-    Out of place, and nothing is blended: a nan that is replaced is gone.
-    """
-    return tree_map(lambda old, new: old.index_copy(0, index, new.to(old.dtype)), tree, fresh)

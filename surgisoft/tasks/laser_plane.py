@@ -40,7 +40,7 @@ class LaserPlaneConfig:
 def laser_plane(
     config: LaserPlaneConfig | None = None, device: str | torch.device = "cpu"
 ) -> Follow:
-    """A circle of 20 mm diameter on a plane 40 mm beyond the tip."""
+    """The beam of one arm follows a circle of 20 mm diameter on a plane 40 mm beyond the tip."""
     config = config or LaserPlaneConfig()
     world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
     start = points_at_start(world)

@@ -32,12 +32,12 @@ SQUARE = TrackConfig(FollowConfig(path="square", size_mm=15.0))
 
 
 def track_circle(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
-    """A circle of 20 mm diameter."""
+    """The tip of one arm follows a circle of 20 mm diameter."""
     return _track("track_circle", config or TrackConfig(), device)
 
 
 def track_square(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
-    """A square of 15 mm edge."""
+    """The tip of one arm follows a square of 15 mm edge."""
     return _track("track_square", config or SQUARE, device)
 
 
@@ -46,7 +46,7 @@ TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_ST
 
 
 def tip(points_mm: Tensor) -> Tensor:
-    """(B, 3) mm: the last of the key points (B, n, 3) mm."""
+    """(B, 3) mm: the tip, which is the last of the key points (B, n, 3) mm."""
     return points_mm[:, -1]
 
 

@@ -1,5 +1,7 @@
 """PettingZoo's and Gymnasium's own checkers, and what they do not check."""
 
+import copy
+import pickle
 import warnings
 
 import gymnasium
@@ -194,3 +196,39 @@ def test_wrong_use_is_one_line():
         env.step({"arm": np.zeros(2)})
     with pytest.raises(InputError, match="step before reset"):
         SingleEnv("track_circle").step(np.zeros(3))
+
+
+@every_task
+@pytest.mark.parametrize("geometry", ["fcl", "batched"])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copied_environment_goes_on_as_the_original(name, geometry, copied):
+    """In the middle of an episode; SuperSuit and AsyncVectorEnv copy environments."""
+    env = parallel_env(name, geometry=geometry)
+    env.reset(seed=5)
+    push = {agent: np.full(3, 1.5, np.float32) for agent in env.agents}
+    for _ in range(3):
+        env.step(push)
+    other = copied(env)
+    for _ in range(3):
+        for one, two in zip(env.step(push), other.step(push), strict=True):
+            for agent in push:
+                np.testing.assert_array_equal(one[agent], two[agent])
+
+
+def test_gymnasium_takes_the_arm_and_refuses_what_it_does_not_know(tmp_path):
+    env = gymnasium.make("surgisoft/track_circle-v0", arm="default", geometry="batched")
+    plain = gymnasium.make("surgisoft/track_circle-v0")
+    np.testing.assert_array_equal(env.reset(seed=4)[0], plain.reset(seed=4)[0])
+    many = gymnasium.make_vec("surgisoft/keyhole-v0", num_envs=2, geometry="fcl")
+    assert isinstance(many.unwrapped._adapter.task.world.scene.collision, RefereedScene)
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(InputError, match="no arm model there"):
+            make("surgisoft/track_circle-v0", arm=tmp_path / "none")
+        with pytest.raises(InputError, match="this task has no scene"):
+            make("surgisoft/track_circle-v0", scene=tmp_path)
+        with pytest.raises(TypeError, match="arms"):
+            make("surgisoft/track_circle-v0", arms="default")
+    with pytest.raises(TypeError, match="num_env"):
+        BatchedEnv("track_circle", num_env=3)
+    with pytest.raises(InputError, match="num_envs is 0"):
+        BatchedEnv("track_circle", 0)

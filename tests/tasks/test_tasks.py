@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,12 +19,19 @@ from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.inverse_kinematics import least_squares
 from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane, on_plane
 from surgisoft.tasks.path_following import FollowConfig, FollowWeights
-from surgisoft.tasks.registry import TASKS, make_task
+from surgisoft.tasks.registry import (
+    TASKS,
+    config_from,
+    config_of,
+    config_table,
+    make_task,
+    read_config,
+)
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
 from surgisoft.tasks.trajectories.closed_path import circle, square
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.pytree import rows, tree_map
+from surgisoft.tasks.world.pytree import ObjectBatch, rows, tree_map, with_rows
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import WorldConfig
 
@@ -381,3 +389,87 @@ def test_another_arm_model_takes_the_default_ones_place(name, tmp_path):
         assert task.world.arms[agent].key_points == 6
     with pytest.raises(InputError, match="no arm model there"):
         make_task(name, kind(FollowConfig(arm="no/arm")) if kind else CircleAblationConfig(arm="x"))
+
+
+def reward_terms(name, config=None):
+    """Weighted terms of one random step, agent -> term -> (B,)."""
+    episodes = Episodes(make_task(name, config))
+    state = episodes.seeded(2, 3)
+    _, outcome = episodes.step(state, random_actions(episodes.task, 3, 0))
+    return outcome.terms
+
+
+@every_task
+def test_a_weight_scales_its_reward_term_and_no_other(name):
+    """Each weight trebled in turn; 0 leaves the term out."""
+    usual, own = reward_terms(name), config_table(config_of(name))
+    tables = {"follow": own["follow"]} if "follow" in own else {"": own}
+    ((part, table),) = tables.items()
+    for agent, terms in usual.items():
+        weights = table["weights"].get(agent, table["weights"])
+        term = next(iter(terms))
+        for factor in (3.0, 0.0):
+            change = {term: factor * weights[term]}
+            change = {agent: change} if agent in table["weights"] else change
+            change = {"weights": change}
+            config = config_from(name, {part: change} if part else change, Path("x.toml"))
+            changed = reward_terms(name, config)[agent]
+            assert (term in changed) == (factor != 0.0)
+            for other, value in changed.items():
+                torch.testing.assert_close(
+                    value, terms[other] * (factor if other == term else 1.0), rtol=1e-6, atol=1e-6
+                )
+
+
+def test_rewards_of_the_keyhole_by_hand():
+    """3 for each target reached, -1 for contact, as before the weights had names."""
+    weights = config_of("keyhole").weights
+    assert (weights.way, weights.near, weights.visits, weights.contact) == (1.0, 1.0, 3.0, -1.0)
+
+
+def test_field_names_of_earlier_versions_are_accepted(tmp_path):
+    file = tmp_path / "old.toml"
+    file.write_text(
+        "[follow]\nrecall = 0\nforesight = false\nfine_weight = 0.25\n"
+        "[world.scenery]\ngeometry = 'fcl'\n"
+    )
+    config = read_config("track_square", file)
+    follow = config.follow
+    assert (follow.history_steps, follow.one_step_prediction) == (0, False)
+    assert follow.weights == FollowWeights(track=1.0, fine=0.25)
+    assert config.world.scene_engine.geometry == "fcl"
+    assert follow.path == "square", "the task's own default stays"
+    file.write_text("[follow]\nrecal = 0\n")
+    with pytest.raises(InputError, match=r"old\.toml.*recal"):
+        read_config("track_square", file)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[follow.weights]\nfine = nan\n", "finite"),
+        ("[follow.weights]\nfine = 0.0\ntrack = 0.0\n", "all reward weights are 0"),
+        ("[follow.weights]\nspeed = 1.0\n", "speed"),
+    ],
+)
+def test_wrong_weights_are_one_line(text, says, tmp_path):
+    file = tmp_path / "weights.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=says) as caught:
+        read_config("track_circle", file)
+    assert "\n" not in str(caught.value)
+    assert "weights.toml" in str(caught.value)
+
+
+def test_objects_of_a_state_are_selected_and_replaced_with_its_rows():
+    """An arm on a rig keeps a simulated plant for each environment beside its tensors."""
+    part = track_circle().world.start(streams(0, 3)).arms["arm"]
+    a, b, c, d = (object() for _ in "abcd")
+    part = replace(part, plant=ObjectBatch((a, b, c)))
+    index = torch.tensor([2, 0])
+    assert rows(part, index).plant.items == (c, a)
+    fresh = replace(rows(part, torch.tensor([1])), plant=ObjectBatch((d,)))
+    changed = with_rows(part, torch.tensor([1]), fresh)
+    assert changed.plant.items == (a, d, c)
+    assert part.plant.items == (a, b, c)
+    assert tree_map(torch.clone, part).plant is part.plant

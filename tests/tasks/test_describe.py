@@ -54,7 +54,8 @@ def test_indices_and_scales_by_hand():
     missing = seen[target.first : target.last + 1].sinh()
     torch.testing.assert_close(missing + part.seen_mm[0, -1], task.route_mm(state)[0, -1])
     command = seen[places["command"].first : places["command"].last + 1]
-    torch.testing.assert_close(20.0 * (command + 1.0), part.command[0])
+    low, high = torch.tensor(task.arm.model.spec.low), torch.tensor(task.arm.model.spec.high)
+    torch.testing.assert_close(low + (high - low) * (command + 1.0) / 2.0, part.command[0])
 
 
 def test_another_config_is_described_as_it_is():

@@ -18,7 +18,6 @@ from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
 
@@ -144,9 +143,9 @@ class ArmPart:
     """(B, m) kPa: chamber pressure as measured."""
     offset_mm: Tensor
     """(B, n, 3) mm: known difference of the key points from the model's; 0 in simulation."""
-    plant: ObjectBatch[Any] | None = None
-    """The plant of each environment where a simulated rig moves the arm; None where the model does.
-    Resets and row selections carry it like any tensor of the state."""
+    plant: Any = None
+    """State of the plants where simulated rigs move the arm, a pytree with `Objects` in it;
+    None where the model moves it. Resets and row selections carry it like any tensor."""
 
     @property
     def tip_mm(self) -> Tensor:

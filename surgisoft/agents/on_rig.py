@@ -26,7 +26,7 @@ from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import Arm, ArmPart
-from surgisoft.tasks.world.pytree import Objects
+from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random import Stream
 
 
@@ -78,7 +78,7 @@ class RigPlant:
     that hold the same rig only the later one is true.
     """
 
-    rigs: Objects[SimulatedRig]
+    rigs: ObjectBatch[SimulatedRig]
     """The B rigs."""
     target_kPa: Tensor
     """(B, m) kPa: pressures that were commanded last."""
@@ -132,7 +132,7 @@ class RigArm:
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Rigs at rest that then went through random pressures, at the start of an episode."""
         trials = zip(stream.key.tolist(), stream.count.tolist(), strict=True)
-        rigs = Objects(self._fresh(key, count) for key, count in trials)
+        rigs = ObjectBatch(tuple(self._fresh(key, count) for key, count in trials))
         salt = zlib.crc32(f"history {self.name}".encode())
         own = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
         _, share = own.uniform(0.0, 1.0, self.vary.history, self.chambers)
@@ -142,7 +142,7 @@ class RigArm:
         part = replace(
             part,
             gain=torch.ones_like(part.gain),
-            arm=self.model.initial_state(len(rigs)),
+            arm=self.model.initial_state(len(rigs.items)),
             plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
         )
         for target in (*passed, first):
@@ -201,7 +201,7 @@ class RigArm:
     def _read(self, part: ArmPart, target: Tensor) -> tuple[ArmPart, Reading]:
         """One period of the rigs towards pressures (B, m) kPa; the model goes along."""
         rows = []
-        for rig, asked in zip(part.plant.rigs.things, target.double().cpu().numpy(), strict=True):
+        for rig, asked in zip(part.plant.rigs.items, target.double().cpu().numpy(), strict=True):
             rig.command(np.clip(asked, *rig.limits.T))
             sample, truth = rig.read_beside_truth()
             rows.append((sample.measured, sample.key_points_mm, truth.noise_free_mm[0]))

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cache import Report
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.evaluate import evaluate
 from surgisoft.agents.on_rig import RigConfig, on_rig
-from surgisoft.agents.policies import open_driver
+from surgisoft.agents.policies import open_policy
 from surgisoft.agents.presets import Plan, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.agents.training import resume, train_new
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 
@@ -52,7 +52,7 @@ def plan_of(
     return Plan(task, config, preset, preset_for(preset, task), own, seed=seed)
 
 
-def trained(folder: Path, plan: Plan, report: Report) -> RunFolder:
+def trained(folder: Path, plan: Plan, report: Progress) -> RunFolder:
     """The run of a plan: the one in the folder, finished if it was cut off, or a new one."""
     own, device = Processes(), torch.device("cpu")
 
@@ -85,7 +85,7 @@ def played(
     seed: int,
     rig: RigConfig | None = None,
     arm: Path | None = None,
-    report: Report = lambda done, total, note: None,
+    report: Progress = lambda done, total, note: None,
 ) -> dict[str, dict]:
     """What a driver's episodes brought: name with unit -> fields of `Summary`; FCL is the referee.
 
@@ -97,7 +97,7 @@ def played(
     place = make_task(task, config)
     if rig is not None:
         place = on_rig(place, rig)
-    opened = open_driver(driver, place)
+    opened = open_policy(driver, place)
     found = evaluate(
         place, driver, opened, episodes, seed, progress=lambda d, t: report(d, t, "playing")
     )

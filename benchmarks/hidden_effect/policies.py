@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.cache import Kept, Meter, model_digest
+from benchmarks.cache import Cache, model_digest
 from benchmarks.control.policies import cost, plan_of, played, trained
 from surgisoft.agents.on_rig import RigConfig
+from surgisoft.progress import Stages
 from surgisoft.tasks.registry import config_table, with_fields
 
 TASK = "track_circle"
@@ -22,7 +23,7 @@ TRAIN, PLAY = 100, 8
 class Drivers:
     """How policies are trained, and the rig that drivers are played on."""
 
-    kept: Kept
+    kept: Cache
     """Where policies and results are kept."""
     specimen: int
     """Seed of the arm's casting."""
@@ -36,7 +37,7 @@ class Drivers:
     """Episodes of each driver."""
 
     def on_model(
-        self, title: str, arm: Path, meter: Meter, names: tuple[str, ...]
+        self, title: str, arm: Path, meter: Stages, names: tuple[str, ...]
     ) -> tuple[dict[str, dict], dict]:
         """Drivers that know the arm by the model in a folder: NAME/SIGHT -> fields of `Summary` of
         the episodes' mean errors [mm], and the `Cost` of the policy.

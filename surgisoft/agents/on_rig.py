@@ -101,8 +101,9 @@ class Reading:
 class RigArm:
     """An arm of the world whose plant is a batch of rigs; see `Arm` for each attribute and method.
 
-    Predictions (`foresee`, `settled`) come from the arm's model within the rig's pressure limits.
-    Holds no state: the rigs are in `ArmPart.plant`.
+    Predictions (`foresee`, `settled`) and the range by which observations are scaled (`low`,
+    `high`) are those of the simulated arm, on which policies were trained; commands are held within
+    the rig's limits besides (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
     """
 
     def __init__(self, arm: Arm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig):
@@ -121,8 +122,9 @@ class RigArm:
             )
         self.period_s = rig.period_s
         low, high = (torch.tensor(end).to(arm.low) for end in rig.limits.T)
-        self.simulated = _limited(arm, low, high)
-        arm = self.simulated
+        self.lowest = torch.maximum(arm.low, low)
+        self.highest = torch.minimum(arm.high, high)
+        self.simulated = arm
         self.name, self.device, self.vary = arm.name, arm.device, arm.vary
         self.chambers, self.key_points = arm.chambers, arm.key_points
         self.model, self.backbone, self.pneumatics = arm.model, arm.backbone, arm.pneumatics
@@ -137,8 +139,8 @@ class RigArm:
         own = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
         _, share = own.uniform(0.0, 1.0, self.vary.history, self.chambers)
         stream, part = self.simulated.start(stream)
-        first = part.pressure
-        passed = (self.low + (self.high - self.low) * share).unbind(1)
+        first = torch.minimum(torch.maximum(part.pressure, self.lowest), self.highest)
+        passed = (self.lowest + (self.highest - self.lowest) * share).unbind(1)
         part = replace(
             part,
             gain=torch.ones_like(part.gain),
@@ -161,7 +163,7 @@ class RigArm:
         """
         target = part.plant.target_kPa.to(action)
         shift = part.command - target
-        target = self.pneumatics.command(target, action, self.low, self.high)
+        target = self.pneumatics.command(target, action, self.lowest, self.highest)
         expected = self.pneumatics.follow(part.pressure, target + shift, dt_s)
         for _ in range(self.reads):
             part, reading = self._read(part, target)
@@ -233,13 +235,6 @@ class RigArm:
             plant = replace(plant, drift_mm=drift)
         part = self.posed(part, frames.apply(part.mount, reading.true_mm))
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
-
-
-def _limited(arm: Arm, low: Tensor, high: Tensor) -> Arm:
-    """The arm within pressures low, high (m,) kPa besides its own."""
-    limited = copy.copy(arm)
-    limited.low, limited.high = torch.maximum(arm.low, low), torch.minimum(arm.high, high)
-    return limited
 
 
 def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtual_rig) -> Task:

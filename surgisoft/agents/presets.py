@@ -1,4 +1,4 @@
-"""What training is told: presets, and how long each task is trained."""
+"""Hyper-parameters of training: presets, their changes for each task, and plans of runs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Preset:
     """Activation of the hidden layers, by rsl-rl's name."""
     normalise: bool = False
     """Whether observations are normalised by their running mean and deviation. The tasks' own are
-    of the order of 1, and a normaliser that moves changes the policy below the learner's feet."""
+    of the order of 1, and a moving normaliser changes the policy between two updates."""
     action_kPa: float = 1.0
     """Change of pressure for an output of 1, kPa; the pumps' own limit holds besides."""
     noise: float = 0.5
@@ -89,7 +89,7 @@ STEPS: dict[str, int] = {
     "laser_plane": 4_000_000,
     "circle_ablation": 1_000_000,
 }
-"""Task -> steps that the `fast` preset trains it unless told otherwise."""
+"""Task -> default number of steps of the `fast` preset."""
 PAPER_STEPS = 20_000_000
 """Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
 
@@ -100,8 +100,8 @@ _FOLLOW = {
     "desired_kl": 0.03,
     "evaluate_every": 25,
 }
-"""Following a path each action shows at once what it was worth. Many small minibatches: the number
-of gradient steps decides how finely a path is followed at last."""
+"""Path following: the effect of an action shows at once, so the discount is low. Many small
+minibatches, because the number of gradient steps limits the final accuracy."""
 
 TASK_CHANGES: dict[str, dict] = {
     "track_circle": _FOLLOW,
@@ -118,9 +118,9 @@ TASK_CHANGES: dict[str, dict] = {
 
 
 def preset_for(name: str, task: str, **changes) -> Preset:
-    """The named preset as it suits a task, with some fields changed (None: as it is).
+    """The named preset for a task, with some fields changed (None: unchanged).
 
-    An unknown name answers with the known ones.
+    An unknown name raises an InputError that lists the known ones.
     """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
@@ -130,7 +130,7 @@ def preset_for(name: str, task: str, **changes) -> Preset:
 
 
 def steps_for(name: str, task: str) -> int:
-    """Steps that a preset trains a task unless told otherwise."""
+    """Default number of steps that a preset trains a task."""
     return STEPS.get(task, PAPER_STEPS) if name == "fast" else PAPER_STEPS
 
 

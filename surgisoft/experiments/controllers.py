@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.agents.policies import Driver, open_driver
+from surgisoft.agents.policies import Policy, open_policy
 from surgisoft.errors import InputError
 from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.experiments.spec import NOMINAL, DriverSpec, Experiment
@@ -252,7 +252,7 @@ class Nominal:
     def act(
         self, task: PhasedAblation, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """As for `Driver`."""
+        """As for `Policy`."""
         arms = {
             name: replace(part, mount=task.world.arms[name].pose.expand_as(part.mount))
             for name, part in state.world.arms.items()
@@ -261,12 +261,12 @@ class Nominal:
 
 
 class Hands:
-    """A `Driver`: each phase's hands, asked only where an episode is in that phase."""
+    """A `Policy`: each phase's hands, asked only where an episode is in that phase."""
 
     def __init__(self, spec: Experiment, task: PhasedAblation, policy: str):
         """policy: who acts in phases that say so; a training run must fit the task."""
-        self.policy: Driver = Nominal() if policy == NOMINAL else open_driver(policy, task.base)
-        self.scripted = open_driver("scripted", task)
+        self.policy: Policy = Nominal() if policy == NOMINAL else open_policy(policy, task.base)
+        self.scripted = open_policy("scripted", task)
         self.own: dict[tuple[str, str], Hand] = {}
         for agent in task.agents:
             chambers = task.world.arms[agent].chambers
@@ -279,7 +279,7 @@ class Hands:
     def act(
         self, task: PhasedAblation, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """As for `Driver`."""
+        """As for `Policy`."""
         known: dict[str, dict[str, Tensor]] = {}
         actions = {}
         for agent in task.agents:

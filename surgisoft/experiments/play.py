@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from surgisoft.agents.evaluate import episode_table
-from surgisoft.agents.referee import EpisodeReferee, Verdict
+from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks
 from surgisoft.agents.rollout import Instant, Rollout, rollout
 from surgisoft.experiments.controllers import REASONS, Hands, PhasedAblation
 from surgisoft.experiments.plan import Setting, build_task
@@ -50,14 +50,14 @@ def play_block(
 ) -> Block:
     """Play episodes `first` to `first + count - 1` of a setting."""
     task, hands = opened(spec, setting)
-    judge, recorders = EpisodeReferee(task), _Recorders(task, spec, setting)
+    judge, recorders = ExactChecks(task), _Recorders(task, spec, setting)
 
     def watch(now: Instant) -> None:
         judge(now)
         recorders(now)
 
     played = rollout(task, hands, count, spec.seed, count, progress, watch, first)
-    rows = _rows(task, setting, first, played, judge.verdicts())
+    rows = _rows(task, setting, first, played, judge.checks())
     worst = max(rows, key=badness)["episode"]
     kept = {0, worst} & {row["episode"] for row in rows}
     return Block(rows, {number: recorders.log(number) for number in sorted(kept)})
@@ -95,16 +95,16 @@ class _Recorders:
 
 
 def _rows(
-    task: PhasedAblation, setting: Setting, first: int, played: Rollout, verdicts: list[Verdict]
+    task: PhasedAblation, setting: Setting, first: int, played: Rollout, checks: list[EpisodeCheck]
 ) -> list[Row]:
-    table = episode_table(task, played, verdicts)
+    table = episode_table(task, played, checks)
     for name in DROPPED:
         table.pop(name, None)
     table |= _timings(task, played)
     about: Row = {"setting": setting.label, "case": setting.case.name}
     about |= {"lesion": setting.lesion.name} if setting.lesion else {}
     about |= dict(setting.values)
-    outcomes = _outcomes(task, played, verdicts)
+    outcomes = _outcomes(task, played, checks)
     return [
         about
         | {"episode": first + i, "outcome": outcomes[i]}
@@ -135,13 +135,13 @@ def _longest(on: Tensor) -> Tensor:
     return best
 
 
-def _outcomes(task: PhasedAblation, played: Rollout, verdicts: list[Verdict]) -> list[str]:
+def _outcomes(task: PhasedAblation, played: Rollout, checks: list[EpisodeCheck]) -> list[str]:
     """How each episode ended, in words."""
     reason, where = played.end("reason").tolist(), played.end("reason_phase").tolist()
     names, found = [phase.name for phase in task.phases], []
-    for i, verdict in enumerate(verdicts):
-        if verdict.contact is not None:
-            found.append(f"contact of {verdict.contact.between[0]}, {verdict.contact.between[1]}")
+    for i, check in enumerate(checks):
+        if check.contact is not None:
+            found.append(f"contact of {check.contact.between[0]}, {check.contact.between[1]}")
         elif played.failed[i]:
             found.append("an arm is no longer finite")
         elif reason[i]:

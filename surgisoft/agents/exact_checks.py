@@ -70,7 +70,7 @@ class ExactChecks:
 
     def __init__(self, task: Task):
         """task: one whose world has obstacles, see `has_obstacles`."""
-        around = task.world.surroundings
+        around = task.world.scene
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.checker = Referee(around.geometry.bodies)
         self.beam_mm = around.beam_mm if LASER in task.world.arms else None
@@ -97,7 +97,7 @@ class ExactChecks:
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         notes.steps += 1
-        clearance = world.scenery.clearance
+        clearance = world.scene.clearance
         notes.contact_differs += bool(found) != bool(clearance.collides[row])
         notes.closest.append((float(clearance.least_mm[row]), step, arms))
         notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
@@ -106,7 +106,7 @@ class ExactChecks:
 
     def _look_along(self, notes: _Notes, state: TaskState, row: int, arms) -> None:
         """Compare the beam's exact end with that of the batched geometry."""
-        beam, hit = state.world.arms[LASER], state.world.scenery.hit
+        beam, hit = state.world.arms[LASER], state.world.scene.hit
         origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
         exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=LASER)
         if int(exact.struck) != int(hit.struck[row]):
@@ -131,7 +131,7 @@ class ExactChecks:
 
 def has_obstacles(task: Task) -> bool:
     """Whether there is anything that an arm could touch."""
-    return task.world.surroundings is not None
+    return task.world.scene is not None
 
 
 def contacts_in(checks: list[EpisodeCheck]) -> torch.Tensor:

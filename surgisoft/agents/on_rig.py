@@ -25,9 +25,9 @@ from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import Arm, ArmPart
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import ObjectBatch
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.random_streams import Stream
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,16 @@ class Reading:
 
 
 class RigArm:
-    """An arm of the world whose plant is a batch of rigs; see `Arm` for each attribute and method.
+    """An arm of the world whose plant is a batch of rigs; see `Arm` for its attributes and methods.
 
-    Predictions (`foresee`, `settled`) and the range by which observations are scaled (`low`,
+    Predictions (`predict`, `settled`) and the range by which observations are scaled (`low`,
     `high`) are those of the simulated arm, on which policies were trained; commands are held within
     the rig's limits besides (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
     """
 
-    def __init__(self, arm: Arm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig):
+    def __init__(
+        self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig
+    ):
         """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
         self.config, self.build = config, build
         rig = build(config, 0)
@@ -171,21 +173,13 @@ class RigArm:
         shift = shift + self.config.pump_gain * surprise
         return stream, self._observed(replace(part, command=target + shift), reading)
 
-    def foresee(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
-        """One-step prediction of the key points, see `Arm.foresee`, with the estimated offset."""
-        return self.simulated.foresee(part, pressure, dt_s)
+    def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """One-step prediction of the key points, see `Arm.predict`, with the estimated offset."""
+        return self.simulated.predict(part, pressure, dt_s)
 
     def settled(self, pressure: Tensor) -> Tensor:
         """The model's steady-state key points, see `Arm.settled`."""
         return self.simulated.settled(pressure)
-
-    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float):
-        """The model's state and key points, see `Arm.bent`."""
-        return self.simulated.bent(part, pressure, dt_s)
-
-    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
-        """The part with its body where the key points are, see `Arm.posed`."""
-        return self.simulated.posed(part, points_mm)
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest pressure a step from now, see `Arm.within_reach`."""
@@ -210,7 +204,7 @@ class RigArm:
         columns = (np.stack(column) for column in zip(*rows, strict=True))
         row = {"dtype": torch.float32, "device": self.device}
         reading = Reading(*(torch.tensor(column, **row) for column in columns))
-        model, points = self.bent(part, reading.pressure, self.period_s)
+        model, points = self.simulated.bent(part, reading.pressure, self.period_s)
         plant = replace(part.plant, target_kPa=target)
         part = replace(part, arm=model, points_mm=points, pressure=reading.pressure, plant=plant)
         return part, reading
@@ -233,7 +227,7 @@ class RigArm:
                 now = offset + self.config.observer_gain * surprise
             seen, offset = seen + now, now + drift
             plant = replace(plant, drift_mm=drift)
-        part = self.posed(part, frames.apply(part.mount, reading.true_mm))
+        part = self.simulated.posed(part, frames.apply(part.mount, reading.true_mm))
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
 
 

@@ -141,7 +141,7 @@ def _rolled_out(
     watch: Callable[[Instant], None] | None,
 ) -> Rollout:
     """Episodes `first` to `first + count - 1` side by side; finished ones leave the batch."""
-    runner, device = Episodes(task), task.world.device
+    runner, device = Episodes(task, donate=True), task.world.device
     state = runner.seeded(seed, count, first)
     at = torch.arange(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
@@ -153,7 +153,7 @@ def _rolled_out(
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
         actions = policy.act(task, state, runner.observe(state))
-        state, outcome = runner.step(state, actions, in_place=True)
+        state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
         for name, value in outcome.measures.items():

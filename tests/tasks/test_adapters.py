@@ -64,24 +64,24 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
 def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     """Every clearance and hit of an episode is an answer of that engine, and of no other."""
     env = surgisoft.parallel_env("circle_ablation", geometry=geometry)
-    around, asked = env.task.surroundings, []
+    around, asked = env.task.scene, []
     referee = Referee(around.geometry.bodies)
-    assert isinstance(around.judge, RefereedScene if geometry == "fcl" else BatchedScene)
+    assert isinstance(around.collision, RefereedScene if geometry == "fcl" else BatchedScene)
     for name in ("clearance", "cast"):
-        ask = getattr(around.judge, name)
+        ask = getattr(around.collision, name)
         monkeypatch.setattr(
-            around.judge,
+            around.collision,
             name,
             lambda *a, ask=ask, name=name, **k: asked.append(name) or ask(*a, **k),
         )
     env.reset(seed=3)
     env.step({agent: np.full(3, 2.0, np.float32) for agent in env.agents})
     assert asked.count("clearance") == 2
-    arms, scenery = env._state.world.arms, env._state.world.scenery
+    arms, scene = env._state.world.arms, env._state.world.scene
     shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
     exact = referee.clearance(shapes).least_mm
     near = {"fcl": 1e-4, "batched": 0.5}[geometry]
-    assert scenery.clearance.least_mm.item() == pytest.approx(exact, abs=near)
+    assert scene.clearance.least_mm.item() == pytest.approx(exact, abs=near)
 
 
 def test_scene_and_arm_are_named_in_one_call(tmp_path):

@@ -17,14 +17,14 @@ from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.inverse_kinematics import least_squares
 from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane, on_plane
-from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.path_following import FollowConfig, FollowWeights
 from surgisoft.tasks.registry import TASKS, make_task
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
-from surgisoft.tasks.trajectories import circle, square
+from surgisoft.tasks.trajectories.closed_path import circle, square
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import rows, tree_map
-from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import WorldConfig
 
 
@@ -186,7 +186,7 @@ def test_reward_by_hand():
     terms = task.rewards(replace(state, world=world))["arm"]
     assert terms["track"].item() == pytest.approx(math.exp(-0.3), rel=1e-4)
     assert terms["fine"].item() == pytest.approx(math.exp(-3.0), rel=1e-3)
-    paper = track_circle(TrackConfig(FollowConfig(fine_weight=0.0)))
+    paper = track_circle(TrackConfig(FollowConfig(weights=FollowWeights(fine=0.0))))
     assert set(paper.rewards(Episodes(paper).seeded(0, 1))["arm"]) == {"track"}
 
 
@@ -254,18 +254,18 @@ def test_the_plane_is_where_the_config_says():
     assert (far.centre - near.centre)[2].item() == pytest.approx(25.0, abs=1e-4)
 
 
-def test_the_foreseen_error_is_that_of_a_step_without_action():
-    """Played for real: commands held, the pumps still catching up, chambers turning round."""
+def test_the_predicted_error_is_that_of_a_step_without_action():
+    """Simulated: commands held, pumps still catching up, chambers reversing."""
     task = track_circle()
     episodes = Episodes(task)
     state, _, _ = played(episodes, 64, 20)
-    foreseen = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
+    predicted = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
     after, _ = episodes.step(state, {"arm": torch.zeros(64, 3)})
     tip = after.world.arms["arm"].points_mm[:, -1]
-    torch.testing.assert_close(foreseen, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(predicted, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
 
 
-def test_the_last_steps_are_recalled_newest_first():
+def test_the_history_holds_the_last_steps_newest_first():
     """Pressures by the pumps' lag, movements from the key points; nothing before the episode."""
     task = track_circle()
     episodes = Episodes(task)
@@ -278,14 +278,16 @@ def test_the_last_steps_are_recalled_newest_first():
         tips.append(part.points_mm[:, -1])
         state, _ = episodes.step(state, {"arm": torch.full((5, 3), action)})
     tips.append(state.world.arms["arm"].points_mm[:, -1])
-    recalled = episodes.observe(state)["arm"][:, -13:-1]
+    history = episodes.observe(state)["arm"][:, -13:-1]
     by_hand = (changes[2], changes[1], tips[3] - tips[2], tips[2] - tips[1])
-    torch.testing.assert_close(recalled, torch.cat(by_hand, 1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(history, torch.cat(by_hand, 1), rtol=0, atol=1e-4)
     anew = episodes.reset(state, torch.tensor([True] + 4 * [False]))
     kept = episodes.observe(anew)["arm"][:, -13:-1]
     assert not kept[0].any()
-    assert torch.equal(kept[1:], recalled[1:])
-    without = Episodes(track_circle(TrackConfig(FollowConfig(recall=0, foresight=False))))
+    assert torch.equal(kept[1:], history[1:])
+    without = Episodes(
+        track_circle(TrackConfig(FollowConfig(history_steps=0, one_step_prediction=False)))
+    )
     plain, own = (play.observe(play.seeded(2, 5))["arm"] for play in (without, episodes))
     assert torch.equal(plain, torch.cat((own[:, :27], own[:, 30:-13], own[:, -1:]), 1))
 
@@ -304,8 +306,8 @@ def test_noise_is_seen_but_not_scored():
     assert (part.seen_kPa - part.pressure).std().item() == pytest.approx(0.3, rel=0.1)
     error = noisy.observe(a)["arm"][:, 12:15].sinh() - plain.observe(b)["arm"][:, 12:15].sinh()
     assert error.std().item() == pytest.approx(0.5, rel=0.05)
-    foreseen, truly = (e.observe(s)["arm"][:, 27:30].sinh() for e, s in ((noisy, a), (plain, b)))
-    assert (0.1 * (foreseen - truly)).std().item() == pytest.approx(0.5, rel=0.05)
+    predicted, truly = (e.observe(s)["arm"][:, 27:30].sinh() for e, s in ((noisy, a), (plain, b)))
+    assert (0.1 * (predicted - truly)).std().item() == pytest.approx(0.5, rel=0.05)
 
 
 def test_randomised_mounts_and_gains_have_the_asked_spread():
@@ -352,7 +354,7 @@ def test_the_script_is_the_same_for_one_and_for_many():
         (lambda: FollowConfig(path="star"), "star.*circle.*square"),
         (lambda: FollowConfig(size_mm=-1.0), "size_mm is -1.0"),
         (lambda: FollowConfig(loop_s=math.nan), "loop_s is nan"),
-        (lambda: FollowConfig(recall=-1), "recall is -1"),
+        (lambda: FollowConfig(history_steps=-1), "history_steps is -1"),
         (lambda: LaserPlaneConfig(distance_mm=0.0), "distance_mm is 0.0"),
         (lambda: TrackBodyConfig(slow_s=0.0), "slow_s is 0.0"),
     ],

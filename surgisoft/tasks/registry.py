@@ -121,13 +121,15 @@ def with_present_names(config: Any, table: Any) -> Any:
     """
     if not isinstance(table, dict):
         return table
-    former, result = getattr(config, "FORMER_NAMES", {}), {}
+    former, moved, result = getattr(config, "FORMER_NAMES", {}), {}, {}
     for name, value in table.items():
-        for part in reversed(former.get(name, name).split(".")[1:]):
-            value = {part: value}
-        present = former.get(name, name).split(".")[0]
-        both = (result[present], value) if name not in former else (value, result.get(present))
-        result[present] = _merged(*both) if present in result else value
+        if name in former:
+            for part in reversed(former[name].split(".")):
+                value = {part: value}
+            moved = _merged(moved, value)
+        else:
+            result[name] = value
+    result = _merged(moved, result)
     known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     return {
         name: with_present_names(known[name], value)

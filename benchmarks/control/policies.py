@@ -1,4 +1,4 @@
-"""Policies for studies: trained into a folder once, gone on with if cut off; drivers played."""
+"""Policies of benchmarks: trained into a folder once, resumed if interrupted, and rolled out."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from surgisoft.agents.presets import Plan, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.agents.training import resume, train_new
 from surgisoft.errors import InputError
-from surgisoft.progress import Progress
+from surgisoft.progress import Progress, noted, silent
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What training took."""
+    """Cost of a training run."""
 
     steps: int
     """Steps over all episodes."""
@@ -44,7 +44,7 @@ def plan_of(
     arm: Path | None = None,
     preset: str = "fast",
 ) -> Plan:
-    """A training run: the task's own number of steps and the default arm unless told otherwise."""
+    """A training run, by default with the task's number of steps and the default arm."""
     config = config_of(task)
     if arm is not None:
         config = with_fields(config, arm=str(arm))
@@ -73,7 +73,7 @@ def trained(folder: Path, plan: Plan, report: Progress) -> RunFolder:
 
 
 def cost(run: RunFolder) -> Cost:
-    """What a run took so far."""
+    """Cost of a run so far."""
     last = _rows(run.path)[-1]
     return Cost(last["steps"], last["wall_s"], last["cpu_s"])
 
@@ -85,11 +85,11 @@ def played(
     seed: int,
     rig: RigConfig | None = None,
     arm: Path | None = None,
-    report: Progress = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> dict[str, dict]:
-    """What a driver's episodes brought: name with unit -> fields of `Summary`; FCL is the referee.
+    """Evaluation of a policy: name with unit -> fields of `Summary`; contact is checked by FCL.
 
-    driver: `scripted`, `random` or a run's folder. rig: None plays in simulation.
+    driver: `scripted`, `random` or a run's folder. rig: None for simulation.
     """
     config = config_of(task)
     if arm is not None:
@@ -98,9 +98,7 @@ def played(
     if rig is not None:
         place = on_rig(place, rig)
     opened = open_policy(driver, place)
-    found = evaluate(
-        place, driver, opened, episodes, seed, progress=lambda d, t: report(d, t, "playing")
-    )
+    found = evaluate(place, driver, opened, episodes, seed, progress=noted(report, "rollout"))
     return found.to_json()["overall"]
 
 
@@ -129,7 +127,7 @@ def _rows(folder: Path) -> list[dict]:
 
 
 def _finished(folder: Path, plan: Plan) -> bool:
-    """Whether all that was planned is done; a run that was cut off before its first turn is not."""
+    """Whether the plan is done; a run interrupted before its first iteration is not."""
     file = folder / "metrics.jsonl"
     if not file.is_file() or not file.read_text().strip():
         return False

@@ -1,7 +1,7 @@
-"""Control: learned, scripted and random drivers on every task, in simulation and on the rig.
+"""Benchmark `control`: learned, scripted and random policies on every task and plant.
 
-Runs lie in one folder as `TASK-seed-N`; what is missing is trained there, what is there is taken
-as it is. Results are kept beside them by the content of the policy.
+Runs are in one folder as `TASK-seed-N`; missing ones are trained, others are used as they are.
+Evaluations are cached beside them by the content of the policy.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class ControlConfig:
     seeds: tuple[int, ...] = (1, 2, 3)
     """Seeds of the training runs."""
     episodes: int = 100
-    """Episodes of each driver in simulation."""
+    """Episodes of each policy in simulation."""
     rig_episodes: int = 20
-    """Episodes of each driver on the rig."""
+    """Episodes of each policy on the rig."""
     episode_seed: int = 1000
-    """Seed of the episodes that are played; training and its evaluations use others."""
+    """Seed of the evaluated episodes; training and checkpoint selection use others."""
     rate_steps: int = 1_048_576
     """Steps of preset `paper` by which its rate is measured; 0: it is not."""
     whole_steps: int = PAPER_STEPS
@@ -68,14 +68,14 @@ class Trained:
     preset: str
     """Its preset."""
     cost: Cost
-    """What it took."""
+    """Its cost."""
     best: dict[str, float]
-    """What its own evaluation found for the policy that was kept."""
+    """Evaluation of the selected checkpoint."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """One driver's episodes."""
+    """Evaluation of one policy on one task and plant."""
 
     task: str
     """What was played."""
@@ -89,7 +89,7 @@ class Played:
 
 @dataclass(frozen=True)
 class Results:
-    """All that was measured."""
+    """All results of the benchmark."""
 
     runs: tuple[Trained, ...]
     """Every policy's training."""
@@ -102,7 +102,7 @@ class Results:
 
 
 def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
-    """Train what is missing, then play everything that is not kept from before."""
+    """Train what is missing, then evaluate everything that is not in the cache."""
     learned = [(task, seed) for task in LEARNED if task in config.tasks for seed in config.seeds]
     plays = 2 * (len(learned) + 2 * len(config.tasks))
     whole = config.whole_steps if RATE_TASK in config.tasks else 0
@@ -149,7 +149,7 @@ def _paper(config: ControlConfig, folder: Path, meter: Stages) -> Cost:
 
 
 def _played(config: ControlConfig, kept: Cache, task: str, where: str, driver: str, tell) -> dict:
-    """What one driver's episodes brought, from the folder of results where it is there."""
+    """Evaluation of one policy, from the cache where it is there."""
     rig = RigConfig() if where == "rig" else None
     count = config.episodes if rig is None else config.rig_episodes
     about = {

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from benchmarks.cache import Cache, model_digest
-from benchmarks.hidden_effect.policies import PLAY, TRAIN, Drivers
+from benchmarks.hidden_effect.policies import PLAY, TRAIN, PolicyEvaluation
 from benchmarks.hidden_effect.rates import by_rate
 from benchmarks.hidden_effect.rigs import Bench
 from surgisoft.diagnosis.amend import EVERY_ROW, amend, fall_of
@@ -41,7 +41,7 @@ TAKE, JUDGING_TAKE, FURTHER_TAKE, PACED_TAKE = 1, 9, 20, 33
 MODELS = ("before", "after", "oracle")
 """The model without the effect, the one amended by the diagnosis, the one told the name."""
 LASTING = ("learned", "scripted")
-"""Drivers that know the arm by a model."""
+"""PolicyEvaluation that know the arm by a model."""
 STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
 """Length of one effect, by the meter."""
 
@@ -146,7 +146,7 @@ class Study:
         rates = self.kept.values(
             f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
         )
-        drivers = Drivers(
+        drivers = PolicyEvaluation(
             self.kept, config.specimen, hidden, config.steps, config.seed, config.episodes
         )
         driven, training = self._driven(name, models, drivers, meter)
@@ -286,7 +286,7 @@ class Study:
 
         return self.kept.values(f"errors/{name}", about, make)
 
-    def _driven(self, name: str, models: dict[str, Path], drivers: Drivers, meter: Stages):
+    def _driven(self, name: str, models: dict[str, Path], drivers: PolicyEvaluation, meter: Stages):
         """MODEL/DRIVER/SIGHT -> summary, MODEL -> cost of its policy."""
         driven, training = {}, {}
         for key, arm in models.items():
@@ -295,7 +295,9 @@ class Study:
             driven |= {f"{key}/{which}": summary for which, summary in found.items()}
         return driven, training
 
-    def _paced(self, name: str, before: Path, effects, bench: Bench, drivers: Drivers, meter):
+    def _paced(
+        self, name: str, before: Path, effects, bench: Bench, drivers: PolicyEvaluation, meter
+    ):
         """The same effects amended on circles at the task's own pace, where that is called for."""
         about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
         folder = self.kept.place(f"models/{name}-paced", about)

@@ -20,7 +20,7 @@ from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
 
 TOLERANCE = 1e-5
-"""Exported policies answer with the same actions to this, kPa."""
+"""Largest difference of an exported policy's actions from the policy's own, kPa."""
 
 
 def export(policy: LearnedPolicy, folder: Path) -> list[Path]:

@@ -158,7 +158,7 @@ class RigArm:
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
-        """One step with changes of pressure (B, m), kPa, asked for now.
+        """Advance one step with changes of pressure (B, m), kPa.
 
         `part.command` is the command after which a pump of the simulated arm would give what the
         rig's pump gives: the two differ by an offset, which is estimated here.

@@ -51,7 +51,7 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
     with drawing():
         figure, axis = plt.subplots(figsize=(CHART[0], 4.2))
-        axis.plot(*broken_at_jumps(flat).T, c=AMBER, lw=5, alpha=0.55, label="asked for")
+        axis.plot(*broken_at_jumps(flat).T, c=AMBER, lw=5, alpha=0.55, label="reference")
         word = "burnt" if log.beam is not None else "done"
         axis.plot(*broken_at_jumps(went).T, c=BLUE, lw=1.3, label=word)
         axis.set_aspect("equal", adjustable="datalim")
@@ -63,7 +63,7 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
 
 
 def error_chart(log: EpisodeLog) -> Picture | None:
-    """The distance from what was asked for, over time; with a beam, only while it burns."""
+    """The distance from the reference over time; with a beam, only while it is on."""
     named = log.measures.get("beam_error_mm")
     error = log.error_mm if named is None else named
     if not np.isfinite(error).any():

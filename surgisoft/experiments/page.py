@@ -222,7 +222,7 @@ def _design(results: Results) -> Section:
         )
         for phase in spec.phases
     ]
-    header = ["phase", "laser arm", "endoscope arm", "beam", "goes on when", "longest"]
+    header = ["phase", "laser arm", "endoscope arm", "beam", "next phase when", "longest"]
     faults = [
         f"{fault.arm}: chamber {fault.chamber} goes to 0 kPa from {fault.at_s:g} s on"
         for fault in spec.faults

@@ -89,7 +89,7 @@ def log_file(folder: Path, setting: str, episode: int) -> Path:
 
 
 def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bool = False) -> None:
-    """Make the folder of results, or check that this experiment goes on in it."""
+    """Make the folder of results, or check that it holds results of this experiment."""
     there = (folder / FILE).is_file()
     if there and resume and not force:
         if load_experiment(folder / FILE) != spec:

@@ -31,7 +31,7 @@ from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
 from surgisoft.tasks.trajectories.closed_path import circle, square
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.pytree import Objects, rows, tree_map, with_rows
+from surgisoft.tasks.world.pytree import ObjectBatch, rows, tree_map, with_rows
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import WorldConfig
 
@@ -465,11 +465,11 @@ def test_objects_of_a_state_are_selected_and_replaced_with_its_rows():
     """An arm on a rig keeps a simulated plant for each environment beside its tensors."""
     part = track_circle().world.start(streams(0, 3)).arms["arm"]
     a, b, c, d = (object() for _ in "abcd")
-    part = replace(part, plant=Objects((a, b, c)))
+    part = replace(part, plant=ObjectBatch((a, b, c)))
     index = torch.tensor([2, 0])
-    assert rows(part, index).plant.things == (c, a)
-    fresh = replace(rows(part, torch.tensor([1])), plant=Objects((d,)))
+    assert rows(part, index).plant.items == (c, a)
+    fresh = replace(rows(part, torch.tensor([1])), plant=ObjectBatch((d,)))
     changed = with_rows(part, torch.tensor([1]), fresh)
-    assert changed.plant.things == (a, d, c)
-    assert part.plant.things == (a, b, c)
+    assert changed.plant.items == (a, d, c)
+    assert part.plant.items == (a, b, c)
     assert tree_map(torch.clone, part).plant is part.plant

@@ -16,9 +16,10 @@ from benchmarks.control.two_processes import trained_by_two
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import PAPER_STEPS
 from surgisoft.agents.run_folder import BEST, RunFolder
+from surgisoft.config import to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, Stages
-from surgisoft.tasks.registry import config_of, config_table
+from surgisoft.tasks.registry import config_of
 
 LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
 """Tasks that policies are trained for."""
@@ -154,9 +155,9 @@ def _played(config: ControlConfig, kept: Cache, task: str, where: str, driver: s
     count = config.episodes if rig is None else config.rig_episodes
     about = {
         "task": task,
-        "config": config_table(config_of(task)),
+        "config": to_table(config_of(task)),
         "driver": driver,
-        "rig": rig and config_table(rig),
+        "rig": rig and to_table(rig),
         "episodes": count,
         "seed": config.episode_seed,
     }

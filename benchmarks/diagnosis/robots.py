@@ -18,7 +18,7 @@ from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, Case
 from surgisoft.diagnosis.next_experiment.catalogue import Setting
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.rig.virtual import MOUNT
 from surgisoft.surrogate.checkpoint import load_model, save_model

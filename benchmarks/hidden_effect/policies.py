@@ -8,8 +8,9 @@ from pathlib import Path
 from benchmarks.cache import Cache, model_digest
 from benchmarks.control.policies import cost, plan_of, played, trained
 from surgisoft.agents.on_rig import RigConfig
+from surgisoft.config import to_table
 from surgisoft.progress import Stages
-from surgisoft.tasks.registry import config_table, with_fields
+from surgisoft.tasks.registry import with_fields
 
 TASK = "track_circle"
 """What the policies learn."""
@@ -64,7 +65,7 @@ class PolicyEvaluation:
         about = {
             "plan": told,
             "learned": driver not in ("scripted", "random"),
-            "rig": config_table(rig),
+            "rig": to_table(rig),
             "episodes": self.episodes,
             "seed": self.seed,
         }
@@ -79,7 +80,7 @@ def _inputs(plan, arm: Path) -> dict:
     """The inputs of a policy, for the cache; the arm by its content, not by its path."""
     return {
         "task": plan.task,
-        "config": config_table(with_fields(plan.task_config, arm=model_digest(arm))),
+        "config": to_table(with_fields(plan.task_config, arm=model_digest(arm))),
         "hyper_parameters": asdict(plan.preset),
         "steps": plan.steps,
         "seed": plan.seed,

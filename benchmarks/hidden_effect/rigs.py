@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.cache import Cache
 from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import Recording, load_recording, save_recording
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.progress import Progress
 from surgisoft.rig import VirtualRig
 from surgisoft.rig.virtual import MOUNT

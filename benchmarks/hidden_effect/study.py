@@ -26,7 +26,7 @@ from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model

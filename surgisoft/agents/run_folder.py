@@ -28,7 +28,7 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.registry import config_from, config_table, make_task, with_fields
+from surgisoft.tasks.registry import config_from, make_task, with_fields
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -69,7 +69,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
             "versions": versions(),
             "started": datetime.now().isoformat(timespec="seconds"),
             "task": plan.task,
-            "task_config": config_table(plan.task_config),
+            "task_config": to_table(plan.task_config),
             "scene": scene,
             "arms": {
                 name: {"model": arm.model.summary(), "effects": [*arm.model.effects]}

@@ -96,7 +96,7 @@ def collect(
 ) -> None:
     """Collect a recording on the virtual rig: the paper's arm, pumps and motion capture."""
     from surgisoft.measurement.protocols import make_protocol
-    from surgisoft.measurement.recordings.recording import save_recording
+    from surgisoft.measurement.recordings import save_recording
     from surgisoft.rig import VirtualRig
     from surgisoft.rig.virtual import MOUNT
 

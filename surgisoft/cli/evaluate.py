@@ -89,13 +89,13 @@ def evaluate(
     print(f"{own.name}, {on}: {episodes} episodes of seed {seed}; mean [95 % interval]")
     _show(results)
     if json_file:
-        from surgisoft.tasks.registry import config_table
+        from surgisoft.config import to_table
 
         about = {
             "task": own.name,
             "task_config": table,
             "on": on,
-            "rig": rig and config_table(rig),
+            "rig": rig and to_table(rig),
             "seed": seed,
             "episodes": episodes,
             "dt_s": own.world.config.dt_s,
@@ -143,14 +143,8 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
     """The task to play and its configuration as a table; a run brings its own."""
     from surgisoft.agents.policies import POLICIES, check_policy
     from surgisoft.agents.run_folder import RunFolder
-    from surgisoft.tasks.registry import (
-        TASKS,
-        config_of,
-        config_table,
-        make_task,
-        read_config,
-        with_fields,
-    )
+    from surgisoft.config import to_table
+    from surgisoft.tasks.registry import TASKS, config_of, make_task, read_config, with_fields
 
     for name in drivers:
         check_policy(name)
@@ -169,7 +163,7 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
         own = brought[0].plan().task_config if brought else config_of(task)
     given = {"arm": arm, "scene": None if scene is None else str(scene)}
     own = with_fields(own, **{name: value for name, value in given.items() if value is not None})
-    return make_task(task, own), config_table(own)
+    return make_task(task, own), to_table(own)
 
 
 def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool, on: str, logged):

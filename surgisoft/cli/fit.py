@@ -64,7 +64,7 @@ def fit(
     import torch
 
     from surgisoft.measurement.histories import arm_spec, check_fits, history_of
-    from surgisoft.measurement.recordings.recording import check_same_arm
+    from surgisoft.measurement.recordings import check_same_arm
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
     from surgisoft.surrogate.effects import named_effect
     from surgisoft.surrogate.fit import FitConfig

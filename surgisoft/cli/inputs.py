@@ -15,7 +15,7 @@ def warn(text: str) -> None:
 
 def read_recordings(paths: Iterable[Path]) -> list:
     """The recordings in files and folders; what is odd but usable is warned of."""
-    from surgisoft.measurement.recordings.recording import load_recordings
+    from surgisoft.measurement.recordings import load_recordings
 
     return load_recordings(paths, on_warning=warn)
 

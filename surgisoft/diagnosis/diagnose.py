@@ -43,7 +43,7 @@ from surgisoft.diagnosis.verdict import (
 )
 from surgisoft.diagnosis.weaknesses import weaknesses
 from surgisoft.errors import unknown_name
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel

@@ -19,7 +19,7 @@ from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
 from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 

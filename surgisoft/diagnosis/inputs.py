@@ -10,7 +10,7 @@ import torch
 from surgisoft.diagnosis.problem import Problem, pose, with_reference
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import outside_range
-from surgisoft.measurement.recordings.recording import Recording, load_recordings
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel

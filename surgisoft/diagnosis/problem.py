@@ -12,7 +12,7 @@ from surgisoft.diagnosis.comparing.floor import noise_floor
 from surgisoft.diagnosis.motions import motions
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 SAME_DEG = 5.0

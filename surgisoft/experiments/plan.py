@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.agents.on_rig import RigConfig, on_rig
-from surgisoft.config import Where
+from surgisoft.config import Where, merged, to_table
 from surgisoft.errors import InputError
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.spec import (
@@ -17,13 +17,12 @@ from surgisoft.experiments.spec import (
     Experiment,
     Lesion,
     Vary,
-    merged,
     task_config,
 )
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import config_table, with_present_names
+from surgisoft.tasks.registry import with_present_names
 
 Value = int | float | str
 
@@ -112,7 +111,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
 
 def _configured(spec: Experiment, values) -> CircleAblationConfig:
     """The task's configuration with what varies; the scene is still a folder's name."""
-    table = config_table(spec.task)
+    table = to_table(spec.task)
     for field, value in values:
         top, _, name = field.partition(".")
         if top == "task":

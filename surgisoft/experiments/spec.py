@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from surgisoft.config import Rule, Where, from_table, read_toml, write_toml
+from surgisoft.config import Rule, Where, from_table, merged, read_toml, to_table, write_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.ablation import ABLATION
 from surgisoft.scene.spec import Length, Point
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import config_table, with_present_names
+from surgisoft.tasks.registry import with_present_names
 
 FORMAT = 1
 """Version of the file's format."""
@@ -208,7 +208,7 @@ def load_experiment(path: str | Path) -> Experiment:
             raise (where / "task" / name).error(
                 "does not belong here", "the scene at the top, the arm in a case"
             )
-    plain = config_table(CircleAblationConfig()) | {"scene": ""}
+    plain = to_table(CircleAblationConfig()) | {"scene": ""}
     task = task_config(merged(plain, with_present_names(CircleAblationConfig(), own)), where)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
@@ -226,16 +226,9 @@ def task_config(table: dict, where: Where) -> CircleAblationConfig:
         ) from None
 
 
-def merged(base: Any, changes: Any) -> Any:
-    """A table with the fields of another one changed, at whatever depth they are."""
-    if not (isinstance(base, dict) and isinstance(changes, dict)):
-        return changes
-    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
-
-
 def save_experiment(spec: Experiment, path: Path) -> None:
     """Write the exact configuration, with every default; loading it gives an equal one."""
-    table = _without_none(config_table(spec))
+    table = _without_none(to_table(spec))
     for name in ("scene", "arm"):
         table["task"].pop(name, None)
     folder = path.parent.resolve()

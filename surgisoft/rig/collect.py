@@ -6,7 +6,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.interface import Rig, Sample
 

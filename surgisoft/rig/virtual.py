@@ -13,7 +13,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import ArmInfo, Recording
+from surgisoft.measurement.recordings import ArmInfo, Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig import bench
 from surgisoft.rig.arm import (

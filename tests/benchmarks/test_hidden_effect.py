@@ -15,7 +15,7 @@ from benchmarks.hidden_effect.study import MODELS, Outcome, StudyConfig, run, wo
 from benchmarks.hidden_effect.table import draw, markdown
 from surgisoft.cli import run as run_command
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.measurement.recordings import load_recording
 from surgisoft.progress import Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model

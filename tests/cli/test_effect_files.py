@@ -10,7 +10,7 @@ from typer.main import get_command
 from surgisoft.cli import app, commands, run
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import make_effect, own, register_effect_file

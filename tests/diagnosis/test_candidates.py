@@ -7,7 +7,7 @@ import torch
 from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.problem import locked_rows, pose
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import EFFECTS, make_effect

@@ -33,7 +33,7 @@ from surgisoft.diagnosis.next_experiment.words import words_for
 from surgisoft.diagnosis.problem import pose
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import ArmModel

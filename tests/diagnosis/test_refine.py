@@ -16,7 +16,7 @@ from surgisoft.diagnosis.refinement.nuisance import kinds
 from surgisoft.diagnosis.refinement.refine import Predictor, free_parameters, vector
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.model import ArmModel

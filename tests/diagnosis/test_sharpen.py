@@ -12,7 +12,7 @@ from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.race.ranking import Race
 from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.measurement.histories import history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
 from tests.diagnosis.synthetic import backlash, walk
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, save_model
@@ -23,7 +24,6 @@ from surgisoft.tasks.registry import (
     TASKS,
     config_from,
     config_of,
-    config_table,
     make_task,
     read_config,
 )
@@ -402,7 +402,7 @@ def reward_terms(name, config=None):
 @every_task
 def test_a_weight_scales_its_reward_term_and_no_other(name):
     """Each weight trebled in turn; 0 leaves the term out."""
-    usual, own = reward_terms(name), config_table(config_of(name))
+    usual, own = reward_terms(name), to_table(config_of(name))
     tables = {"follow": own["follow"]} if "follow" in own else {"": own}
     ((part, table),) = tables.items()
     for agent, terms in usual.items():

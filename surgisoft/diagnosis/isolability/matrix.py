@@ -31,7 +31,7 @@ from surgisoft.diagnosis.isolability.moments import (
 from surgisoft.diagnosis.problem import noise_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 

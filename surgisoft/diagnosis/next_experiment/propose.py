@@ -43,7 +43,7 @@ from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.known_error import KnownError

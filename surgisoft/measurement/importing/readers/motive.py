@@ -7,12 +7,13 @@ Motive documentation, Data Export: CSV, https://docs.optitrack.com/motive/data-e
 """
 
 import csv
-import re
+from dataclasses import replace
 from pathlib import Path
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.spec import FileRole
-from surgisoft.measurement.importing.tables import RawTable, read_bytes, table_of_body
+from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
+from surgisoft.measurement.importing.readers.text import table_of_body
+from surgisoft.measurement.tables import read_text
 
 _UNITS = {"Meters": "m", "Centimeters": "cm", "Millimeters": "mm"}
 _HEADER_LINES = 30
@@ -21,21 +22,21 @@ _PREFERRED = ("Marker", "Rigid Body", "Bone", "Rigid Body Marker", "Bone Marker"
 """Where a name comes twice: markers as measured go before markers as solved for."""
 
 
-def is_motive(path: Path) -> bool:
+def _fits(path: Path) -> bool:
     """Whether the file begins as Motive's export does."""
     try:
         with path.open("rb") as file:
             if file.read(2) == b"\x1f\x8b":
-                return read_bytes(path).startswith(b"Format Version,")
+                return read_text(path).startswith(b"Format Version,")
             file.seek(0)
             return file.read(64).removeprefix(b"\xef\xbb\xbf").startswith(b"Format Version,")
     except OSError:
         return False
 
 
-def motive_table(path: Path, role: FileRole) -> RawTable:
+def _read(path: Path, role: FileRole) -> RawTable:
     """Columns are called Frame, Time, NAME.x, NAME.y, NAME.z, and NAME.qx .. NAME.qw of a body."""
-    data = read_bytes(path)
+    data = read_text(path)
     if not data.startswith(b"Format Version,"):
         raise InputError(f"{path}: no 'Format Version' at the start, expected a Motive CSV export")
     lines = data.split(b"\n", _HEADER_LINES)
@@ -50,8 +51,13 @@ def motive_table(path: Path, role: FileRole) -> RawTable:
     names, kinds = _columns(rows, axes, head.get("Rotation Type", "Quaternion") == "Quaternion")
     body = b"\n".join(lines[axes + 1 :])
     raw = table_of_body(path, role, names, body, axes + 2)
-    unit = _unit(path, head)
-    return RawTable(path, [*names, *raw.names[len(names) :]], raw.cells, unit, kinds, raw.notes)
+    return replace(
+        raw,
+        names=[*names, *raw.names[len(names) :]],
+        unit=_unit(path, head),
+        bodies=tuple(name for name, kind in kinds.items() if kind in ("Rigid Body", "Bone")),
+        markers=tuple(name for name, kind in kinds.items() if "Marker" in kind),
+    )
 
 
 def _unit(path: Path, head: dict[str, str]) -> str:
@@ -102,27 +108,4 @@ def _kinds(types: list[str], assets: list[str]) -> dict[str, str]:
     }
 
 
-def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """Key by which 'Disc2' comes before 'Disc10'."""
-    parts = re.split(r"([0-9]+)", name)
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
-
-
-def bodies(table: RawTable) -> list[str]:
-    """Names of the rigid bodies, in natural order."""
-    names = [name for name, kind in table.kinds.items() if kind in ("Rigid Body", "Bone")]
-    return sorted(names, key=natural_order)
-
-
-def planes(table: RawTable, pattern: str) -> list[list[str]]:
-    """Markers of each plane, planes and markers in natural order.
-
-    A marker belongs to the plane that the expression's first group finds in its name; names that do
-    not fit belong to none.
-    """
-    found: dict[str, list[str]] = {}
-    for name, kind in table.kinds.items():
-        match = re.match(pattern, name)
-        if match and "Marker" in kind:
-            found.setdefault(match[1], []).append(name)
-    return [sorted(found[plane], key=natural_order) for plane in sorted(found, key=natural_order)]
+READER = Reader("a Motive CSV export", _read, fits=_fits, states_unit=True)

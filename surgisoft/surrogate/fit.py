@@ -10,7 +10,7 @@ import copy
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import torch
@@ -19,13 +19,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import known_effects, make_effect
+from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
+from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
     CHECK_EVERY,
     Data,
@@ -100,7 +100,7 @@ def excitation(
 ) -> list[ChamberExcitation]:
     """What a history excites, one answer a chamber; low, high, band (m,) in the arm's unit."""
     rest = torch.zeros_like(low).clamp(low, high)
-    _, direction = directions.trace(history.pressure, band, rest)
+    _, direction = direction_scan(history.pressure, band, rest)
     pressure = history.rows(history.pressure)
     span = (high - low).where(high > low, torch.ones_like(low))
     scaled = ((pressure - low) / span).double().numpy()
@@ -250,10 +250,10 @@ class FitResult:
         lines += [f"note: {warning}" for warning in self.warnings]
         error = self.model.validation
         points = " ".join(
-            "-" if value is None else f"{value:.4f}" for value in error["per_key_point_mm"]
+            "-" if value is None else f"{value:.4f}" for value in error.per_key_point_mm
         )
         lines.append(
-            f"held-out RMSE {error['rmse_mm']:.4f} mm over {error['rows']} rows; "
+            f"held-out RMSE {error.rmse_mm:.4f} mm over {error.rows} rows; "
             f"key points base to tip: {points} mm"
         )
         return lines
@@ -287,11 +287,11 @@ def fit(
             _stage(candidate, name, epochs, config, data, result, progress)
         rows = data.judging_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
-    if data.judge.noise_mm is not None:
-        result.model.validation["noise_mm"] = data.judge.noise_mm
-    if not math.isfinite(result.model.validation["rmse_mm"]):
+    validation = replace(result.model.validation, noise_mm=data.judge.noise_mm)
+    result.model.validation = validation
+    if not math.isfinite(validation.rmse_mm):
         raise InputError("the fit did not come to a finite error; check the recordings' key points")
-    for number, value in enumerate(result.model.validation["per_key_point_mm"]):
+    for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
             result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
@@ -322,7 +322,7 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
     predicted, measured = held_rows(model, data)
     model.validation = validated_error(measured, predicted)
     result.model = model
-    result.stages.append(StageReport("recurrent", model.validation["rmse_mm"], epochs, 0.0, True))
+    result.stages.append(StageReport("recurrent", model.validation.rmse_mm, epochs, 0.0, True))
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
@@ -404,7 +404,7 @@ def _possible(result: FitResult, name: str, config: FitConfig, support: _Support
     """Whether the recordings support a stage in any chamber; notes those that they do not."""
     if name in ("pressure", "constant curvature") or not config.check_excitation:
         return True
-    if name != "direction" and not known_effects()[name].needs_reversals:
+    if name != "direction" and not hypothesis_of(known_effects()[name]).needs_reversals:
         return True
     use = support.use(name)
     for chamber, used in zip(support.chambers, use, strict=True):
@@ -427,11 +427,10 @@ def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, tr
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
     grown = copy.deepcopy(model)
     if name == "direction":
-        grown.network = grown.network.with_directions(use)
-        return grown
+        return grown.replace(network=grown.network.with_directions(use))
     effect = make_effect(name, model.facts)
     effect.use_chambers(use)
-    return ArmModel(spec, grown.network, {**grown.effects, name: effect})
+    return grown.replace(effects={**grown.effects, name: effect})
 
 
 def _stage(

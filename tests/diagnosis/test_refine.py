@@ -30,8 +30,8 @@ NOISE_MM = 0.05
 def bare_arm() -> ArmModel:
     """The network of the default arm without its memory."""
     arm = default_arm()
-    network = arm.network.requires_grad_(False)
-    return ArmModel(arm.spec, network, {}, arm.rest_mm, arm.validation).eval()
+    arm.network.requires_grad_(False)
+    return arm.replace(effects={}).eval()
 
 
 def measured_on(truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0) -> Recording:
@@ -145,7 +145,7 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
     """Half of the default arm's friction is missing: its weights come back, in one instance."""
     truth = default_arm()
     weaker = copy.deepcopy(truth)
-    for strength in weaker.effects["hysteresis"].strengths().values():
+    for strength in weaker.effects["hysteresis"].amplitudes().values():
         strength.mul_(0.5)
     recording = measured_on(truth, rows=300)
     problem = pose(weaker, [recording], part="open")

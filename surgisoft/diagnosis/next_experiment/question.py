@@ -193,7 +193,7 @@ def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> l
         if best is None or gains[best] < CLEAR:
             continue
         effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
-        for parameter in effect.strengths().values():
+        for parameter in effect.amplitudes().values():
             part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
             parameter.data.copy_(part.view_as(parameter))
             first += parameter.numel()

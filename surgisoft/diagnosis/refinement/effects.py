@@ -62,7 +62,7 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
         effects = {key: model.effects[key] for key in keys}
         free = free_parameters(model, keys)
         if len(keys) == 1 and keys[0] in large:
-            free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].strengths().items()}
+            free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].amplitudes().items()}
         parameters += intervals(effects, free, fit, problem.block)
     order = {name: position for position, name in enumerate(names)}
     parameters.sort(key=lambda parameter: order[parameter.effect])
@@ -100,10 +100,10 @@ def shrink(effect: Effect) -> bool:
 
     By bisection between nothing, of which a share must be plausible, and the present strengths.
     """
-    strengths = {name: p.detach().clone() for name, p in effect.strengths().items()}
+    strengths = {name: p.detach().clone() for name, p in effect.amplitudes().items()}
 
     def scale(factor: float) -> bool:
-        for name, parameter in effect.strengths().items():
+        for name, parameter in effect.amplitudes().items():
             parameter.copy_(factor * strengths[name])
         return effect.plausible()
 
@@ -116,7 +116,7 @@ def shrink(effect: Effect) -> bool:
 
 def is_large(effect: Effect) -> bool:
     """Whether an effect has so many values that its strengths alone are fitted."""
-    values = [*effect.strengths().values(), *effect.shapes().values()]
+    values = [*effect.amplitudes().values(), *effect.nonlinear_parameters().values()]
     return sum(p.numel() for p in values) > LARGE
 
 
@@ -132,6 +132,6 @@ def _added(problem: Problem, name: str) -> ArmModel:
             misfit = refine_large(model, problem, name).misfit
         else:
             misfit = refine(model, problem, [name], FIRST_ITERATIONS).misfit
-        values = sum(p.numel() for p in effect.strengths().values())
+        values = sum(p.numel() for p in effect.amplitudes().values())
         tried.append((misfit * (1.0 + PRICE) ** values, model))
     return min(tried, key=lambda one: one[0])[1]

@@ -41,7 +41,7 @@ def strength_slopes(model: ArmModel, problem: Problem, key: str) -> np.ndarray:
     signal = forward.start
     context = forward.context_at(signal)
     memory = problem.rows(effect.scan(rest, signal.value, context))
-    changes = effect.columns(problem.rows(signal.value), memory)
+    changes = effect.sensitivities(problem.rows(signal.value), memory)
     if effect.stage in ("line", "material"):
         trace = model.trace(problem.history)
         at = problem.rows(model.effective(trace.pressure, trace.memory))
@@ -61,7 +61,7 @@ def strength_slopes(model: ArmModel, problem: Problem, key: str) -> np.ndarray:
 
 def refine_large(model: ArmModel, problem: Problem, key: str) -> Fit:
     """Fit the strengths of one effect of a model in place; see the module's head."""
-    parameters = {f"{key}.{name}": p for name, p in model.effects[key].strengths().items()}
+    parameters = {f"{key}.{name}": p for name, p in model.effects[key].amplitudes().items()}
     predict = Predictor(Forward(model, problem, [key]), parameters)
     values = start = vector(parameters)
     residual = problem.measured - predict(values)

@@ -66,8 +66,8 @@ def free_parameters(
     answer = {}
     for key in keys:
         effect = model.effects[key]
-        strengths = {} if key == held else effect.strengths()
-        for name, parameter in (strengths | effect.shapes()).items():
+        strengths = {} if key == held else effect.amplitudes()
+        for name, parameter in (strengths | effect.nonlinear_parameters()).items():
             answer[f"{key}.{name}"] = parameter
     return answer
 
@@ -91,8 +91,8 @@ def _are_shapes(model: ArmModel, keys: Iterable[str], held: str | None = None) -
     answer = []
     for key in keys:
         effect = model.effects[key]
-        strengths = {} if key == held else effect.strengths()
-        for kind, values in ((False, strengths), (True, effect.shapes())):
+        strengths = {} if key == held else effect.amplitudes()
+        for kind, values in ((False, strengths), (True, effect.nonlinear_parameters())):
             answer += [kind] * sum(p.numel() for p in values.values())
     return np.array(answer, bool)
 

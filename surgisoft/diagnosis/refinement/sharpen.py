@@ -36,7 +36,7 @@ class Sharpened(Candidate):
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect:
         """The effect at a multiple (1,) of its fitted strengths."""
         effect = copy.deepcopy(self.effect)
-        for parameter in effect.strengths().values():
+        for parameter in effect.amplitudes().values():
             parameter.mul_(float(amplitudes[0]))
         return effect
 
@@ -73,11 +73,13 @@ def with_fitted(problem: Problem, name: str, effect: Effect) -> ArmModel | None:
     model = with_effect(copy.deepcopy(problem.model), name, copy.deepcopy(effect))
     refine(model, problem, [name], ITERATIONS)
     effect = model.effects[name]
-    if not effect.plausible() and effect.shapes() and shrink(effect):
+    if not effect.plausible() and effect.nonlinear_parameters() and shrink(effect):
         refine(model, problem, [name], ITERATIONS, held=name)
     return model if effect.plausible() else None
 
 
 def _values(effect: Effect) -> int:
     """How many numbers a fit of the effect chooses."""
-    return sum(p.numel() for p in [*effect.strengths().values(), *effect.shapes().values()])
+    return sum(
+        p.numel() for p in [*effect.amplitudes().values(), *effect.nonlinear_parameters().values()]
+    )

@@ -47,7 +47,7 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
         amplitudes = torch.from_numpy(validation.amplitudes(picks[best])).float()
         begin = 0
         with torch.no_grad():
-            for strength in effect.strengths().values():
+            for strength in effect.amplitudes().values():
                 end = begin + strength.numel()
                 strength.copy_(amplitudes[begin:end].view_as(strength))
                 begin = end

@@ -23,7 +23,8 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
 """Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
@@ -31,7 +32,7 @@ OTHERS = -0.35
 """Share of the other chambers in a wall line's load that a diagnosis tries."""
 
 
-class Softening(Effect):
+class Softening(WallFibres):
     """Mullins softening by the largest load of a chamber and of all of them."""
 
     stage = "material"
@@ -50,33 +51,22 @@ class Softening(Effect):
         loads (`wall_lines`).
         """
         super().__init__(facts)
-        self.ring = bool(ring)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
         self.log_growth = logarithm(growth)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+        self.set_fibres(others, ring)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "common": self.common}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        lines = lines_tried(len(facts.low), OTHERS)
-        return [cls(facts, *widths, *some) for widths in GRID for some in lines]
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.others]
 
-    @property
-    def _lines(self) -> Tensor:
-        """(K, m) loads of the wall lines by those of the chambers."""
-        return wall_lines(self.others, len(self.reach), self.ring)
-
     def energy(self, signal: Tensor) -> Tensor:
         """(..., K + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
         load = self.load(signal)
-        own, mean = (load @ self._lines.T).square(), load.square().mean(-1, keepdim=True)
+        own, mean = (load @ self.fibres.T).square(), load.square().mean(-1, keepdim=True)
         return torch.cat([own, mean], dim=-1)
 
     def rest(self, signal: Tensor) -> Tensor:
@@ -95,8 +85,8 @@ class Softening(Effect):
         """Two (..., m) shifts of the actuation at strength one: own and common."""
         below = (memory - self.energy(signal)).clamp(min=0)
         damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
-        load, lines = self.load(signal), self._lines
-        own = ((load @ lines.T) * damage[..., :-1]) @ lines
+        load, fibres = self.load(signal), self.fibres
+        own = ((load @ fibres.T) * damage[..., :-1]) @ fibres
         return self.reach * own, self.reach * load * damage[..., -1:]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -104,11 +94,8 @@ class Softening(Effect):
         own, common = self._softened(signal, memory)
         return signal + self.own * own + self.common * common
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return torch.stack(self._softened(signal, memory)).detach()
-
-    def config(self) -> dict:
-        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"
@@ -121,3 +108,11 @@ class Softening(Effect):
             Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    fibres = fibres_tried(len(facts.low), OTHERS)
+    return [Softening(facts, *widths, *some) for widths in GRID for some in fibres]
+
+
+HYPOTHESIS = Hypothesis(Softening, _grid)

@@ -18,13 +18,15 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
+    Effect,
     Memoryless,
     Quantity,
     amplitude,
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
@@ -32,7 +34,7 @@ OTHERS = -0.35
 """Share of the other chambers in a wall line's load that a diagnosis tries."""
 
 
-class Stiffening(Memoryless):
+class Stiffening(WallFibres, Memoryless):
     """Progressive loss of push, the same for all chambers."""
 
     stage = "material"
@@ -45,19 +47,13 @@ class Stiffening(Memoryless):
         others, ring: the wall lines' loads (`wall_lines`).
         """
         super().__init__(facts)
-        self.ring = bool(ring)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+        self.set_fibres(others, ring)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "bend": self.bend}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        lines = lines_tried(len(facts.low), OTHERS)
-        return [cls(facts, steepness, *some) for steepness in GRID for some in lines]
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at strength one: own and bending."""
@@ -73,9 +69,9 @@ class Stiffening(Memoryless):
             # A recording beyond the fitted range must not blow up.
             return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
 
-        lines = wall_lines(self.others, m, self.ring)
-        u = x @ lines.T
-        own = lost(u, u.square()) @ lines
+        fibres = self.fibres
+        u = x @ fibres.T
+        own = lost(u, u.square()) @ fibres
         return self.reach * own, self.reach * lost(x, bend)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -83,11 +79,8 @@ class Stiffening(Memoryless):
         own, bend = self._lost(signal)
         return signal + self.own * own + self.bend * bend
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return torch.stack(self._lost(signal)).detach()
-
-    def config(self) -> dict:
-        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: a rest of the push is left"
@@ -106,3 +99,11 @@ class Stiffening(Memoryless):
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    fibres = fibres_tried(len(facts.low), OTHERS)
+    return [Stiffening(facts, steepness, *some) for steepness in GRID for some in fibres]
+
+
+HYPOTHESIS = Hypothesis(Stiffening, _grid)

@@ -17,7 +17,7 @@ from surgisoft.surrogate.effects import (
     own,
     register_effect_file,
 )
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.networks import ConstantCurvature
 from tests.surrogate.effects.arms import FACTS
 
@@ -44,7 +44,7 @@ def arm() -> ArmModel:
     effect.loss.data.fill_(0.3)
     network = ConstantCurvature(torch.tensor(spec.low), torch.tensor(spec.high), 2)
     network.set_rest(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 70.0]]))
-    return ArmModel(spec, network, {"slack": effect}, torch.eye(3)[:2], {"rmse_mm": 0.1})
+    return ArmModel(spec, network, {"slack": effect}, torch.eye(3)[:2], Validation(0.1))
 
 
 def test_the_documentations_effect_works(slack):
@@ -54,7 +54,7 @@ def test_the_documentations_effect_works(slack):
     x = torch.tensor([[-10.0, 0.0, 20.0]])
     memory = effect.rest(x)
     assert torch.equal(effect.apply(x, memory), x)
-    assert torch.equal(effect.columns(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
+    assert torch.equal(effect.sensitivities(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
     effect.loss.data.fill_(0.5)
     assert effect.apply(x, memory).tolist() == [[-5.0, 0.0, 20.0]]
     assert effect.plausible()

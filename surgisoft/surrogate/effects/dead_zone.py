@@ -9,6 +9,7 @@ Kokotovic 1996, ch. 2, the dead zone); near rest the slope is 1 - threshold / wi
 where both are equal.
 """
 
+import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (

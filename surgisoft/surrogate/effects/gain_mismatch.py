@@ -5,6 +5,7 @@ Area, wall and pressure sensor of a chamber differ from the nominal ones by a co
     x_eff_i = x_i + gain_i x_i,      x = load, 0 at rest and 1 at full actuation.
 """
 
+import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude

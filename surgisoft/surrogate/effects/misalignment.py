@@ -6,6 +6,7 @@ with R the rotation by the vector `turn` (Rodrigues 1840): the similarity betwee
 Umeyama (1991, eq. 40).
 """
 
+import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of

@@ -9,6 +9,7 @@ with the chambers' mean load l (Connolly, Walsh & Bertoldi 2017, fibre-reinforce
 with t the tangent of the bent centreline r(s) of length L. A straight arm hides it.
 """
 
+import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (

@@ -34,7 +34,7 @@ class Candidate:
     more: bool = False
     """Whether the columns make an effect that the model has already stronger."""
     fitted: bool = False
-    """Whether its nonlinear parameters were fitted through the whole chain, not taken from a grid."""
+    """Whether its nonlinear parameters were fitted and not taken from a grid."""
 
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:

@@ -173,6 +173,12 @@ class Scanning:
         self.start, self.context, self.rows, self.given = start, context, rows, direction
         self.memory: dict[str, Tensor] = {}
 
+    def context_at(self, signal: Signal) -> Context:
+        """Times, temperatures and, behind the line, the chambers' pressure along a signal."""
+        if signal.pressure is None:
+            return self.context
+        return replace(self.context, pressure=signal.pressure)
+
     @torch.no_grad()
     def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
         """(R, T, m) direction of change; every run starts from rest."""
@@ -184,10 +190,7 @@ class Scanning:
         """Signal behind an effect whose memory has followed every row."""
         if self.rows is not None and link.stage in ("body", "sensor"):
             return link.part.apply(signal.value, signal.value[..., :0, 0])
-        context = self.context
-        if signal.pressure is not None:
-            context = replace(context, pressure=signal.pressure)
-        memory = link.part.scan(self.start[link.name], signal.value, context)
+        memory = link.part.scan(self.start[link.name], signal.value, self.context_at(signal))
         self.memory[link.name] = memory
         return link.part.apply(signal.value, memory)
 
@@ -408,6 +411,7 @@ class RepeatedScan:
         parameters change (empty: those of the network); rows: picks the looked-at rows (S, ...)
         of a (R, T, ...) tensor."""
         self.chain, self.history, self.rows = chain, history, rows
+        self.first_pressure = first
         # Runs that begin alike have one memory before their first row.
         self.first = first[:1] if (first == first[:1]).all() else first
         self.thin = all(isinstance(link.part, Memoryless) for link in chain.outer)

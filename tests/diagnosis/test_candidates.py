@@ -70,7 +70,7 @@ def test_more_of_an_effect_is_its_own_share(problem):
     model = problem.model
     with torch.no_grad():
         trace = model.trace(problem.history)
-        push = model.effective(trace.pressure, trace.memory) - trace.pressure
+        push = trace.behind["material"] - trace.pressure
         more = model.network(trace.pressure + 1.1 * push, trace.direction)
         same = model.network(trace.pressure + push, trace.direction)
         change = problem.rows(more - same).numpy()

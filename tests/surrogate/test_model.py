@@ -230,5 +230,5 @@ def test_an_effect_of_another_version_is_migrated_or_refused(tmp_path, name):
         opened(effects={name: {}})
     with pytest.raises(InputError, match=f"effect '{name}' cannot be opened.*another meaning"):
         opened(effect_versions={name: 1})
-    with pytest.raises(InputError, match="version 3 .*expected at most 2"):
+    with pytest.raises(InputError, match=r"version 3 .*expected at most 2"):
         opened(effect_versions={name: 3})

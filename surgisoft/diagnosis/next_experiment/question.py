@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.candidates import facts_of
+from surgisoft.diagnosis.estimation.effects import with_fitted
 from surgisoft.diagnosis.isolability.designs import (
     PERIOD_S,
     Design,
@@ -27,7 +28,6 @@ from surgisoft.diagnosis.isolability.matrix import (
 )
 from surgisoft.diagnosis.isolability.moments import Moments, Uncertainty, sample_time, unimitated
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refinement.sharpen import with_fitted
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 

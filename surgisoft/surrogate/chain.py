@@ -383,7 +383,7 @@ class Chain:
 
         at: (S, m) actuation or (S, n, 3) key points, mm, that the effect sees; memory: (S, ...)
         its memory; slope: (S, n, 3, m) `network_slope` on those rows, which line and material
-        effects act through. The memory of effects behind the effect is taken to follow.
+        effects act through. Effects behind the effect are taken to hand the change on as it is.
         """
         changes = effect.sensitivities(at, memory)
         if effect.stage in ("line", "material"):

@@ -1,9 +1,10 @@
-"""What a recording excites: which inputs of a model it can support.
+"""Fit a model by forward selection: pressure, then effects with memory, then directions.
 
-A network cannot tell an input's effect from the pressure's where the pressure already says what
-that input is. After a plain traverse of the pressure cube the slow chamber has only ever risen:
-its direction is a constant, its memory a function of its pressure. And where a chamber has only
-ever swept its whole range, nothing says what a small reversal does.
+First the excitation of the recordings decides which inputs they can identify. A network cannot
+separate an input from the pressure where the input is a function of the pressure. After a plain
+traverse of the pressure cube the slow chamber has only ever risen: its direction is a constant, its
+memory a function of its pressure. And where a chamber has only ever swept its whole range, the data
+does not show what a small reversal does.
 """
 
 import copy
@@ -223,7 +224,7 @@ class FitResult:
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
     known: KnownError | None = None
-    """Where the model is off on the rows that it was fitted to and judged on."""
+    """Training residuals: those on the rows that the model was fitted to and validated on."""
 
     def report(self) -> dict:
         """What happened, for a JSON file beside the model."""
@@ -361,7 +362,7 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
 
 
 def _stages(config: FitConfig) -> list[str]:
-    """Names of the stages: with memory in place, a direction has to earn its place last."""
+    """Names of the stages in order; the direction comes last, after the effects with memory."""
     if config.network == "constant_curvature":
         return ["constant curvature"]
     names = ["pressure", *config.effects]
@@ -371,7 +372,7 @@ def _stages(config: FitConfig) -> list[str]:
 
 
 def _stage_epochs(name: str, stages: list[str], config: FitConfig) -> int:
-    """Epochs of a stage: the richest has most, those that lead to it few."""
+    """Epochs of a stage: the last has most, those that lead to it few."""
     share = 1.0
     if name in config.effects:
         share = EFFECT_SHARE
@@ -386,13 +387,13 @@ class _Support:
 
     chambers: list[ChamberExcitation]
     judged_inside: bool
-    """Whether the judging data reverses inside the range in every chamber."""
+    """Whether the validation data reverses inside the range in every chamber."""
 
     def use(self, name: str) -> Tensor:
         """(m,) 1 for each chamber whose direction or memory may be used, else 0.
 
         A memory needs inner reversals to be learned. A direction that was only seen in full
-        sweeps may still be right: that is left to judging data which has inner reversals.
+        sweeps may still be right: validation data with inner reversals decides.
         """
         lenient = name == "direction" and self.judged_inside
         return torch.tensor(
@@ -438,8 +439,8 @@ def _stage(
 ) -> None:
     """Train one stage and keep it if held-out data rewards it.
 
-    What it is held against is the simpler model trained just as long: a gain must come from what
-    was added, not from the training.
+    It is compared with the simpler model trained for the same number of epochs, so that a gain must
+    come from the addition and not from the training.
     """
     begin = time.perf_counter()
     done = train_model(candidate, data, name, epochs, config, result.loss, progress)
@@ -463,7 +464,7 @@ def _stage(
 
 
 def _square(model: ArmModel, data: Data) -> Tensor:
-    """(S, n, 3) squared error in mm^2 on the judging rows; NaN where missing."""
+    """(S, n, 3) squared error in mm^2 on the validation rows; NaN where missing."""
     rows = data.judging_rows(model)
     return (model_rows(model, rows) - rows.target).square()
 

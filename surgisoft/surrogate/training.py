@@ -1,4 +1,4 @@
-"""Rows of histories: what a static model sees in each, which are held out, and their error."""
+"""Training of a model: rows of histories, held-out rows, and Adam with memories through windows."""
 
 import copy
 import math
@@ -63,23 +63,23 @@ def measured_rows(history: History) -> Tensor:
 
 @dataclass(frozen=True)
 class Data:
-    """What a model is fitted to and what judges it."""
+    """Training and validation data of a fit."""
 
     train: History
     """Histories to fit to."""
     valid: History | None
-    """Histories that judge; None: the rows of `train` in `held` do."""
+    """Validation histories; None: the rows of `train` in `held` validate."""
     held: Tensor | None
     """(R, T) rows of `train` that are held out; None with a validation history."""
 
     @classmethod
     def split(cls, train: History, valid: History | None, seed: int) -> "Data":
-        """Judge by a validation history, or by held-out runs or blocks without one."""
+        """Validate on a validation history, or on held-out runs or blocks without one."""
         return cls(train, valid, hold_out(train, seed) if valid is None else None)
 
     @property
     def judge(self) -> History:
-        """The history that the judging rows are part of."""
+        """The history that the validation rows are part of."""
         return self.train if self.valid is None else self.valid
 
     def fitted_rows(self, model: ArmModel, trace: Taps | None = None) -> Rows:
@@ -90,7 +90,7 @@ class Data:
         return rows.take(~self.train.rows(self.held)[measured_rows(self.train)])
 
     def judging_rows(self, model: ArmModel) -> Rows:
-        """The rows that judge, as the model sees them."""
+        """The validation rows, as the model sees them."""
         if self.valid is not None:
             return make_rows(model, self.valid)
         held = self.train.rows(self.held)[measured_rows(self.train)]
@@ -190,10 +190,10 @@ MEMORY_RATE = 10.0
 def train(
     model: ArmModel, data: Data, name: str, epochs: int, config, losses: list, progress
 ) -> int:
-    """Adam with a cosine schedule; the model ends as its best running average on judging rows.
+    """Adam with a cosine schedule; the model ends as its running average of least validation error.
 
     Memories are trained in the stages of effects only. Appends (name, epoch, training loss,
-    judging loss) to `losses`; returns the epochs done.
+    validation loss) to `losses`; returns the epochs done.
     """
     every = [p for effect in model.effects.values() for p in effect.memory_parameters()]
     every += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
@@ -339,7 +339,7 @@ BURN_IN = 32
 def train_recurrent(
     model: ArmModel, data: Data, epochs: int, rate: float, seed: int, progress=None
 ) -> tuple[list[tuple[str, int, float, float]], int]:
-    """Adam on windows; ends as the best on judging rows. Returns (losses, epochs done)."""
+    """Adam on windows; ends as the best on the validation rows. Returns (losses, epochs done)."""
     train = data.train
     generator = torch.Generator().manual_seed(seed)
     network: RecurrentArm = model.network
@@ -392,14 +392,14 @@ def train_recurrent(
 
 
 def held_rows(model: ArmModel, data: Data) -> tuple[Tensor, Tensor]:
-    """(predicted, measured) key points (S, n, 3) in mm on the judging rows."""
+    """(predicted, measured) key points (S, n, 3) in mm on the validation rows."""
     mask = data.judge.valid if data.held is None else data.held
     with torch.no_grad():
         return model.predict(data.judge)[mask], data.judge.key_points[mask]
 
 
 def held_error(model: ArmModel, data: Data, weights: Tensor) -> float:
-    """Weighted MSE in mm^2 on the judging rows."""
+    """Weighted MSE in mm^2 on the validation rows."""
     predicted, measured = held_rows(model, data)
     return float(weighted_mse(predicted, measured, weights))
 

@@ -27,15 +27,15 @@ from surgisoft.surrogate.effects.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 AROUND = 16
-"""Directions of the support that a diagnosis tries."""
+"""Directions of the support that identification tries."""
 DEPTHS = (0.5, 0.7, 0.86, 0.96)
-"""Quantiles of the body's excursion at which it puts the support."""
+"""Quantiles of the body's excursion at which identification puts the support."""
 LEAST_SHARE = 0.08
 """Least share of a support that is there. One that yields more is met all the time and looks like
 a weight, or like a stiffer wall."""
 BESIDE = 1
-"""Neighbouring directions that it puts supports in at once, either side: what is met may be round,
-but an arm that is held from all around is a stiffer one."""
+"""Neighbouring directions, on either side, in which identification puts supports at once: the
+support may be round, but an arm that is held from all around is a stiffer one."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
 support, and to push it back would take no bounded bending."""
@@ -63,7 +63,7 @@ class Contact(Memoryless):
         self.share = amplitude(1)
         self.azimuth = nn.Parameter(torch.tensor([float(azimuth_rad)]))
         self.rise = nn.Parameter(torch.tensor([float(rise_rad)]))
-        # In lengths of the arm, so that a step of the shapes means alike for all of them.
+        # In lengths of the arm, so that a step of any nonlinear parameter has a like size.
         self.offset = nn.Parameter(torch.tensor([float(offset_mm) / self.length_mm]))
         lever = beam.levers[self.point] / self.length_mm**2
         self.register_buffer("lever", lever, persistent=False)

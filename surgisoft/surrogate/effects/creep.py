@@ -40,7 +40,7 @@ GRID = (
     (20.0, 2.0),
     (90.0, 2.5),
 )
-"""(tau in s, width in natural logarithms) that a diagnosis tries."""
+"""(tau in s, width in natural logarithms) that identification tries."""
 
 
 class Creep(Effect):

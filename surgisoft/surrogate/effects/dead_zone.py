@@ -24,7 +24,7 @@ from surgisoft.surrogate.effects.base import (
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 GRID = (0.04, 0.1, 0.25)
-"""Widths that a diagnosis tries, loads."""
+"""Widths that identification tries, loads."""
 
 
 class DeadZone(Memoryless):

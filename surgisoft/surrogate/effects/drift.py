@@ -40,15 +40,15 @@ KINDS = ("base", "actuation", "temperature")
 TEN_MINUTES = 600.0
 """Time at which the amplitudes are given, s."""
 ROOM_C = 22.0
-"""T_0 where nobody knows it, degrees Celsius."""
+"""T_0 where the recordings do not state it, degrees Celsius."""
 TEN_KELVIN = 10.0
 """Change of temperature at which the amplitudes are given, K."""
 GRID = (200.0, 1000.0, 20000.0)
-"""Times tau of the base that a diagnosis tries, s."""
+"""Times tau of the base that identification tries, s."""
 FEW = (1000.0, 20000.0)
-"""The same of the actuation, and of a base that yields with a power of the time."""
+"""Times tau of the actuation, and of a base that yields with a power of the time, s."""
 POWER = 0.5
-"""That power."""
+"""Power of the time of a base that identification tries."""
 
 
 class Drift(Effect):

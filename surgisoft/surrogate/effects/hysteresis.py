@@ -3,8 +3,8 @@
 A play operator of radius r follows its input through a gap of width 2r:
 y(t) = clamp(y(t-), u(t) - r, u(t) + r) (Krasnosel'skii & Pokrovskii 1989, ch. 1). Many of them
 remember every reversal that no larger one has wiped out. In a soft arm friction sits in the wall,
-and the strain of a wall line is moved by several chambers at once; as in a vector hysteron model
-(Mayergoyz 2003, ch. 3), plays therefore run along several lines l of the actuation space,
+and several chambers at once move the strain of a wall fibre; as in a vector hysteron model
+(Mayergoyz 2003, ch. 3), play operators therefore run along several lines l of the actuation space,
 
     u_l = sum_i a_li x_i + sum_ij b_lij x_i x_j,      x = actuation scaled to [-1, 1],
 
@@ -25,14 +25,14 @@ from surgisoft.surrogate.effects.wall_fibres import RINGS, fibre_matrix
 from surgisoft.surrogate.scan import play_scan
 
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
-"""Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
-the half range (a larger radius never moves)."""
+"""Radii of the play operators, in units of half a line's range: fine for small reversals, and up to
+nearly the half range (an operator of a larger radius never moves)."""
 OTHERS = (0.0, -0.2, -0.4)
-"""Shares of the other chambers in a line that a diagnosis tries."""
+"""Shares of the other chambers in a line that identification tries."""
 SECTION = {3: -0.2, 4: 0.2}
 """Shares of the neighbours in the lines of a plane section: four fifths of a strain bend."""
 FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
-"""Radii where a diagnosis asks whether there is any play."""
+"""Radii for the question whether there is any play."""
 
 
 class Hysteresis(Effect):
@@ -49,7 +49,7 @@ class Hysteresis(Effect):
         others: float = 0.0,
         section: bool = False,
     ):
-        """Radii of the plays, in units of half a line's range.
+        """Radii of the play operators, in units of half a line's range.
 
         ring: the chambers are alike and stand in a ring, so that one chamber's weights, turned,
         are those of all; pairs: lines along pairs of neighbours beside those along one chamber;

@@ -38,7 +38,7 @@ GRID = (
     (2.0, 0.4),
     (4.0, 0.4),
 )
-"""(frequency in Hz, damping ratio) that a diagnosis tries."""
+"""(frequency in Hz, damping ratio) that identification tries."""
 
 
 class Inertia(Effect):

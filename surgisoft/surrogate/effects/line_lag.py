@@ -41,9 +41,9 @@ CHAIN = 3
 USUAL = 0.1
 """Difference, as a share of the range, at which the time constants are stated."""
 LAMINAR = 100.0
-"""Difference, as a share of the range, up to which flow is laminar unless told otherwise."""
+"""Difference, as a share of the range, up to which flow is laminar by default."""
 TURBULENT = 0.003
-"""The same for the turbulent flow that a diagnosis tries."""
+"""Difference up to which the turbulent flow that identification tries is laminar."""
 GRID = (
     (0.05, 0.05, 0.02, LAMINAR),
     (0.15, 0.15, 0.02, LAMINAR),
@@ -64,7 +64,7 @@ GRID = (
     (0.35, 0.7, 0.02, TURBULENT),
     (0.6, 1.2, 0.02, TURBULENT),
 )
-"""(filling, emptying, dead time) in s and the difference of the turn that a diagnosis tries."""
+"""(filling, emptying, dead time) in s and the difference of the turn that identification tries."""
 TOLERANCE = 1e-6
 """Change of a whole recording's lag, as a share of the range, at which its iteration ends."""
 

@@ -5,9 +5,9 @@ Euler-Bernoulli beam on the bent centreline r(s) (Love 1927, ch. XVIII; `effects
     M(s) = (r_tip - r(s)) x F + int_s^L (r(s') - r(s)) x w ds',
     theta(s) = C int_0^s M ds,     u(s) = int_0^s theta x dr,     q = p + u.
 
-Shapes alone tell C F and C w, compliance times load. They are given as the sag that they cause at
-the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8. Where gravity's
-direction is not known, each is a vector in the base frame.
+The shape of an arm determines only C F and C w, compliance times load. They are given as the sag
+that they cause at the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8.
+Where gravity's direction is not known, each is a vector in the base frame.
 """
 
 import torch

@@ -1,13 +1,13 @@
 """Softening: the wall is softer below the largest load that it has seen (Mullins 1969).
 
-As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall line's load, its
+As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall fibre's load, its
 largest value so far W_max, and an exponential instead of the error function:
 
     x_eff = x + own A' (u d(W, W_max)) / |A| + common x d(V, V_max),   u = A x / |A|,
     d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
     W_i = u_i^2,   V = sum_i x_i^2 / m.
 
-A mixes the chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm
+A mixes the chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm
 shortens the wall on the other side. On a first loading W = W_max and nothing changes.
 """
 
@@ -27,9 +27,9 @@ from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
-"""Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
+"""Widths that identification tries, in units of the energy at full load, and their growths."""
 OTHERS = -0.35
-"""Share of the other chambers in a wall line's load that a diagnosis tries."""
+"""Share of the other chambers in a wall fibre's load that identification tries."""
 
 
 class Softening(WallFibres):
@@ -47,8 +47,8 @@ class Softening(WallFibres):
     ):
         """width: fall of the energy over which the wall turns soft, in units of that at full load.
 
-        growth: what that grows by, as a share of the largest energy; others, ring: the wall lines'
-        loads (`wall_lines`).
+        growth: share of the largest energy that is added to the width; others, ring: the mixture of
+        the wall fibres' loads (`fibre_matrix`).
         """
         super().__init__(facts)
         self.own = amplitude(1)
@@ -64,7 +64,7 @@ class Softening(WallFibres):
         return [self.others]
 
     def energy(self, signal: Tensor) -> Tensor:
-        """(..., K + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
+        """(..., K + 1) energy of each fibre and the chambers' mean, from actuation (..., m)."""
         load = self.load(signal)
         own, mean = (load @ self.fibres.T).square(), load.square().mean(-1, keepdim=True)
         return torch.cat([own, mean], dim=-1)
@@ -82,7 +82,7 @@ class Softening(WallFibres):
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at strength one: own and common."""
+        """Two (..., m) shifts of the actuation at amplitude one: own and common."""
         below = (memory - self.energy(signal)).clamp(min=0)
         damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
         load, fibres = self.load(signal), self.fibres

@@ -1,6 +1,6 @@
 """Stiffening: the wall resists more, the farther it is strained.
 
-The share of push that is lost grows with the load u of each wall line and with the bending of the
+The share of push that is lost grows with the load u of each wall fibre and with the bending of the
 arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
     x_eff = x - own A' (u h(u^2)) / |A| - bend x h(B^2),   u = A x / |A|,
@@ -9,8 +9,8 @@ arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
 with B = 1 where one chamber alone is fully loaded; of four chambers, which stand in a ring, opposed
 ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A mixes the
-chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm shortens the
-wall on the other side.
+chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm shortens
+the wall on the other side.
 """
 
 import torch
@@ -29,9 +29,9 @@ from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = (0.1, 2.0, 5.0)
-"""Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
+"""Steepnesses k that identification tries: nearly cubic, and exponential."""
 OTHERS = -0.35
-"""Share of the other chambers in a wall line's load that a diagnosis tries."""
+"""Share of the other chambers in a wall fibre's load that identification tries."""
 
 
 class Stiffening(WallFibres, Memoryless):
@@ -44,7 +44,7 @@ class Stiffening(WallFibres, Memoryless):
     ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
-        others, ring: the wall lines' loads (`wall_lines`).
+        others, ring: the mixture of the wall fibres' loads (`fibre_matrix`).
         """
         super().__init__(facts)
         self.own = amplitude(1)
@@ -56,7 +56,7 @@ class Stiffening(WallFibres, Memoryless):
         return {"own": self.own, "bend": self.bend}
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at strength one: own and bending."""
+        """Two (..., m) shifts of the actuation at amplitude one: own and bending."""
         x, k = self.load(signal), self.log_steepness.exp()
         m = x.shape[-1]
         if m == 4:

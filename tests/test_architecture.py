@@ -17,7 +17,16 @@ MAY_IMPORT = {
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
     "agents": {"scene", "surrogate", "measurement", "rig", "tasks", "report"},
-    "experiments": {"agents", "scene", "measurement", "rig", "tasks", "replay", "report"},
+    "experiments": {
+        "agents",
+        "scene",
+        "surrogate",
+        "measurement",
+        "rig",
+        "tasks",
+        "replay",
+        "report",
+    },
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {

@@ -6,7 +6,7 @@ of time, leaves out zero and where it is worth having.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -14,8 +14,9 @@ import numpy as np
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.problem import Problem, pose
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 
 LEAST_FALL = 0.05
@@ -106,6 +107,8 @@ class Amendment:
     """The error along the open and along the locked part."""
     seconds: float
     """Time that it took, s."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def claimed(self) -> bool:
@@ -133,24 +136,31 @@ class Amendment:
             "error_open_mm": asdict(opened) | {"ci95": list(opened.ci95)},
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
+            "notes": list(self.notes),
             "seconds": self.seconds,
         }
 
 
+@on_one_thread
 def amend(
-    model: ArmModel,
-    recordings: list[Recording],
-    names: list[str],
+    model: Model,
+    recordings: Recordings,
+    effects: str | Iterable[str],
     retune_network: bool = True,
     progress: Progress | None = None,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
+    Model and recordings may be given by their paths.
+
+    effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
     effects alone make the error fall.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
+    names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
     problem = pose(model, recordings, part="open")
     tell(f"fitting {' + '.join(names)}")
@@ -165,6 +175,8 @@ def amend(
     alone = fall_of(locked, locked.with_model(fitted.model))
     if retuned and not (alone.claimed and fall_of(locked, locked.with_model(better)).claimed):
         better, retuned = fitted.model, False
+    # The residuals of the fit say nothing of a network that was re-tuned since.
+    better.training_residuals = None if retuned else model.training_residuals
     pairs = [(part, part.with_model(better)) for part in (problem, locked)]
     return Amendment(
         model=better,
@@ -177,6 +189,7 @@ def amend(
         retuned=retuned,
         tracks=(track_of(*pairs[0]), track_of(*pairs[1])),
         seconds=time.perf_counter() - begin,
+        notes=notes,
     )
 
 

@@ -10,10 +10,11 @@ from surgisoft.diagnosis.comparing.axes import AxisShare, shares
 from surgisoft.diagnosis.comparing.bands import Band, bands
 from surgisoft.diagnosis.comparing.ceiling import Ceiling, ceiling
 from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, repeat_floor
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe
 from surgisoft.measurement.recordings.recording import Recording
-from surgisoft.surrogate.model import ArmModel
 
 WORST = 5
 """Worst moments that are listed."""
@@ -83,6 +84,8 @@ class Comparison:
     """Error and bias in bands of every axis."""
     worst: tuple[Moment, ...]
     """The worst moments, each from another stretch of time."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def explainable(self) -> float | None:
@@ -140,11 +143,12 @@ class Comparison:
             "ceiling_ci95_mm": top and top["ci95_mm"],
             "explainable": self.explainable,
         }
-        return _known(values)
+        return json_safe(values)
 
 
-def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, Residuals]:
-    """Evaluate a model on recordings."""
+def compare(model: Model, recordings: Recordings) -> tuple[Comparison, Residuals]:
+    """Evaluate a model on recordings; both may be given by their paths."""
+    model, recordings, notes = open_inputs(model, recordings)
     rest = residuals(model, recordings)
     square = np.square(rest.error_mm)
     seen = ~np.isnan(square).all(axis=1)
@@ -176,6 +180,7 @@ def compare(model: ArmModel, recordings: list[Recording]) -> tuple[Comparison, R
             missing=int((~seen).sum()),
             bands=tuple(bands(rest)),
             worst=tuple(_worst(rest, recordings)),
+            notes=notes,
         ),
         rest,
     )
@@ -226,15 +231,6 @@ def _root_interval(square: np.ndarray, block: np.ndarray) -> tuple[float, float]
 
 def _mm(value: float) -> str:
     return f"{value:.2f} mm" if value >= 0.095 else f"{value:.3f} mm"
-
-
-def _known(value):
-    """The value with None for NaN, which JSON cannot say; through dicts and lists."""
-    if isinstance(value, dict):
-        return {name: _known(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(each) for each in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _nanmean(values: np.ndarray) -> float:

@@ -8,7 +8,7 @@
 """
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +17,15 @@ from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
 from surgisoft.diagnosis.estimation.effects import refined
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    identification_problem,
+    on_one_thread,
+    open_inputs,
+)
 from surgisoft.diagnosis.kind import kind_of, unnamed
-from surgisoft.diagnosis.problem import Problem, locked_rows, pose, with_reference
+from surgisoft.diagnosis.problem import Problem, locked_rows
 from surgisoft.diagnosis.race.blackbox import BlackBox, black_box
 from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.gates import first_shares, studentised
@@ -90,25 +97,27 @@ class Findings:
         return picked_by(self.named)
 
 
+@on_one_thread
 def diagnose(
-    model: ArmModel,
-    recordings: list[Recording],
+    model: Model,
+    recordings: Recordings,
     progress: Progress | None = None,
-    reference: list[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | KnownError | None = None,
     without: Collection[str] = (),
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
+    Model and recordings may be given by their paths.
+
     without: effects that cannot be, such as a contact on a bench without anything to lean on.
-    reference: recordings from before something changed, or what the model's folder keeps of those
-    of its fit; where given, the question is what has changed since.
+    reference: recordings from before something changed; without them the residuals that the model
+    keeps of its fit. Where there is one of them, the question is what has changed since.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
+    model, recordings, notes = open_inputs(model, recordings)
     report("predicting")
-    problem = pose(model, recordings, part="open")
-    if reference is not None:
-        problem = with_reference(problem, reference)
+    problem = identification_problem(model, recordings, reference)
     report("columns of the effects")
     names = known_effects()
     for name in without:
@@ -118,7 +127,7 @@ def diagnose(
     said = answer(find(problem, tried, report))
     if said.verdict.kind == "unknown_effect":
         said = with_axis(said, model, recordings)
-    return replace(said, seconds=time.perf_counter() - begin)
+    return replace(said, notes=notes, seconds=time.perf_counter() - begin)
 
 
 def with_axis(said: Diagnosis, model: ArmModel, recordings: list[Recording]) -> Diagnosis:

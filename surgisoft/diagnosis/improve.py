@@ -7,7 +7,7 @@ the errors of all rounds, and decides nothing but whether the whole fall is clai
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
@@ -15,6 +15,7 @@ from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.estimation.effects import fit_effects, fit_plausible
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
@@ -71,6 +72,8 @@ class Improvement:
     """The error along the open and along the locked part."""
     seconds: float
     """Time that it took, s."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -99,18 +102,22 @@ class Improvement:
             "error_mm": asdict(self.locked) | {"ci95": list(self.locked.ci95)},
             "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
+            "notes": list(self.notes),
             "seconds": self.seconds,
         }
 
 
+@on_one_thread
 def improve(
-    model: ArmModel,
-    recordings: list[Recording],
+    model: Model,
+    recordings: Recordings,
     most_effects: int = MOST_EFFECTS,
     progress: Progress | None = None,
-    reference: list[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | KnownError | None = None,
 ) -> Improvement:
     """Add effect after effect to a model, until no gate lets another through.
+
+    Model and recordings may be given by their paths.
 
     reference: as for `diagnose`.
     """
@@ -118,6 +125,8 @@ def improve(
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
+    model, recordings, notes = open_inputs(model, recordings)
+    reference = model.training_residuals if reference is None else reference
     problem = pose(model, recordings, part="open")
     models, rounds, parameters = [model], [], ()
     added: list[str] = []
@@ -161,6 +170,10 @@ def improve(
         why = f"held-out motion rewards a re-tuned network by {100 * tuned.gain:.0f} %"
         models.append(tuned.model)
         note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
+    if models[-1] is not model:
+        kept = not (added and tuned.kept)
+        # The residuals of the fit say nothing of a network that was re-tuned since.
+        models[-1].training_residuals = model.training_residuals if kept else None
     locked = pose(model, recordings, EVERY_ROW, part="locked")
     judged = iter([locked.with_model(one) for one in models[1:]])
     final, shown = locked, []
@@ -174,6 +187,7 @@ def improve(
         locked=fall_of(locked, final),
         tracks=(track_of(problem, problem.with_model(models[-1])), track_of(locked, final)),
         seconds=time.perf_counter() - begin,
+        notes=notes,
     )
 
 

@@ -87,6 +87,8 @@ class Diagnosis:
     """What would tell the rivals apart; None where nothing is open."""
     checks: tuple[str, ...] = ()
     """What is wrong or weak with the data, said before anything is named."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
     axis: str | None = None
     """The axis that what is left depends on most, where it is known."""
     seconds: float = 0.0

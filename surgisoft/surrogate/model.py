@@ -1,6 +1,7 @@
 """The arm model: a network between line and material effects in front, body and sensor behind."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -12,11 +13,15 @@ from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 
+if TYPE_CHECKING:
+    from surgisoft.surrogate.known_error import KnownError
+
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
 share of its range."""
 
 Network = HawNN | ConstantCurvature | RecurrentArm
+"""What may stand in the middle of the chain."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,9 @@ class ArmModel(nn.Module):
 
     Both walk the same `Chain` and agree.
     """
+
+    training_residuals: "KnownError | None" = None
+    """Residuals of the model on rows of its own fit; None where they are not known."""
 
     def __init__(
         self,
@@ -73,7 +81,11 @@ class ArmModel(nn.Module):
         rest_mm: Tensor | None = None,
         validation: Validation | None = None,
     ) -> "ArmModel":
-        """A model with some parts replaced; it shares all others with this one."""
+        """A model with some parts replaced; it shares all others with this one.
+
+        Training residuals belong to the network and effects that were fitted together: a model
+        with another network or other effects has none.
+        """
         fresh = ArmModel(
             spec or self.spec,
             network or self.network,
@@ -81,6 +93,8 @@ class ArmModel(nn.Module):
             self.rest_mm if rest_mm is None else rest_mm,
             validation or self.validation,
         )
+        if network is None and effects is None:
+            fresh.training_residuals = self.training_residuals
         return fresh.to(self.rest_mm.device).train(self.training)
 
     @property

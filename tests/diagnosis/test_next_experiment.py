@@ -22,7 +22,12 @@ from surgisoft.diagnosis.next_experiment.catalogue import (
     schedule_text,
 )
 from surgisoft.diagnosis.next_experiment.plans import make_plans
-from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
+from surgisoft.diagnosis.next_experiment.propose import (
+    likely_rivals,
+    next_experiment,
+    propose,
+    recommend,
+)
 from surgisoft.diagnosis.next_experiment.question import pose_question
 from surgisoft.diagnosis.next_experiment.words import words_for
 from surgisoft.diagnosis.problem import pose
@@ -269,7 +274,7 @@ def test_after_a_change_by_hand_the_new_recording_is_diagnosed_alone(tmp_path, l
     model = str(files("surgisoft") / "assets" / "default_arm")
     data, out = tmp_path / "r.parquet", tmp_path / "s.csv"
     save_recording(lagging, data)
-    answer = recommend(pose(default_arm(), [lagging]), ["line_lag", "rate_dependence"])
+    answer = next_experiment(default_arm(), [lagging], ["line_lag", "rate_dependence"])
     arguments = ["next-experiment", model, str(data), "-o", str(out)]
     assert run([*arguments, "--between", "line_lag", "rate_dependence"]) == 0
     printed = capsys.readouterr().out

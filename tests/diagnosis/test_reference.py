@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from surgisoft.cli import run
 from surgisoft.diagnosis.diagnose import diagnose
@@ -99,7 +100,11 @@ def test_a_fitted_model_keeps_where_it_is_off(tmp_path):
     np.testing.assert_array_equal(known.actuation, history.pressure[0, ::step])
     off = before.key_points_mm - model.predict(history)[0].numpy()
     np.testing.assert_allclose(known.residual_mm, off[::step], atol=1e-4)
-    save_model(model, tmp_path / "arm", force=True)  # an amended one: what was known is void
+    assert torch.equal(model.training_residuals.residual_mm, known.residual_mm)
+    save_model(model, tmp_path / "again")
+    assert torch.equal(load_known_error(tmp_path / "again").residual_mm, known.residual_mm)
+    model.training_residuals = None
+    save_model(model, tmp_path / "arm", force=True)
     assert load_known_error(tmp_path / "arm") is None
 
 

@@ -10,7 +10,6 @@ import torch
 import trimesh
 
 from surgisoft.cli import run
-from surgisoft.cli.arms import reaches_of
 from surgisoft.errors import InputError
 from surgisoft.scene.author import check_target
 from surgisoft.scene.capsules import ArmShape
@@ -22,6 +21,7 @@ from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.reach import reaches_of
 from surgisoft.tasks.world.world import WorldConfig, lone_arm
 from tests.scene.shapes import ball, box, lumpy
 

@@ -6,10 +6,19 @@ expected log probability of naming the right rival, over all pairs, whichever is
 Reiner 1965; Box & Hill 1967). The same is done for every change of the bench that touches a rival.
 """
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    identification_problem,
+    on_one_thread,
+    open_inputs,
+)
 from surgisoft.diagnosis.isolability.matrix import SURE, Isolability
 from surgisoft.diagnosis.next_experiment.catalogue import (
     AS_IT_STANDS,
@@ -34,7 +43,10 @@ from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import known_effects, make_effect
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
 MINUTES = 15.0
@@ -73,6 +85,8 @@ class Recommendation:
     """Options of `surgisoft collect` for the change of the bench on the virtual rig."""
     isolability: Isolability | None = field(default=None, repr=False)
     """What the recordings and the experiment together say about the rivals."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def separates(self) -> tuple[tuple[str, str], ...]:
@@ -121,7 +135,36 @@ class Recommendation:
                 {"effects": list(p.effects), "before": p.before, "after": p.after}
                 for p in self.pairs
             ],
+            "notes": list(self.notes),
         }
+
+
+@on_one_thread
+def next_experiment(
+    model: Model,
+    recordings: Recordings = (),
+    between: Sequence[str] | None = None,
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETTINGS),
+    reference: Sequence[Recording] | KnownError | None = None,
+) -> Recommendation:
+    """The experiment that best distinguishes competing effects.
+
+    Model and recordings may be given by their paths. The recordings are looked at as `diagnose`
+    does: the training part, the direction of gravity, the residuals of the model's fit.
+
+    between: the competing effects; without them those that explain the recordings best, and
+    without recordings all known ones.
+    settings: names of the changes of the bench that may be asked for.
+    reference: as for `diagnose`.
+    """
+    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not given:
+        return propose(load_model(model), between, minutes, settings)
+    arm, measured, notes = open_inputs(model, given)
+    problem = identification_problem(arm, measured, reference)
+    found = recommend(problem, between or likely_rivals(problem), minutes, settings)
+    return replace(found, notes=notes)
 
 
 def recommend(

@@ -1,4 +1,4 @@
-"""The named physical effects; a file's stem is the name that is printed."""
+"""The physical effects by name: one file each, whose stem is the name."""
 
 from collections.abc import Iterable
 from pathlib import Path

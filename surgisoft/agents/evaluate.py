@@ -148,7 +148,7 @@ def episode_table(
 def _in_view(task: Task, played: Rollout) -> Tensor:
     """(N,) share of the steps at which the endoscope sees as much as the scene asks for."""
     seen = played.measures["view_fraction"]
-    enough = (seen >= task.world.surroundings.spec.limits.view_fraction).float()
+    enough = (seen >= task.world.scene.spec.limits.view_fraction).float()
     return enough.where(seen.isfinite(), seen).nanmean(1)
 
 

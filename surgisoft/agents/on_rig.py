@@ -25,9 +25,9 @@ from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import Arm, ArmPart
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import Objects
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.random_streams import Stream
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,13 @@ class Reading:
 class RigArm:
     """An arm of the world whose plant is a batch of rigs; see `Arm` for each attribute and method.
 
-    Predictions (`foresee`, `settled`) come from the arm's model within the rig's pressure limits.
+    Predictions (`predict`, `settled`) come from the arm's model within the rig's pressure limits.
     Holds no state: the rigs are in `ArmPart.plant`.
     """
 
-    def __init__(self, arm: Arm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig):
+    def __init__(
+        self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig
+    ):
         """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
         self.config, self.build = config, build
         rig = build(config, 0)
@@ -169,20 +171,20 @@ class RigArm:
         shift = shift + self.config.pump_gain * surprise
         return stream, self._observed(replace(part, command=target + shift), reading)
 
-    def foresee(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
-        """One-step prediction of the key points, see `Arm.foresee`, with the estimated offset."""
-        return self.simulated.foresee(part, pressure, dt_s)
+    def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """One-step prediction of the key points, see `Arm.predict`, with the estimated offset."""
+        return self.simulated.predict(part, pressure, dt_s)
 
     def settled(self, pressure: Tensor) -> Tensor:
         """The model's steady-state key points, see `Arm.settled`."""
         return self.simulated.settled(pressure)
 
     def bent(self, part: ArmPart, pressure: Tensor, dt_s: float):
-        """The model's state and key points, see `Arm.bent`."""
+        """The model's state and key points, see `ModelArm.bent`."""
         return self.simulated.bent(part, pressure, dt_s)
 
     def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
-        """The part with its body where the key points are, see `Arm.posed`."""
+        """The part with its body where the key points are, see `ModelArm.posed`."""
         return self.simulated.posed(part, points_mm)
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
@@ -235,7 +237,7 @@ class RigArm:
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
 
 
-def _limited(arm: Arm, low: Tensor, high: Tensor) -> Arm:
+def _limited(arm: ModelArm, low: Tensor, high: Tensor) -> ModelArm:
     """The arm within pressures low, high (m,) kPa besides its own."""
     limited = copy.copy(arm)
     limited.low, limited.high = torch.maximum(arm.low, low), torch.minimum(arm.high, high)
@@ -248,8 +250,8 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtua
     Tasks ask their world for its arms, so that this exchanges the world only.
     """
     config = config or RigConfig()
-    world, moved = copy.copy(task.world), copy.copy(task)
+    world, moved = task.world, copy.copy(task)
     dt_s = world.config.dt_s
-    world.arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
-    moved.world = world
+    arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
+    moved.world = world.with_arms(arms)
     return moved

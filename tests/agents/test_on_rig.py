@@ -117,7 +117,7 @@ def test_task_and_world_have_the_same_arm(task):
     assert moved.arm is moved.world.arms["arm"]
     assert task.arm is task.world.arms["arm"] is not moved.arm
     cut = on_rig(CircleAblation(), RigConfig(settle_s=0.2))
-    assert {name: aim.arm for name, aim in cut.aims.items()} == cut.world.arms
+    assert {name: each.arm for name, each in cut.pointing.items()} == cut.world.arms
 
 
 def test_without_noise_cameras_see_the_truth(task):
@@ -125,7 +125,7 @@ def test_without_noise_cameras_see_the_truth(task):
     part = state.world.arms["arm"]
     torch.testing.assert_close(part.seen_mm, part.points_mm)
     # The prediction for the present pressure is the estimate: the offset takes the model there.
-    predicted = task.arm.foresee(part, part.pressure, 1e-3)
+    predicted = task.arm.predict(part, part.pressure, 1e-3)
     torch.testing.assert_close(predicted, part.seen_mm, atol=2e-2, rtol=0.0)
 
 

@@ -1,20 +1,30 @@
 """States are pytrees: frozen dataclasses, mappings and tuples of tensors, the batch in front."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import fields, is_dataclass, replace
-from typing import Generic, TypeVar
+from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import Field, fields, is_dataclass, replace
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import torch
 from torch import Tensor
 
 Tree = TypeVar("Tree")
 Thing = TypeVar("Thing")
 
 
+class TensorDataclass(Protocol):
+    """A frozen dataclass whose fields are tensors (B, ...) or pytrees of them."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
 class Objects(Generic[Thing]):
     """A batch of B things that are no tensors, one for each environment, such as simulated plants.
 
     `rows` and `with_rows` choose among the things as they choose among the rows of tensors. The
-    things themselves are never copied: two states may hold the same one.
+    things themselves are never copied: two states may hold the same one, and where a step changes
+    it, only the new state may be stepped again.
     """
 
     def __init__(self, things: Iterable[Thing]):
@@ -68,7 +78,7 @@ def rows(tree: Tree, index: Tensor) -> Tree:
 def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
     """The pytree with the environments at index (R,) int64 replaced by those of `fresh`.
 
-    Out of place, and nothing is blended: a nan that is replaced is gone.
+    Out of place; values are copied, never blended, so a nan that is replaced leaves no trace.
     """
 
     def replaced(old: Objects, new: Objects) -> Objects:
@@ -80,3 +90,8 @@ def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
     return tree_map(
         lambda old, new: old.index_copy(0, index, new.to(old.dtype)), tree, fresh, objects=replaced
     )
+
+
+def overwritable(tensor: Tensor) -> bool:
+    """Whether PyTorch allows a write here: a tensor made under inference_mode only inside one."""
+    return torch.is_inference_mode_enabled() or not tensor.is_inference()

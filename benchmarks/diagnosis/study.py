@@ -63,7 +63,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     begin = time.process_time()
     torch.set_num_threads(1)
     model = base_model(case.robot, folder, case.undertrained)
-    if case.surrogate_mm > model.validation["rmse_mm"]:
+    if case.surrogate_mm > model.validation.rmse_mm:
         model = bent(model, case.robot, case.surrogate_mm, case.take)
     known = KnownError.of(model, [validation_of(case.robot)])
     recorded = record(case)
@@ -83,7 +83,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
         ranking=tuple(row.effect for row in found.ranking),
         confidence=found.ranking[0].confidence if found.ranking else 0.0,
         effect_mm=recorded.effect_mm,
-        surrogate_mm=model.validation["rmse_mm"],
+        surrogate_mm=model.validation.rmse_mm,
         seconds=seconds,
         statistics=found.statistics,
         settled=settled,

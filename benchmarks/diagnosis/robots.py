@@ -74,8 +74,9 @@ def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
                 if name in noise:
                     value.add_(middle * noise[name])
         rows = Data(history, history, None).judging_rows(answer)
-        answer.validation |= validated_error(rows.target, model_rows(answer, rows))
-        if answer.validation["rmse_mm"] < wanted_mm:
+        found = validated_error(rows.target, model_rows(answer, rows))
+        answer.validation = replace(found, noise_mm=model.validation.noise_mm)
+        if found.rmse_mm < wanted_mm:
             low = middle
         else:
             high = middle

@@ -101,7 +101,7 @@ def evaluate(
             "dt_s": own.world.config.dt_s,
             "confidence": 0.95,
         }
-        about["drivers"] = {result.driver: result.to_json() for result in results}
+        about["drivers"] = {result.policy: result.to_json() for result in results}
         write_json(json_file, about)
         print(f"wrote {json_file}")
     if replay:
@@ -141,14 +141,14 @@ def _rig_config(
 
 def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | None, scene):
     """The task to play and its configuration as a table; a run brings its own."""
-    from surgisoft.agents.policies import DRIVERS, check_driver
+    from surgisoft.agents.policies import POLICIES, check_policy
     from surgisoft.agents.run_folder import RunFolder
     from surgisoft.config import to_table
     from surgisoft.tasks.registry import TASKS, config_of, make_task, read_config, with_fields
 
     for name in drivers:
-        check_driver(name)
-    runs = [RunFolder(name) for name in drivers if name not in DRIVERS]
+        check_policy(name)
+    runs = [RunFolder(name) for name in drivers if name not in POLICIES]
     if task is None and not runs:
         raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
     task = task or runs[0].config["task"]
@@ -169,11 +169,11 @@ def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | 
 def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool, on: str, logged):
     """Each driver's evaluation, and the first episode's log of those that are to be logged."""
     from surgisoft.agents.evaluate import evaluate as evaluate_driver
-    from surgisoft.agents.policies import open_driver
-    from surgisoft.agents.selection import FirstEpisode
+    from surgisoft.agents.policies import open_policy
+    from surgisoft.agents.rollout import EpisodeRecorders
 
-    opened = {name: open_driver(name, task) for name in drivers}
-    first = {name: FirstEpisode(task, name, seed, on) for name in logged}
+    opened = {name: open_policy(name, task) for name in drivers}
+    first = {name: EpisodeRecorders(task, name, seed, on, only=0) for name in logged}
     results = []
     for name, driver in opened.items():
         watch = first.get(name)
@@ -183,14 +183,14 @@ def _evaluated(task, drivers: list[str], episodes: int, seed: int, referee: bool
                     task, name, driver, episodes, seed, referee, progress=report, watch=watch
                 )
             )
-    return results, {name: each.log() for name, each in first.items()}
+    return results, {name: each.log(0) for name, each in first.items()}
 
 
 def _show(results) -> None:
     from surgisoft.agents.evaluate import RATES
 
     names = list(dict.fromkeys(name for result in results for name in result.overall))
-    rows = [["", *(Path(result.driver).name for result in results)]]
+    rows = [["", *(Path(result.policy).name for result in results)]]
     for name in names:
         cells = (_cell(result.overall.get(name), name in RATES) for result in results)
         rows.append([name, *cells])
@@ -199,10 +199,10 @@ def _show(results) -> None:
         held = "".join(f"   {cell:>{w}s}" for cell, w in zip(cells, widths[1:], strict=True))
         print(f"{first:{widths[0]}s}{held}")
     for result in results:
-        if result.verdicts is not None:
+        if result.checks is not None:
             facts = result.to_json()["referee"]
             print(
-                f"referee on {Path(result.driver).name}: {facts['instants']:,} instants; the "
+                f"referee on {Path(result.policy).name}: {facts['instants']:,} instants; the "
                 f"batched path differs on contact at {facts['contact_differs']}, on what the beam "
                 f"meets at {facts['beam_differs']}, on where within {facts['beam_off_mm']:.1g} mm"
             )

@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.intervals import Parameter
+from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.problem import Problem, pose
-from surgisoft.diagnosis.refinement.effects import fit_effects
-from surgisoft.diagnosis.refinement.intervals import Parameter
-from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 

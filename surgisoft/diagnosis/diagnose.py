@@ -16,6 +16,7 @@ import numpy as np
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
+from surgisoft.diagnosis.estimation.effects import refined
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
@@ -31,7 +32,6 @@ from surgisoft.diagnosis.race.gates import first_shares, studentised
 from surgisoft.diagnosis.race.naming import CHANCE, LEAST_GAIN, SMALL, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
-from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import (
     Diagnosis,
@@ -152,7 +152,8 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     close = _close(first, named)
     if close:
         report(f"shapes of {' and '.join(standing.effect for standing in close)}")
-        race = race.extended(sharpened(problem, race, close))
+        standing = [(one.effect, race.in_place(race.single(one.option))) for one in close]
+        race = race.extended(refined(problem, [one for one in standing if one[1] is not None]))
         first = race.standings()
         named, following = name_effects(race, first)
     base = picked_by(named)

@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.estimation.effects import fit_effects, fit_plausible
+from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
+from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refinement.effects import fit_effects, fit_plausible
-from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
-from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.diagnosis.verdict import Diagnosis
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording

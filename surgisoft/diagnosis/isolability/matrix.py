@@ -286,7 +286,7 @@ def uncertainty_of(
     points, length = model.spec.key_points, length_of(model)
     if noise_mm is None:
         noise_mm = np.full(points, CAMERA_SHARE * length)
-    validated = [value or 0.0 for value in model.validation.get("per_key_point_mm", [])]
+    validated = [value or 0.0 for value in model.validation.per_key_point_mm]
     surrogate = np.array(validated or [0.05 * length] * points)
     return Uncertainty(
         np.asarray(noise_mm, float),

@@ -38,7 +38,7 @@ from surgisoft.measurement.importing.spec import (
 )
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.importing.units import factor
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 

@@ -30,8 +30,8 @@ from surgisoft.measurement.importing.readers import ADVICE, AUTO, NOT_READ, form
 from surgisoft.measurement.importing.ready_maps import READY_MAPS
 from surgisoft.measurement.importing.rotation import parse_rotation
 from surgisoft.measurement.importing.units import check_conversion
+from surgisoft.measurement.recordings import ArmInfo
 from surgisoft.measurement.recordings.columns import MM_PER
-from surgisoft.measurement.recordings.recording import ArmInfo
 from surgisoft.measurement.recordings.sidecar import GravityTable, RecordingTable, Sidecar
 
 

@@ -8,12 +8,16 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.candidates import with_effect
+from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.least_squares import (
+    Prediction,
+    free_parameters,
+    repeated_scan,
+    vector,
+)
+from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.estimation.nuisance import kinds
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refinement.effects import fit_effects
-from surgisoft.diagnosis.refinement.forward import Forward
-from surgisoft.diagnosis.refinement.network import retune
-from surgisoft.diagnosis.refinement.nuisance import kinds
-from surgisoft.diagnosis.refinement.refine import Predictor, free_parameters, vector
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
@@ -30,8 +34,8 @@ NOISE_MM = 0.05
 def bare_arm() -> ArmModel:
     """The network of the default arm without its memory."""
     arm = default_arm()
-    network = arm.network.requires_grad_(False)
-    return ArmModel(arm.spec, network, {}, arm.rest_mm, arm.validation).eval()
+    arm.network.requires_grad_(False)
+    return arm.replace(effects={}).eval()
 
 
 def measured_on(truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0) -> Recording:
@@ -125,12 +129,12 @@ def test_forward_is_the_model_and_its_slopes_are_those_of_autograd():
     arm = with_truth("creep", {"amount": [0.1]}, with_truth("misalignment", {"scale": [0.02]}))
     problem = pose(arm, [measured_on(arm, rows=100)], part="open")
     parameters = free_parameters(arm, ["creep", "misalignment"])
-    forward = Forward(arm, problem, list(arm.effects))
-    predict = Predictor(forward, parameters)
+    forward = repeated_scan(arm, problem, list(arm.effects))
+    predict = Prediction(forward, parameters)
     values = vector(parameters)
     predicted = predict(values)
     assert np.allclose(predicted, problem.predicted, atol=1e-4)
-    slopes = predict.slopes(values, predicted)
+    slopes = predict.sensitivities(values, predicted)
     for place, (name, parameter) in enumerate(parameters.items()):
         if name not in ("creep.amount", "creep.log_tau"):
             continue
@@ -145,7 +149,7 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
     """Half of the default arm's friction is missing: its weights come back, in one instance."""
     truth = default_arm()
     weaker = copy.deepcopy(truth)
-    for strength in weaker.effects["hysteresis"].strengths().values():
+    for strength in weaker.effects["hysteresis"].amplitudes().values():
         strength.mul_(0.5)
     recording = measured_on(truth, rows=300)
     problem = pose(weaker, [recording], part="open")

@@ -18,8 +18,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from surgisoft.diagnosis.estimation.nuisance import held_out_parts
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refinement.nuisance import judging_parts
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 
@@ -55,7 +55,7 @@ def retune(model: ArmModel, problem: Problem) -> Retuned:
     trace = model.trace(problem.history)
     hidden = _hidden(
         network,
-        problem.rows(model.effective(trace.pressure, trace.memory)),
+        problem.rows(trace.behind["material"]),
         problem.rows(trace.direction),
     )
     count = len(hidden)
@@ -63,7 +63,7 @@ def retune(model: ArmModel, problem: Problem) -> Retuned:
     held = np.cov(anywhere.T, bias=True)
     held += 1e-6 * np.trace(held) / len(held) * np.eye(len(held))
     residual = problem.residual.reshape(count, -1)
-    part = judging_parts(problem)
+    part = held_out_parts(problem)
     found = [_held_out(hidden, residual, part, ridge * held) for ridge in RIDGES]
     best = int(np.argmin([np.square(left).sum() for left in found]))
     gain = _gain_by_block(residual, found[best], problem.block)
@@ -77,8 +77,7 @@ def retune(model: ArmModel, problem: Problem) -> Retuned:
     network = copy.deepcopy(network)
     network.layers[-1].weight.copy_(last.weight + change[:-1].T / network.scale[:, None])
     network.layers[-1].bias.copy_(last.bias + change[-1] / network.scale)
-    fresh = ArmModel(model.spec, network, dict(model.effects), model.rest_mm, model.validation)
-    fresh.eval().requires_grad_(False)
+    fresh = model.replace(network=network).eval().requires_grad_(False)
     better = np.nansum(np.square(problem.with_model(fresh).residual)) < total
     return Retuned(fresh if better else model, bool(better), share)
 

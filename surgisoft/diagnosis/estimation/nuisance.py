@@ -1,14 +1,14 @@
-"""The surrogate's own static error as a nuisance that is taken out while an effect is fitted.
+"""Model discrepancy as a nuisance: the network's own static error, projected out of a fit.
 
-What a flexible function of actuation and direction explains at the size of the surrogate's
-validated error is not counted as evidence (generalised least squares under the prior of
-`discrepancy`: Kennedy & O'Hagan 2001). With features F of unit-normal weights, a residual r of one
+What a flexible function of actuation and direction explains at the size of the model's validated
+error is no evidence for an effect (generalised least squares under the prior of `discrepancy`:
+Kennedy & O'Hagan 2001). With features F of unit-normal weights, a residual r of one
 key point has the precision
 
     W = I - F (F' F + ridge I)^-1 F',      ridge = (noise^2 + rows left^2) / validated^2,
 
 left: RMS of what no effect explains, which hangs together over some rows; validated: RMS of the
-surrogate's own error.
+model's own error.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ MOST_PARTS = 5
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
-    """The static error's part of each key point."""
+    """The weights W of each key point's residual."""
 
     features: np.ndarray
     """(S, F) features of actuation and direction."""
@@ -43,7 +43,7 @@ class Nuisance:
 
     @classmethod
     def of(cls, problem: Problem, residual: np.ndarray) -> "Nuisance":
-        """The nuisance of a problem whose effects leave the residual (S, n, 3), mm."""
+        """The weights for a problem whose effects leave the residual (S, n, 3), mm."""
         seen = np.isfinite(residual).all(2)
         square = np.where(seen, np.square(residual).sum(-1), 0.0).sum(0) / np.maximum(
             seen.sum(0), 1
@@ -59,7 +59,7 @@ class Nuisance:
             factors.append(linalg.cho_factor(grams[key] + ridge[k] * np.eye(features.shape[1])))
         return cls(features, seen, tuple(factors))
 
-    def rest(self, field: np.ndarray) -> np.ndarray:
+    def weighted(self, field: np.ndarray) -> np.ndarray:
         """(S, n, 3, ...) W times a field of that shape; zero where nothing was measured."""
         answer = np.empty_like(field)
         for k, factor in enumerate(self.factors):
@@ -71,15 +71,18 @@ class Nuisance:
         return answer
 
     def misfit(self, residual: np.ndarray) -> float:
-        """Sum of squares of a residual (S, n, 3), the static error taken out, mm^2."""
-        return float((self.rest(residual) * np.where(self.seen[..., None], residual, 0.0)).sum())
+        """r' W r of a residual (S, n, 3): its sum of squares without the static error, mm^2."""
+        return float(
+            (self.weighted(residual) * np.where(self.seen[..., None], residual, 0.0)).sum()
+        )
 
 
-def judging_parts(problem: Problem) -> np.ndarray:
-    """(S,) part of the rows that each row is left out with: kinds of runs where there are a few.
+def held_out_parts(problem: Problem) -> np.ndarray:
+    """(S,) part of the rows that each row is held out with.
 
-    What a fit must foresee is motion of another kind, and kinds of motion come in runs. A run that
-    was repeated is no other kind.
+    A fit must predict motion of another kind, and kinds of motion come in runs; so the parts are
+    kinds of runs where there are several, and folds of blocks otherwise. A repeated run is of the
+    same kind.
     """
     _, run = np.unique(problem.history.run_of_row[problem.index].numpy(), return_inverse=True)
     if run.max() + 1 < LEAST_RUNS:

@@ -8,9 +8,9 @@ import pytest
 from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.estimation.effects import refined
 from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.race.ranking import Race
-from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
@@ -63,11 +63,16 @@ def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
 def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
     found = diagnose(default_arm(), [lagging])
     assert found.verdict.effects == ("line_lag",)
-    monkeypatch.setattr(diagnosing, "sharpened", lambda *_: [])
+    monkeypatch.setattr(diagnosing, "refined", lambda *_: [])
     grid = diagnose(default_arm(), [lagging])
     fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
     rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
     assert fine["line_lag"] < 0.7 * rough["line_lag"]
+
+
+def standing_effects(race: Race, standings) -> list:
+    """Effects by name as a race would add each of them."""
+    return [(one.effect, race.in_place(race.single(one.option))) for one in standings]
 
 
 def test_what_is_fitted_is_plausible_small_and_new(lagging):
@@ -75,7 +80,7 @@ def test_what_is_fitted_is_plausible_small_and_new(lagging):
     race = Race.of(problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"]))
     first = race.standings()
     assert {standing.effect for standing in first} >= {"line_lag", "hysteresis"}
-    fitted = sharpened(problem, race, first)
+    fitted = refined(problem, standing_effects(race, first))
     names = [candidate.name for candidate in fitted]
     assert "line_lag" in names
     assert "hysteresis" not in names  # the model has it already
@@ -92,7 +97,7 @@ def test_a_fit_leaves_the_shapes_of_the_grid_as_they_are(lagging):
     standing = race.standings()[0]
     effect = race.in_place(standing.option)
     before = {name: p.detach().clone() for name, p in effect.named_parameters()}
-    assert sharpened(problem, race, [standing])
+    assert refined(problem, standing_effects(race, [standing]))
     after = dict(race.in_place(standing.option).named_parameters())
     assert all(after[name].equal(value) for name, value in before.items())
 

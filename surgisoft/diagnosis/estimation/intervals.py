@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 from torch import Tensor
 
-from surgisoft.diagnosis.refinement.refine import Fit, block_slopes, set_vector
+from surgisoft.diagnosis.estimation.least_squares import Fit, block_slopes, set_vector
 from surgisoft.surrogate.effects import Effect
 
 DRAWS = 400

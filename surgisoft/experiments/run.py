@@ -6,15 +6,12 @@ one go and one that was interrupted give the same rows.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-
-import torch
 
 from surgisoft.agents.run_folder import versions
 from surgisoft.config import write_atomically
@@ -24,7 +21,7 @@ from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
 from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
-from surgisoft.workers import workers
+from surgisoft.workers import torch_threads, workers
 
 Report = Callable[[float, float, str], None]
 
@@ -113,7 +110,7 @@ def run_experiment(
     done = total - sum(job.count for job in left)
     told(done, total, "")
     if processes == 1:
-        with _one_thread():
+        with torch_threads(1):
             for job in left:
                 began = done
 
@@ -166,14 +163,3 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
             f"a process of {processes} was ended from outside, memory may be short; go on with "
             "--resume and fewer --processes"
         ) from None
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread, as in the processes: the order of sums decides about last digits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -23,6 +23,13 @@ MANY = {
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 
+OLD_NAMES = {
+    "--specimen": "--robot-seed",
+    "--take": "--trial",
+    "--trust": "--observer-gain",
+}
+"""Options that were renamed: the old name still works and is not shown."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
@@ -45,9 +52,12 @@ def _root(
 
 
 def spread(arguments: list[str]) -> list[str]:
-    """Repeat each option of `MANY` before every value that follows it."""
+    """Repeat each option of `MANY` before every value that follows it; rename old options."""
     answer, option = [], None
-    for argument in arguments:
+    old = {} if arguments[:1] == ["benchmark"] else OLD_NAMES
+    for given in arguments:
+        name, equals, value = given.partition("=")
+        argument = old.get(name, name) + equals + value
         if argument.startswith("-") and not argument.lstrip("-").replace(".", "").isdigit():
             option = argument if argument in MANY else None
             first = option is not None

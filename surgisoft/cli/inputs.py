@@ -5,8 +5,6 @@ from pathlib import Path
 
 import typer
 
-from surgisoft.errors import InputError
-
 
 def warn(text: str) -> None:
     """One line of warning on standard error."""
@@ -20,16 +18,9 @@ def read_recordings(paths: Iterable[Path]) -> list:
     return load_recordings(paths, on_warning=warn)
 
 
-def hidden_effects(given: Iterable[str] | None) -> list[tuple[str, float]]:
-    """`creep:0.5` as name and strength; without a number 1."""
-    answer = []
-    for text in given or ():
-        name, colon, strength = text.partition(":")
-        try:
-            answer.append((name, float(strength) if colon else 1.0))
-        except ValueError:
-            raise InputError(f"--hidden {text}: expected NAME or NAME:STRENGTH") from None
-    return answer
+def counted(number: int, thing: str) -> str:
+    """`1 episode`, `2,000 episodes`."""
+    return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"
 
 
 def warn_all(notes: Iterable[str]) -> None:

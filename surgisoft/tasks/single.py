@@ -1,7 +1,7 @@
 """Gymnasium's Env and VectorEnv for tasks of one agent; they translate and nothing else.
 
-Importing this registers `surgisoft/NAME-v0`; `gymnasium.make("surgisoft.tasks.single:surgisoft/
-track_circle-v0")` imports it by itself, and `gymnasium.make_vec` takes the batched one.
+`import surgisoft` registers them as `surgisoft/NAME-v0`. `gymnasium.make_vec` makes the batched
+one.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from surgisoft.environments import register
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.numpy_adapter import Port, unseeded
 from surgisoft.tasks.registry import make_task
-
-ONE_ARM = ("track_circle", "track_square", "track_body", "laser_plane", "keyhole")
-"""Tasks of one agent."""
 
 
 def _port(task: str | Task, config, device) -> tuple[Port, str]:
@@ -107,10 +105,4 @@ class BatchedEnv(VectorEnv):
         )
 
 
-for _name in ONE_ARM:
-    gymnasium.register(
-        f"surgisoft/{_name}-v0",
-        entry_point=SingleEnv,
-        vector_entry_point=BatchedEnv,
-        kwargs={"task": _name},
-    )
+register()

@@ -5,10 +5,20 @@ from pathlib import Path
 
 import typer
 
+from surgisoft.errors import InputError
+
 
 def warn(text: str) -> None:
     """One line of warning on standard error."""
     typer.echo(f"surgisoft: warning: {text}", err=True)
+
+
+def check_model(folder: Path) -> None:
+    """Raise where there is no model, before anything is loaded that takes seconds."""
+    if str(folder) != "default" and not (folder / "config.json").is_file():
+        raise InputError(
+            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+        )
 
 
 def read_recordings(paths: Iterable[Path]) -> list:

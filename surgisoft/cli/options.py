@@ -41,8 +41,8 @@ EffectFiles = Annotated[
         "--effect-file",
         metavar="FILE.py...",
         callback=_register,
-        help="Files of user-defined effects (docs/effects.md): models may hold them, and diagnose, "
-        "improve and next-experiment consider them. The files are run: trust them.",
+        help="Files of user-defined effects (docs/effects.md) that a model holds or may lack. The "
+        "files are run: name only those that you trust.",
     ),
 ]
 """Of every command that opens a model. The effects are registered when the command line is read."""

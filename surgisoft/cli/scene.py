@@ -1,4 +1,4 @@
-"""`surgisoft scene new`, `check` and `show`: author, judge and look at a scene."""
+"""`surgisoft scene new`, `check` and `show`: make, check and view a scene."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,9 @@ from surgisoft.cli.progress import progress
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
 app.add_typer(commands, name="scene")
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a scene (or scene.toml).")]
+Folder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder of a scene (or scene.toml), or phantom_liver.")
+]
 Vector = tuple[float, float, float]
 
 
@@ -51,10 +53,12 @@ def new(
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
     from surgisoft.scene.spec import TOOLS, MountSpec
-    from surgisoft.tasks.world.reach import reach_of
 
     request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
     check_target(output, force)
+
+    from surgisoft.tasks.world.reach import reach_of
+
     blank = {tool: MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in TOOLS}
     reaches = {tool: reach_of(mount) for tool, mount in blank.items()}
     try:
@@ -82,7 +86,7 @@ def check(
     ] = None,
     effect_files: EffectFiles = None,
 ) -> int:
-    """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
+    """Check a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
     from surgisoft.scene.check import check_scene, reach_patch
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
@@ -91,11 +95,13 @@ def check(
     reaches = reaches_of(scene)
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
-    _print_check(verdict)
-    if picture is not None and verdict.work is not None:
+    drawn = picture is not None and verdict.work is not None
+    if drawn:
         from surgisoft.replay.reach_map import draw_reach_map
 
         draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)
+    _print_check(verdict)
+    if drawn:
         print(f"wrote {picture}")
     return 0 if verdict.good else 1
 
@@ -158,6 +164,8 @@ def _request(meshes, unit, lesion, direction, diameter, clearance):
             path, role = text, "organ" if i == 0 else "keep-out"
         elif role not in ROLES:
             raise InputError(f"{text}: role '{role}'; expected one of {', '.join(ROLES)}")
+        if not Path(path).exists():
+            raise InputError(f"{path}: there is no such file; expected a mesh")
         paths.append(Path(path))
         roles.append(role)
     return Request(

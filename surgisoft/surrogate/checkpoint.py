@@ -10,7 +10,8 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as safetensors_bytes
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
@@ -89,13 +90,14 @@ def save_model(
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
-        save_file(weights, fresh / "weights.safetensors")
+        # Not by `save_file`, which makes a file that only its owner can read.
+        (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
         if report is not None:
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
         if known is not None:
             known.save(fresh)
-        fresh.chmod(0o755)
+        fresh.chmod(0o777 & ~_umask())
         if folder.exists():
             for kept in folder.iterdir():
                 if kept.name not in OWN_FILES:
@@ -110,6 +112,13 @@ def save_model(
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
+
+
+def _umask() -> int:
+    """Permissions that the user takes from new files; asking for it means setting it."""
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
 
 
 def _place(folder: str | Path) -> Path:

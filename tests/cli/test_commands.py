@@ -120,7 +120,7 @@ def _options():
     """(command, option) of every command but the long studies."""
     from typer.main import get_command
 
-    from surgisoft.cli import app, commands  # noqa: F401
+    from surgisoft.cli import with_commands
 
     def walk(path, command):
         if hasattr(command, "commands"):
@@ -131,7 +131,11 @@ def _options():
                 if option.opts[0].startswith("-"):
                     yield " ".join(path), option
 
-    return [pair for pair in walk((), get_command(app)) if not pair[0].startswith("benchmark")]
+    return [
+        pair
+        for pair in walk((), get_command(with_commands()))
+        if not pair[0].startswith("benchmark")
+    ]
 
 
 def test_one_name_means_one_thing_in_every_command():

@@ -53,11 +53,11 @@ def amend(
     The parameters are fitted to the first three quarters of each recording and validated on the
     last quarter. Where the error does not fall significantly, nothing is written (exit code 1).
     """
-    claim_other_folder(output, model, force)
     check_free(json_file, "error_mm")
     check_folder(report)
     check_model(model)
     measured = read_recordings(data)
+    claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.amend import amend as amend_model
     from surgisoft.surrogate.checkpoint import load_model

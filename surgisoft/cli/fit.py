@@ -61,13 +61,14 @@ def fit(
     Grows from pressure to effects to direction, keeps each only where held-out data rewards it,
     and says which inputs the recordings cannot support.
     """
+    train = read_recordings(recordings)
+    held = read_recordings(valid) if valid else None
+
     from surgisoft.measurement.fitting import fit as fit_model
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
     from surgisoft.surrogate.networks import parse_widths
 
     claim_folder(output, force)
-    train = read_recordings(recordings)
-    held = read_recordings(valid) if valid else None
     with progress("fit") as report:
         result = fit_model(
             train,

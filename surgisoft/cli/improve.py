@@ -39,11 +39,11 @@ def improve(
     The result is validated on the last quarter of each recording. Where no effect was added, or
     the error did not fall significantly, nothing is written (exit code 1).
     """
-    claim_other_folder(output, model, force)
     check_free(json_file, "rounds")
     check_folder(report)
     check_model(model)
     measured = read_recordings(recordings)
+    claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.improve import improve as improve_model
     from surgisoft.surrogate.checkpoint import load_model

@@ -8,6 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
 
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
 app.add_typer(commands, name="scene")
@@ -51,6 +52,8 @@ def new(
     force: Force = False,
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
+    _check_meshes(meshes)
+
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
     from surgisoft.scene.spec import TOOLS, MountSpec
 
@@ -138,11 +141,18 @@ def show(
             open_viewer(recording)
 
 
+def _check_meshes(meshes: list[str]) -> None:
+    """Raise where a mesh file is missing, with or without a role behind its name."""
+    for text in meshes:
+        path, _, _ = text.rpartition(":")
+        if not Path(text).exists() and not (path and Path(path).exists()):
+            raise InputError(f"{path or text}: there is no such file; expected a mesh")
+
+
 def _request(meshes, unit, lesion, direction, diameter, clearance):
     """The user's wish; contradictions are one line."""
     import numpy as np
 
-    from surgisoft.errors import InputError
     from surgisoft.scene.author import Request
     from surgisoft.scene.mesh import ROLES
     from surgisoft.scene.spec import LimitsSpec
@@ -164,8 +174,6 @@ def _request(meshes, unit, lesion, direction, diameter, clearance):
             path, role = text, "organ" if i == 0 else "keep-out"
         elif role not in ROLES:
             raise InputError(f"{text}: role '{role}'; expected one of {', '.join(ROLES)}")
-        if not Path(path).exists():
-            raise InputError(f"{path}: there is no such file; expected a mesh")
         paths.append(Path(path))
         roles.append(role)
     return Request(

@@ -3,9 +3,10 @@
 import math
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Replay, Report
+from surgisoft.files import write_json
 
 AXES_SHOWN = 5
 """Axes that the terminal lists; the page and the JSON file have all of them."""

@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_json
+from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_json
 
 
 @app.command()

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import counted, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -22,6 +22,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import write_json
 
 PLACES = ("simulation", "rig")
 """Where episodes take place."""
@@ -149,7 +150,7 @@ def _rig_config(
     from surgisoft.rig.trial import hidden_effects
 
     own = RigConfig(seed=robot_seed or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
-    return own if observer_gain is None else replace(own, trust=observer_gain)
+    return own if observer_gain is None else replace(own, observer_gain=observer_gain)
 
 
 def _show(results) -> None:

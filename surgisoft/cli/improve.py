@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free, write_json
+from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
     EffectFiles,
@@ -19,6 +19,7 @@ from surgisoft.cli.options import (
     Report,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_json
 
 
 @app.command()

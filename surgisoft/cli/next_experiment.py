@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_json, write_text
+from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
 """Chambers and unit of the arm that the virtual rig has."""
@@ -64,7 +65,7 @@ def next_experiment(
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
     answer = find_experiment(arm, measured, competing, minutes, settings)
     warn_all(answer.notes)
-    write_text(output, schedule_text(answer.protocol))
+    write_atomically(output, schedule_text(answer.protocol))
     if json_file:
         write_json(json_file, answer.to_json())
     _show(answer, arm.spec, model, recordings or [], output)

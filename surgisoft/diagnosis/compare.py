@@ -13,6 +13,7 @@ from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, 
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe
 from surgisoft.measurement.recordings.recording import Recording
 
 WORST = 5
@@ -142,7 +143,7 @@ class Comparison:
             "ceiling_ci95_mm": top and top["ci95_mm"],
             "explainable": self.explainable,
         }
-        return _known(values)
+        return json_safe(values)
 
 
 def compare(model: Model, recordings: Recordings) -> tuple[Comparison, Residuals]:
@@ -230,15 +231,6 @@ def _root_interval(square: np.ndarray, block: np.ndarray) -> tuple[float, float]
 
 def _mm(value: float) -> str:
     return f"{value:.2f} mm" if value >= 0.095 else f"{value:.3f} mm"
-
-
-def _known(value):
-    """The value with None for NaN, which JSON cannot say; through dicts and lists."""
-    if isinstance(value, dict):
-        return {name: _known(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(each) for each in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _nanmean(values: np.ndarray) -> float:

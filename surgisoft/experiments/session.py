@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from surgisoft.agents.run_folder import RunFolder
-from surgisoft.config import read_toml, write_atomically
+from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.pictures import film, write_pictures
@@ -15,6 +15,7 @@ from surgisoft.experiments.plan import settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, TASK, Experiment, load_experiment
+from surgisoft.files import write_atomically
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
 from surgisoft.scene.packaged import PHANTOM, packaged_scene
@@ -122,7 +123,7 @@ def finish_experiment(
     if replays:
         files += _write_replays(results, progress)
     summary = folder / "summary.md"
-    write_atomically(summary, markdown(results).encode())
+    write_atomically(summary, markdown(results))
     return results, [*files, summary]
 
 

@@ -2,8 +2,6 @@
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.resources import as_file, files
@@ -15,6 +13,7 @@ from safetensors.torch import save as safetensors_bytes
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import make_effect, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
@@ -86,9 +85,7 @@ def save_model(
         "effect_files": files_of(model.effects),
         "validation": model.validation,
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         # Not by `save_file`, which makes a file that only its owner can read.
         (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
@@ -97,28 +94,6 @@ def save_model(
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
         if known is not None:
             known.save(fresh)
-        fresh.chmod(0o777 & ~_umask())
-        if folder.exists():
-            for kept in folder.iterdir():
-                if kept.name not in OWN_FILES:
-                    copy = shutil.copytree if kept.is_dir() else shutil.copy2
-                    copy(kept, fresh / kept.name)
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            os.replace(folder, old / "old")
-            os.replace(fresh, folder)
-            shutil.rmtree(old)
-        else:
-            os.replace(fresh, folder)
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
-
-
-def _umask() -> int:
-    """Permissions that the user takes from new files; asking for it means setting it."""
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
 
 
 def _place(folder: str | Path) -> Path:

@@ -59,8 +59,13 @@ class CircleAblation:
         self.spec = self.surroundings.spec
         self.steps = round(self.spec.limits.time_s / dt_s)
         self.round = round(self.config.cut_s / dt_s)
-        self.aims = {name: Aim(arm, dt_s) for name, arm in self.world.arms.items()}
         self.goal = fresh_cut
+
+    @property
+    def aims(self) -> dict[str, Aim]:
+        """Each arm's axis, by the arm's name."""
+        dt_s = self.world.config.dt_s
+        return {name: Aim(arm, dt_s) for name, arm in self.world.arms.items()}
 
     def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
         """(B, 3) mm: where the beam should meet the ring, `ahead` steps further on."""

@@ -16,6 +16,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.inverse_kinematics import body_part, seek
 from surgisoft.tasks.trajectories import Tour, fresh_tour, place, progress, way_mm
+from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.plate import SlottedPlate, clear_ways, plate_world
 from surgisoft.tasks.world.random import Stream
 from surgisoft.tasks.world.world import WorldConfig
@@ -62,11 +63,16 @@ class Keyhole:
     def __init__(self, config: KeyholeConfig | None = None, device: str | torch.device = "cpu"):
         c = self.config = config or KeyholeConfig()
         self.world = plate_world(c.plate, c.height_mm, c.limit_mm, c.arm, c.world, device)
-        self.arm, self.dt_s = self.world.arms["arm"], c.world.dt_s
+        self.dt_s = c.world.dt_s
         self.steps = round(c.time_s / self.dt_s)
         self.ways = clear_ways(self.world, c.plate, c.deep_mm, c.clear_mm)
         # In a step the tip goes no farther than this.
         self._stride_mm = 4.0 * self.arm.pneumatics.step_kPa / 3.0
+
+    @property
+    def arm(self) -> Arm:
+        """The world's one arm."""
+        return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, Tour]:
         return fresh_tour(stream, self.ways, self.config.visits)

@@ -17,6 +17,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.inverse_kinematics import pressure_part, seek
 from surgisoft.tasks.trajectories import PATHS, Round, fresh_round
+from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random import Stream
 from surgisoft.tasks.world.world import ArmPart, World
 
@@ -120,13 +121,18 @@ class Follow:
         coordinates of the point (2 where the third is fixed).
         """
         self.name, self.world, self.config = name, world, config
-        self.arm, self.marker, self.centre = world.arms["arm"], marker, centre_mm
+        self.marker, self.centre = marker, centre_mm
         self.dt_s = world.config.dt_s
         self.approach = round(config.approach_s / self.dt_s)
         self.loop = round(config.loop_s / self.dt_s)
         self.steps = self.approach + self.loop * config.loops
         self._directions = directions
         self._rest = self.arm.model.rest_mm.to(centre_mm)
+
+    @property
+    def arm(self) -> Arm:
+        """The world's one arm."""
+        return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, Course]:
         stream, way = fresh_round(stream, self.config.any_start)

@@ -14,6 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.inverse_kinematics import pressure_part, seek
 from surgisoft.tasks.track import level_world
+from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random import Stream
 from surgisoft.tasks.world.world import WorldConfig
 
@@ -70,13 +71,18 @@ class TrackBody:
     def __init__(self, config: TrackBodyConfig | None = None, device: str | torch.device = "cpu"):
         c = self.config = config or TrackBodyConfig()
         self.world = level_world(c.world, c.mean_kPa, c.arm, device)
-        self.arm, self.dt_s = self.world.arms["arm"], c.world.dt_s
+        self.dt_s = c.world.dt_s
         self.approach = round(c.approach_s / self.dt_s)
         self.steps = self.approach + round(c.time_s / self.dt_s)
         row = {"dtype": torch.float32, "device": self.world.device}
         self._pace = torch.tensor([1.0 / c.slow_s, 1.0 / c.fast_s], **row)[:, None]
         self._swing = c.swing_kPa * torch.tensor(WEIGHTS, **row)[:, None]
         self._rest = self.arm.model.rest_mm.to(**row)
+
+    @property
+    def arm(self) -> Arm:
+        """The world's one arm."""
+        return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, Waves]:
         stream, phase = stream.uniform(0.0, 1.0, 2, self.arm.chambers)

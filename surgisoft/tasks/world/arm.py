@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -132,6 +133,8 @@ class ArmPart:
     """(B, m) kPa: chamber pressure as measured."""
     offset_mm: Tensor
     """(B, n, 3) mm: what the key points are known to lie off the model; 0 where it is the truth."""
+    plant: Any = None
+    """State of the plant in place of the model, a pytree; None where the model is the plant."""
 
     @property
     def tip_mm(self) -> Tensor:

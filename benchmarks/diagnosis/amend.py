@@ -8,14 +8,12 @@ the locked quarter, as `amend` judges.
 from dataclasses import dataclass
 
 import numpy as np
-from surgisoft.diagnosis.refinement.network import retune
 
 from benchmarks.diagnosis.robots import Recorded
 from surgisoft.diagnosis.amend import EVERY_ROW, amend
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.problem import pose
 from surgisoft.measurement.recordings import Recording
-from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.surrogate.model import ArmModel
 
 

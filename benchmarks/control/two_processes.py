@@ -23,7 +23,7 @@ def arguments(task: str, steps: int, folder: Path) -> list[str]:
     resumed = (folder / "config.json").is_file()
     new = ["--task", task, "--steps", str(steps), "--envs", str(ENVS), "-o", str(folder)]
     own = ["--resume", str(folder)] if resumed else new
-    return ["--nproc-per-node", "2", "-m", "surgisoft.cli", "train", *own]
+    return ["--nproc-per-node", "2", "-m", "surgisoft", "train", *own]
 
 
 def trained_by_two(folder: Path, task: str, steps: int, report: Progress) -> RunFolder:

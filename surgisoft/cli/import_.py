@@ -49,13 +49,14 @@ def import_(
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
     for target in targets if not dry_run else []:
         check_writable(target, force)
+    if not dry_run:
+        for part, target in zip(parts, targets, strict=True):
+            save_recording(part.recording, target, force)
     for part, target in zip(parts, targets, strict=True):
         for note in part.notes:
             print(f"note: {note}")
         for found in find_warnings(part.recording):
             warn(f"{target}, row {found.sample + 1}: {found.text}")
-        if not dry_run:
-            save_recording(part.recording, target, force)
         first, *rest = summary(part.recording)
         about = first.partition(": ")[2]
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")

@@ -21,7 +21,6 @@ from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
 from surgisoft.diagnosis.kind import kind_of, unnamed
@@ -47,6 +46,7 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 MOST_RIVALS = 3
 """Most rivals that an experiment is sought for."""
@@ -97,7 +97,7 @@ class Findings:
         return picked_by(self.named)
 
 
-@on_one_thread
+@torch_threads(1)
 def diagnose(
     model: Model,
     recordings: Recordings,

@@ -6,7 +6,6 @@ one go and one that was interrupted give the same rows.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -17,7 +16,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from surgisoft.agents.evaluate import episode_table
@@ -41,7 +39,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
-from surgisoft.workers import workers
+from surgisoft.workers import torch_threads, workers
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
@@ -141,7 +139,7 @@ def run_experiment(
     done = total - sum(job.count for job in left)
     report(done, total, "")
     if processes == 1:
-        with _one_thread():
+        with torch_threads(1):
             for job in left:
                 began = done
 
@@ -190,17 +188,6 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
             f"a process of {processes} was ended from outside, memory may be short; go on with "
             "--resume and fewer --processes"
         ) from None
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread, as in the processes: the order of sums decides about last digits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @lru_cache(maxsize=1)

@@ -8,7 +8,8 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as safetensors_bytes
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
@@ -104,7 +105,8 @@ def save_model(
     }
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
-        save_file(weights, fresh / "weights.safetensors")
+        # Not by `save_file`, which makes a file that only its owner can read.
+        (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
         if report is not None:
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")

@@ -16,7 +16,6 @@ from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
 from surgisoft.diagnosis.isolability.matrix import SURE, Isolability
@@ -48,6 +47,7 @@ from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 MINUTES = 15.0
 """Longest time on the bench where none is asked for, minutes."""
@@ -139,7 +139,7 @@ class Recommendation:
         }
 
 
-@on_one_thread
+@torch_threads(1)
 def next_experiment(
     model: Model,
     recordings: Recordings = (),

@@ -36,10 +36,17 @@ def load_recording(path: str | Path, on_warning: Warn | None = None) -> Recordin
 
 
 def load_recordings(
-    paths: Iterable[str | Path] | str | Path, on_warning: Warn | None = None
+    paths: Iterable[str | Path | Recording] | str | Path | Recording,
+    on_warning: Warn | None = None,
 ) -> list[Recording]:
-    """Read files, and every recording of folders in the order of their names."""
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    """Read files, and every recording of folders in the order of their names.
+
+    Recordings that are open already stay as they are.
+    """
+    given = [paths] if isinstance(paths, str | Path | Recording) else list(paths)
+    if any(isinstance(item, Recording) for item in given):
+        read = ([i] if isinstance(i, Recording) else load_recordings(i, on_warning) for i in given)
+        return [recording for part in read for recording in part]
     files = _find([Path(p) for p in given], on_warning or _warn)
     return [load_recording(file, on_warning) for file in files]
 

@@ -11,25 +11,25 @@ import numpy as np
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.progress import Progress, silent
+from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
-from surgisoft.scene.folder import Scene, rounded_mount
-from surgisoft.scene.index import used_indices
-from surgisoft.scene.mesh import ROLES, Body, Mesh
+from surgisoft.scene.folder import Scene
+from surgisoft.scene.inside import buried_faces
+from surgisoft.scene.lesion import Site, directed_site, good_sites, pointed_site
+from surgisoft.scene.mesh import ROLES, Body, Mesh, used_indices
 from surgisoft.scene.meshio import (
     MM_PER_UNIT,
     Part,
     check_organ_size,
+    given_unit,
     read_parts,
     recognise_unit,
-    told_unit,
     write_ply,
 )
-from surgisoft.scene.placement import Pair, find_mounts
+from surgisoft.scene.mounts import Pair, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
-from surgisoft.scene.site import Site, directed_site, good_sites, pointed_site
 from surgisoft.scene.spec import (
     FILE,
     BodySpec,
@@ -44,7 +44,7 @@ from surgisoft.scene.spec import (
 
 FAR_OFF = 20.0
 """A mesh whose middle lies this many times its size from the origin is moved there."""
-SAID_FROM_MM = 1.0
+REPORTED_FROM_MM = 1.0
 """A lesion that is moved farther than this onto the surface is told so (mm)."""
 COARSE_RING = 36
 """Ring points while mounts are searched."""
@@ -101,7 +101,7 @@ class Authored:
     scene: Scene
     """The scene; its folder is not yet there."""
     check: SceneCheck
-    """The referee's verdict on it."""
+    """The checker's verdict on it."""
     notes: tuple[str, ...]
     """What was recognised, repaired and chosen, one line each."""
 
@@ -140,7 +140,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
             unit, told = guess.unit, guess.sentence
         else:
-            unit, told = request.unit, told_unit(size, request.unit)
+            unit, told = request.unit, given_unit(size, request.unit)
         scales.append(MM_PER_UNIT[unit])
         if role == "organ":
             check_organ_size(path, size * scales[-1], told)
@@ -342,12 +342,28 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
     return Scene(spec, Path(), bodies)
 
 
+def rounded_mount(position_mm, rotation) -> dict:
+    """A mount's place as the file writes it: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
+
+    position_mm (3,) and rotation (3, 3) of the base frame in the world frame; answers
+    `position_mm`, `direction` and `roll_deg` for `MountSpec`.
+    """
+    direction = rotation[:, 2].round(6) + 0.0
+    plain = frames.rotation_from_z(direction)
+    roll = np.degrees(np.arctan2(rotation[:, 0] @ plain[:, 1], rotation[:, 0] @ plain[:, 0]))
+    return {
+        "position_mm": tuple((np.asarray(position_mm).round(2) + 0.0).tolist()),
+        "direction": tuple(direction.tolist()),
+        "roll_deg": float(np.round(roll, 2) + 0.0),
+    }
+
+
 def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"
     return [
-        *([moved] if site.moved_mm > SAID_FROM_MM else []),
+        *([moved] if site.moved_mm > REPORTED_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
         f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "

@@ -13,9 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from surgisoft.errors import InputError
-from surgisoft.scene.index import equal_rows, used_indices
-from surgisoft.scene.mesh import Mesh
-from surgisoft.scene.winding import winding_numbers
+from surgisoft.scene.inside import winding_numbers
+from surgisoft.scene.mesh import Mesh, equal_rows, used_indices
 
 JOIN = (1e-7, 1e-6, 1e-5, 1e-4, 5e-4)
 """Distances at which vertices are joined, tried in turn until the surface closes (of its size)."""

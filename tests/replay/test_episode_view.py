@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.replay.bodies import TIP_MM, joined, turns_from_z
+from surgisoft.replay.arms import TIP_MM, joined, turns_from_z
 from surgisoft.replay.colours import (
     BLANCHED,
     CHARRED,
@@ -21,11 +21,11 @@ from surgisoft.replay.colours import (
     ROLE_COLOURS,
     tissue_colours,
 )
-from surgisoft.replay.dosed_surface import dosed_surface
 from surgisoft.replay.endoscope import CAMERA, PIXELS
 from surgisoft.replay.episode_view import legend, write_replay
 from surgisoft.replay.plots import plots_of
-from surgisoft.replay.screenshot import take_screenshot
+from surgisoft.replay.surfaces import dosed_surface
+from surgisoft.replay.viewer import take_screenshot
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.tasks.base import Episodes

@@ -1,4 +1,4 @@
-"""From mesh files to scenes: what comes out holds before the referee, what cannot be is said."""
+"""From mesh files to scenes: what comes out holds before the checker, what cannot be is said."""
 
 import dataclasses
 import os
@@ -11,11 +11,11 @@ import trimesh
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.scene.author import check_target
+from surgisoft.scene.author import check_target, rounded_mount
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.check import REASONS, check_scene, held_arms, reach_patch, sentence
-from surgisoft.scene.collision import Referee
-from surgisoft.scene.folder import open_scene, rounded_mount
+from surgisoft.scene.check import REASONS, check_scene, mounted_arms, reach_patch, sentence
+from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
@@ -98,14 +98,14 @@ def test_the_same_meshes_give_the_same_scene(made, tmp_path):
 
 def test_both_arms_and_their_shafts_clear_each_other(made):
     scene = open_scene(made[1])
-    arms = held_arms(scene, reaches_of(scene))
+    arms = mounted_arms(scene, reaches_of(scene))
     rest = {
         tool: ArmShape(arm.lines(arm.reach.rest[None])[0][0], 7.5) for tool, arm in arms.items()
     }
     for tool, arm in arms.items():
         far = rest[tool].centreline_mm[0]
         np.testing.assert_allclose(np.linalg.norm(far - arm.pose[:3, 3]), 100.0)
-    clearance = Referee(scene.bodies).clearance(rest)
+    clearance = CollisionChecker(scene.bodies).clearance(rest)
     assert clearance.least_mm >= scene.spec.limits.clearance_mm
 
 
@@ -197,7 +197,7 @@ def test_the_tables_shapes_are_those_that_the_tasks_bend(made):
 
 
 def test_the_patch_agrees_with_the_ring(made):
-    """The map's circle of the lesion's own diameter says what the referee says of the ring."""
+    """The map's circle of the lesion's own diameter says what the checker says of the ring."""
     scene = open_scene(made[1])
     patch = reach_patch(scene, reaches_of(scene), 48)
     far = np.linalg.norm(patch.flat_mm, axis=1)

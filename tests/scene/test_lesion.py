@@ -12,10 +12,12 @@ from surgisoft.errors import InputError
 from surgisoft.scene.lesion import (
     circle_on,
     closest_in_triangles,
+    directed_site,
+    good_sites,
     lesion_ring,
     nearest_on_surface,
+    pointed_site,
 )
-from surgisoft.scene.site import directed_site, good_sites, pointed_site
 from surgisoft.scene.spec import LesionSpec
 from tests.scene.shapes import ball, box, lumpy, mesh_of
 

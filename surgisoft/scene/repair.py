@@ -270,9 +270,13 @@ def _wind_alike(faces, what, log):
     label = _linked(np.concatenate(([a, other], [a + count, mirror]), axis=1).T, 2 * count)
     if np.any(label[:count] == label[count:]):
         raise InputError(f"{what}: the surface has only one side (Moebius); expected a closed body")
-    # of the two ways to wind each piece, the one that turns fewer faces
+    # of the two ways to wind each piece, the one that turns fewer faces; if both turn as many, the
+    # one with the smaller label, so that all faces of the piece agree
     kept_as_is = np.bincount(label[:count], minlength=label.max() + 1)
-    turned = kept_as_is[label[:count]] < kept_as_is[label[count:]]
+    as_is, reversed_ = label[:count], label[count:]
+    fewer = kept_as_is[as_is] < kept_as_is[reversed_]
+    equal = kept_as_is[as_is] == kept_as_is[reversed_]
+    turned = fewer | (equal & (as_is > reversed_))
     log["faces wound alike"] = int(turned.sum())
     return np.where(turned[:, None], faces[:, ::-1], faces)
 

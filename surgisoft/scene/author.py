@@ -16,7 +16,7 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.inside import buried_faces
-from surgisoft.scene.lesion import Site, directed_site, good_sites, pointed_site
+from surgisoft.scene.lesion import OrganSurface, Site, directed_site, good_sites, pointed_site
 from surgisoft.scene.mesh import ROLES, Body, Mesh, used_indices
 from surgisoft.scene.meshio import (
     MM_PER_UNIT,
@@ -86,6 +86,8 @@ class Prepared:
     """Role of each."""
     meshes: tuple[Mesh, ...]
     """Closed meshes, world frame, mm."""
+    holes_mm: tuple[np.ndarray, ...]
+    """For each mesh (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
     mm_per_unit: float
     """Of the first file."""
     shift_mm: np.ndarray
@@ -104,6 +106,10 @@ class Authored:
     """The checker's verdict on it."""
     notes: tuple[str, ...]
     """What was recognised, repaired and chosen, one line each."""
+
+
+_NamedBody = tuple[str, Mesh, np.ndarray]
+"""Name, closed mesh, and (F,) mm: width of the hole that each face closes, else 0."""
 
 
 class NoMounts(InputError):
@@ -127,7 +133,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     if request.unit is not None and request.unit not in MM_PER_UNIT:
         raise unknown_name("unit", request.unit, MM_PER_UNIT)
     notes: list[str] = []
-    names, roles, meshes, scales = [], [], [], []
+    names, roles, meshes, holes_mm, scales = [], [], [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         tell = partial(_tell, report, i, len(request.meshes), path.name)
         tell("reading")
@@ -146,10 +152,12 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             check_organ_size(path, size * scales[-1], told)
         notes.append(f"{path.name}: unit {told}")
         found = _closed_bodies(path, parts, scales[-1], notes, tell)
-        for i, (name, mesh) in enumerate(sorted(found, key=lambda pair: -_area(pair[1]))):
+        found = sorted(found, key=lambda body: -_area(body[1]))
+        for i, (name, mesh, hole_mm) in enumerate(found):
             names.append(_free_name(name, names))
             roles.append(role if i == 0 or role != "organ" else "keep-out")
             meshes.append(mesh)
+            holes_mm.append(hole_mm)
     bounds = meshes[0].bounds_mm
     middle, size = bounds.mean(axis=0), np.ptp(bounds, axis=0).max()
     shift = np.zeros(3)
@@ -160,10 +168,18 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     if len(meshes) > 1:
         listed = ", ".join(f"{name} ({role})" for name, role in zip(names, roles, strict=True))
         notes.append(f"{len(meshes)} bodies: {listed}")
-    return Prepared(tuple(names), tuple(roles), tuple(meshes), scales[0], shift, tuple(notes))
+    return Prepared(
+        tuple(names),
+        tuple(roles),
+        tuple(meshes),
+        tuple(holes_mm),
+        scales[0],
+        shift,
+        tuple(notes),
+    )
 
 
-def _closed_bodies(path, parts, scale, notes, tell) -> list[tuple[str, Mesh]]:
+def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
     """Every part repaired; where one is beyond repair, all parts taken as one surface.
 
     If that is beyond repair too, the broken parts are left out, unless nothing is left.
@@ -195,7 +211,7 @@ def _tell(report: Progress, number: int, count: int, name: str, what: str) -> No
     report(5.0 * number / count, 100, f"{name}: {what}")
 
 
-def _repaired(path, parts, scale, tell) -> tuple[list[tuple[str, Mesh]], list[InputError], dict]:
+def _repaired(path, parts, scale, tell) -> tuple[list[_NamedBody], list[InputError], dict]:
     """Named closed bodies of the parts, what was beyond repair, and the repairs' counts."""
     found, failures = [], []
     done: dict[str, int] = {}
@@ -212,7 +228,10 @@ def _repaired(path, parts, scale, tell) -> tuple[list[tuple[str, Mesh]], list[In
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem
-        found += [(name, mesh) for mesh in repaired.bodies]
+        found += [
+            (name, mesh, hole_mm)
+            for mesh, hole_mm in zip(repaired.bodies, repaired.holes_mm, strict=True)
+        ]
     return found, failures, done
 
 
@@ -233,8 +252,13 @@ def _free_name(name: str, taken: Sequence[str]) -> str:
 
 def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     """Places for the lesion: the one pointed at, else several good ones."""
-    meshes = list(prepared.meshes)
-    operable = [m for m, role in zip(meshes, prepared.roles, strict=True) if role != "support"]
+    surfaces = [
+        OrganSurface(mesh, hole_mm)
+        for mesh, hole_mm in zip(prepared.meshes, prepared.holes_mm, strict=True)
+    ]
+    operable = [
+        surface for surface, role in zip(surfaces, prepared.roles, strict=True) if role != "support"
+    ]
     if request.lesion is not None:
         point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
         said = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
@@ -243,7 +267,7 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
         return [pointed_site(operable, point, request.diameter_mm, said)]
     if request.lesion_direction is not None:
         return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
-    return good_sites(meshes, request.diameter_mm)
+    return good_sites(surfaces, request.diameter_mm)
 
 
 def author(

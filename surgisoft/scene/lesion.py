@@ -211,8 +211,30 @@ QUICK_RING = 12
 """Ring points that are tried before the whole ring, when a diameter that fits is sought."""
 FAR_POINT_MM = 20.0
 """A point farther than this from every surface is a slip, not a place on it (mm)..."""
+SMALL_HOLE = 0.1
+"""A hole up to this share of the ring's diameter is a flaw of the mesh. A wider one is an opening
+of the organ (a vessel, a bowel), and the faces that close it are no tissue."""
 FAR_POINT = 0.1
 """... unless it is within this share of the body's largest side."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrganSurface:
+    """A closed mesh on which a lesion may lie, but for the faces that close a hole of the file."""
+
+    mesh: Mesh
+    """Closed, wound outwards, world frame, mm."""
+    hole_mm: np.ndarray
+    """(F,) mm: width of the hole that a face closes, 0 for a face of the file."""
+
+    @classmethod
+    def whole(cls, mesh: Mesh) -> OrganSurface:
+        """A mesh that had no hole."""
+        return cls(mesh, np.zeros(len(mesh.faces)))
+
+    def is_lid(self, faces: np.ndarray, diameter_mm: float) -> np.ndarray:
+        """(N,) bool: faces (N,) that close an opening too wide to lie in a ring's path."""
+        return self.hole_mm[faces] > SMALL_HOLE * diameter_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,17 +252,17 @@ class Site:
 
 
 def pointed_site(
-    bodies: list[Mesh], point_mm: np.ndarray, diameter_mm: float, said: str | None = None
+    bodies: list[OrganSurface], point_mm: np.ndarray, diameter_mm: float, said: str | None = None
 ) -> Site:
     """The surface point nearest to `point_mm` (3,), on whichever body it lies.
 
     An InputError where none is near; `said` is the point as the user wrote it.
     """
-    nearest = [nearest_on_surface(mesh, point_mm[None]) for mesh in bodies]
+    nearest = [nearest_on_surface(body.mesh, point_mm[None]) for body in bodies]
     away = [float(np.linalg.norm(points[0] - point_mm)) for points, _ in nearest]
     body = int(np.argmin(away))
     points, faces = nearest[body]
-    most = max(FAR_POINT_MM, FAR_POINT * float(np.ptp(bodies[body].bounds_mm, axis=0).max()))
+    most = max(FAR_POINT_MM, FAR_POINT * float(np.ptp(bodies[body].mesh.bounds_mm, axis=0).max()))
     if away[body] > most:
         said = said or f"the point {tuple(point_mm.round(3).tolist())} mm"
         raise InputError(
@@ -251,14 +273,14 @@ def pointed_site(
     return replace(site, moved_mm=away[body])
 
 
-def directed_site(bodies: list[Mesh], direction: np.ndarray, diameter_mm: float) -> Site:
+def directed_site(bodies: list[OrganSurface], direction: np.ndarray, diameter_mm: float) -> Site:
     """Where a ray from outside along -direction (3,) through the largest body's middle lands.
 
     Where it passes through without touching (a ring's hole), the surface point that lies farthest
     out in that direction.
     """
     away = frames.normalise(np.asarray(direction, dtype=float))
-    mesh = bodies[0]
+    mesh = bodies[0].mesh
     middle = mesh.bounds_mm.mean(axis=0)
     far = float(np.ptp(mesh.bounds_mm, axis=0).sum())
     origin = middle + far * away
@@ -271,13 +293,22 @@ def directed_site(bodies: list[Mesh], direction: np.ndarray, diameter_mm: float)
 
 
 def _with_ring(bodies, body, point, face, diameter_mm) -> Site:
-    ring = circle_on(bodies[body], point, face, diameter_mm)
+    surface, place = bodies[body], tuple(point.round(1).tolist())
+    ring = circle_on(surface.mesh, point, face, diameter_mm)
+    under = np.array([face]) if ring is None else np.append(ring.faces, face)
+    lids = under[surface.is_lid(under, diameter_mm)]
+    if len(lids):
+        raise InputError(
+            f"a ring of {diameter_mm:g} mm at {place} mm lies on faces that the repair added to "
+            f"close a hole {surface.hole_mm[lids].max():.3g} mm wide; the file has no surface "
+            "there: choose another place or a smaller --diameter"
+        )
     if ring is None:
-        fits = _largest_fitting(bodies[body], point, face, diameter_mm)
+        fits = _largest_fitting(surface.mesh, point, face, diameter_mm)
         advice = f"a ring of {fits:.0f} mm does" if fits >= 1.0 else "no ring does"
         raise InputError(
             f"a ring of {diameter_mm:g} mm does not lie on the surface at "
-            f"{tuple(point.round(1).tolist())} mm ({advice}); choose another place or --diameter"
+            f"{place} mm ({advice}); choose another place or --diameter"
         )
     return Site(body, point, ring)
 
@@ -295,16 +326,19 @@ def _largest_fitting(mesh, point, face, diameter_mm) -> float:
     return 0.0
 
 
-def good_sites(bodies: list[Mesh], diameter_mm: float) -> list[Site]:
+def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
     """Places on the largest body that are open to the outside, even and on top, best first.
 
     Points are drawn evenly over the surface (the same ones each time). Openness is the fraction of
-    a cone of rays that leave without touching any body.
+    a cone of rays that leave without touching any body. No place lies on faces that close an
+    opening of the file.
     """
-    mesh = bodies[0]
+    surface, mesh = bodies[0], bodies[0].mesh
     points, faces = _drawn(mesh)
+    tissue = ~surface.is_lid(faces, diameter_mm)
+    points, faces = points[tissue], faces[tissue]
     normals = mesh.face_normals[faces]
-    openness = _openness(bodies, points, normals)
+    openness = _openness([body.mesh for body in bodies], points, normals)
     evenness = _evenness(mesh, points, normals, 0.5 * diameter_mm)
     quality = 2.0 * openness + 2.0 * evenness + 0.7 * normals[:, 2]
     sites: list[Site] = []
@@ -312,7 +346,7 @@ def good_sites(bodies: list[Mesh], diameter_mm: float) -> list[Site]:
         if any(np.linalg.norm(points[i] - site.point_mm) < 1.5 * diameter_mm for site in sites):
             continue
         ring = circle_on(mesh, points[i], int(faces[i]), diameter_mm)
-        if ring is not None:
+        if ring is not None and not surface.is_lid(ring.faces, diameter_mm).any():
             sites.append(Site(0, points[i], ring))
         if len(sites) == SITES:
             break

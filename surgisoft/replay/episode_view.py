@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +63,19 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
     )
 
 
+def layout_names(log: EpisodeLog) -> tuple[str, ...]:
+    """Names of the views in the replay of a log."""
+    return tuple(_view_names(episode_blueprint(log, plots_of(log)).root_container))
+
+
+def _view_names(part: rrb.Container | rrb.View) -> Iterator[str]:
+    if isinstance(part, rrb.View):
+        yield str(part.name)
+        return
+    for inner in part.contents:
+        yield from _view_names(inner)
+
+
 def _cells(plots: tuple[Plot, ...]) -> list:
     """One view a plot, those of a group as tabs."""
     cells, groups = [], {}
@@ -107,7 +121,7 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
     ]
     return rrb.Spatial3DView(
         origin="/",
-        contents=["+ /**", f"- {CAMERA}/picture", "- /plots/**", "- /events", f"- {LEGEND}"],
+        contents=["+ /**", f"- {CAMERA}/**", "- /plots/**", "- /events", f"- {LEGEND}"],
         name=SCENE,
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=not log.bodies),

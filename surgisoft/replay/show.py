@@ -7,9 +7,10 @@ from pathlib import Path
 import pyarrow.compute as pc
 
 from surgisoft.errors import InputError
-from surgisoft.replay.episode_view import Replay, write_replay
+from surgisoft.replay.episode_view import Replay, layout_names, write_replay
 from surgisoft.replay.recording import SUFFIX, TIME
 from surgisoft.replay.viewer import (
+    check_view,
     open_viewer,
     parse_size,
     serve_viewer,
@@ -109,6 +110,8 @@ def open_replay(
         raise InputError("expected at most one of --web, --screenshot and --save")
     if screenshot is None and (time_s is not None or view is not None):
         raise InputError("--time and --view are for a picture: give --screenshot too")
+    if view is not None and found.suffix != SUFFIX:
+        check_view(view, layout_names(load_episode(found)))
     if save is not None:
         if found.suffix == ".rrd":
             raise InputError(f"{found}: is a replay already; --save makes one of an episode's log")

@@ -14,12 +14,12 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import rerun as rr
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_atomically
 
 LOCAL = "127.0.0.1"
@@ -153,6 +153,29 @@ def parse_size(text: str) -> tuple[int, int]:
     return size
 
 
+def view_names(recording: Path) -> tuple[str, ...]:
+    """Names of the views that the layout of an .rrd file defines; empty where it holds no layout."""
+    from rerun.chunk import RrdReader
+
+    column, names = "ViewBlueprint:display_name", []
+    try:
+        reader = RrdReader(recording)
+        for layout in reader.blueprints():
+            for chunk in reader.stream(store=layout):
+                batch = chunk.to_record_batch()
+                if column in batch.schema.names:
+                    names += [name for row in batch.column(column).to_pylist() for name in row]
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{recording}: cannot be read as a Rerun recording ({error})") from None
+    return tuple(names)
+
+
+def check_view(view: str, names: Sequence[str]) -> None:
+    """Raise an InputError that lists the known views, unless `view` is one or none is known."""
+    if names and view not in names:
+        raise unknown_name("view", view, sorted(names))
+
+
 def take_screenshot(
     recording: Path,
     picture: Path,
@@ -167,6 +190,8 @@ def take_screenshot(
     which are pixels of the file; before it, `wait_s` for the viewer's notices to go.
     """
     picture = Path(picture)
+    if view is not None:
+        check_view(view, view_names(recording))
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
     if not picture.parent.is_dir():

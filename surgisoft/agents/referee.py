@@ -69,7 +69,7 @@ class EpisodeReferee:
     """Watches a rollout of a task in a scene; see `rollout(watch=...)`."""
 
     def __init__(self, task: Task):
-        """The task's world has surroundings, see `has_referee`."""
+        """The task's world has a scene, see `has_referee`."""
         around = task.world.scene
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.referee = Referee(around.geometry.bodies)

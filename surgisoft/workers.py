@@ -35,6 +35,22 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
 
 
 @contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch inside the block, or inside the function that this decorates.
+
+    The number of threads decides in which order sums are added, and so about their last digits.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
 def workers(
     processes: int, prepare: Callable[[], object] | None = None
 ) -> Iterator[ProcessPoolExecutor]:

@@ -11,9 +11,9 @@ import numpy as np
 
 from benchmarks.diagnosis.robots import Recorded
 from surgisoft.diagnosis.amend import EVERY_ROW, amend
+from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.refinement.network import retune
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 

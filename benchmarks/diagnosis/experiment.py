@@ -14,7 +14,7 @@ from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
 from surgisoft.diagnosis.next_experiment.propose import recommend
 from surgisoft.diagnosis.next_experiment.reading import effect_left
 from surgisoft.diagnosis.problem import pose
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 
 from surgisoft.diagnosis.amend import EVERY_ROW
 from surgisoft.diagnosis.problem import pose
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 
 BANDS = (1.0, 3.0, 6.0, 10.0, 20.0)

@@ -14,7 +14,7 @@ from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import Residuals, residuals
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 WORST = 5
 """Worst moments that are listed."""

@@ -16,11 +16,11 @@ import numpy as np
 from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.comparing.axes import shares
 from surgisoft.diagnosis.confidence import confidence
+from surgisoft.diagnosis.estimation.effects import refined
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
 from surgisoft.diagnosis.kind import kind_of, unnamed
@@ -31,7 +31,6 @@ from surgisoft.diagnosis.race.gates import first_shares, studentised
 from surgisoft.diagnosis.race.naming import CHANCE, LEAST_GAIN, SMALL, name_effects
 from surgisoft.diagnosis.race.ranking import Race, Standing, picked_by
 from surgisoft.diagnosis.race.static_error import StaticError, static_error
-from surgisoft.diagnosis.refinement.sharpen import sharpened
 from surgisoft.diagnosis.residuals import residuals
 from surgisoft.diagnosis.verdict import (
     Diagnosis,
@@ -43,10 +42,11 @@ from surgisoft.diagnosis.verdict import (
 )
 from surgisoft.diagnosis.weaknesses import weaknesses
 from surgisoft.errors import unknown_name
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 MOST_RIVALS = 3
 """Most rivals that an experiment is sought for."""
@@ -97,7 +97,7 @@ class Findings:
         return picked_by(self.named)
 
 
-@on_one_thread
+@torch_threads(1)
 def diagnose(
     model: Model,
     recordings: Recordings,
@@ -152,7 +152,8 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
     close = _close(first, named)
     if close:
         report(f"shapes of {' and '.join(standing.effect for standing in close)}")
-        race = race.extended(sharpened(problem, race, close))
+        standing = [(one.effect, race.in_place(race.single(one.option))) for one in close]
+        race = race.extended(refined(problem, [one for one in standing if one[1] is not None]))
         first = race.standings()
         named, following = name_effects(race, first)
     base = picked_by(named)

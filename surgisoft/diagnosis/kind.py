@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from surgisoft.diagnosis.race.naming import CHANCE
 from surgisoft.diagnosis.verdict import Kind
-from surgisoft.surrogate.effects import known_effects
+from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
 LEAST_LEFT = 1.0
 """Factor on the surrogate's validated error that is left wherever something unknown is told: what
@@ -13,7 +13,7 @@ LEAST_EXPLAINED = 0.68
 """Share of the error above the floor that the named effects and the next best one must explain
 where FAR or more is left; else something that is not known is missing."""
 LEAST_SETTLED = 0.95
-"""The same of effects alone that real arms have in this very form (`Effect.settled_form`)."""
+"""The same of effects alone that real arms have in this very form (`Hypothesis.exact_form`)."""
 EXPLAINED, MISSED_SHARE = 0.6, 0.2
 """The same wherever something is left, where they explain so much less, of the error above the
 floor, than a black box does."""
@@ -76,7 +76,7 @@ def _imitated(names: tuple[str, ...], further: float, numbers: dict) -> bool:
     beaten = numbers["box_share"] - explained
     sure = _sure_of_box(numbers)
     if numbers["left_size"] >= FAR:
-        settled = all(known_effects()[name].settled_form for name in names)
+        settled = all(hypothesis_of(known_effects()[name]).exact_form for name in names)
         if together < LEAST_EXPLAINED or (settled and explained < LEAST_SETTLED):
             return True
     if together < EXPLAINED and sure and beaten >= MISSED_SHARE:

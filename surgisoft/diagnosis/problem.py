@@ -12,7 +12,7 @@ from surgisoft.diagnosis.comparing.floor import noise_floor
 from surgisoft.diagnosis.motions import motions
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import check_fits, history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
@@ -116,10 +116,10 @@ def own_error(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
     """
     spec, told = model.spec, model.validation
     validated = np.array(
-        [value or 0.0 for value in told.get("per_key_point_mm", [])]
+        [value or 0.0 for value in told.per_key_point_mm]
         or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
     )
-    stated = told.get("noise_mm")
+    stated = told.noise_mm
     noise = noise_mm if stated is None else np.full(len(validated), np.sqrt(3.0) * stated)
     return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_OWN * validated) ** 2))
 

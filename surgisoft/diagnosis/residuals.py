@@ -9,7 +9,7 @@ import torch
 from surgisoft.diagnosis.body_frame import bending, frames
 from surgisoft.diagnosis.comparing.features import Memory, features, memory_of
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 

@@ -43,7 +43,7 @@ def weaknesses(problem: Problem) -> list[str]:
             "fitted on, where it is off by more: an effect that shows there alone may be its own "
             "error"
         )
-    validated = problem.model.validation.get("rmse_mm")
+    validated = problem.model.validation.rmse_mm
     noise = float(np.sqrt(np.mean(problem.noise_mm**2)))
     if validated and problem.floor_source == "holds" and noise > validated:
         answer.append(

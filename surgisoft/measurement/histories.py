@@ -7,7 +7,7 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.noise import known_noise
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History, pack
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 LEAST_HOLD_S = 1.0
 """Shortest hold whose scatter is taken for noise, s."""

@@ -64,8 +64,8 @@ def test_robots_of_known_truth(folder, case, kind, effects):
 def test_a_bent_surrogate_has_the_wanted_error():
     model = default_arm()
     worse = bent(model, 0, 0.3, seed=4)
-    assert worse.validation["rmse_mm"] == pytest.approx(0.3, rel=0.05)
-    assert model.validation["rmse_mm"] < 0.15
+    assert worse.validation.rmse_mm == pytest.approx(0.3, rel=0.05)
+    assert model.validation.rmse_mm < 0.15
 
 
 def test_correlated_noise_is_stated():

@@ -11,7 +11,7 @@ from surgisoft.diagnosis.bootstrap import blocks
 from surgisoft.diagnosis.compare import compare, time_shift
 from surgisoft.diagnosis.comparing.bands import bands
 from surgisoft.diagnosis.residuals import residuals
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from tests.diagnosis.synthetic import NOISE_MM, POINTS, recording, still_model, walk
 from tests.report.browser import chromium, look

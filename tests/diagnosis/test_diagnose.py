@@ -11,7 +11,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
 

@@ -7,6 +7,7 @@ from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.problem import pose
 from surgisoft.diagnosis.race.form import Loosened, loosened
 from surgisoft.diagnosis.race.ranking import Race
+from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import recording, still_model, walk
 
 ROWS = 4000
@@ -16,7 +17,7 @@ PRESSURE = walk(ROWS)
 def shifted(size_mm: np.ndarray):
     """A race over an arm whose tip, and the rest in proportion, is measured size_mm (S,) aside."""
     model = still_model()
-    model.validation = {"rmse_mm": 0.1, "per_key_point_mm": [0.1, 0.1, 0.1], "rows": ROWS}
+    model.validation = Validation(0.1, (0.1, 0.1, 0.1), ROWS)
     problem = pose(model, [recording(size_mm, PRESSURE)])
     race = Race.of(problem, candidates(problem, ["misalignment"]))
     return race, race.standings()

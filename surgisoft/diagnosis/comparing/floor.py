@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.bootstrap import blocks, folds
 from surgisoft.measurement.noise import hold_noise, stated_noise
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 if TYPE_CHECKING:
     from surgisoft.diagnosis.residuals import Residuals

@@ -13,7 +13,13 @@ from surgisoft.diagnosis.isolability.moments import sample_time
 from surgisoft.diagnosis.next_experiment.catalogue import REFERENCE, draw_run, limits_within
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.surrogate.arm import centre_and_half
-from surgisoft.surrogate.effects import ArmFacts, Effect, known_effects, make_effect
+from surgisoft.surrogate.effects import (
+    ArmFacts,
+    Effect,
+    hypothesis_of,
+    known_effects,
+    make_effect,
+)
 from surgisoft.surrogate.history import History, pack
 from surgisoft.surrogate.model import ArmModel
 
@@ -85,7 +91,7 @@ def shapes_of(
         kind = known[name] if name in known else type(make_effect(name, facts))
         if name in model.effects:
             answer.append(Shape(name, model.effects[name], True))
-        answer += [Shape(name, effect) for effect in kind.candidates(facts, points)]
+        answer += [Shape(name, effect) for effect in hypothesis_of(kind).candidates(facts, points)]
     return answer
 
 
@@ -122,9 +128,9 @@ def _slopes(design: Design, signal: Signals, effect: Effect, columns: np.ndarray
 
     columns: (S, n, 3, K) change with each of its strengths.
     """
-    strengths = torch.cat([p.flatten() for p in effect.strengths().values()]).numpy()
+    strengths = torch.cat([p.flatten() for p in effect.amplitudes().values()]).numpy()
     now, answer = columns @ strengths, []
-    for name, parameter in effect.shapes().items():
+    for name, parameter in effect.nonlinear_parameters().items():
         for i, value in enumerate(parameter.flatten().tolist()):
             other = copy.deepcopy(effect)
             step = SHAPE_STEP * max(1.0, abs(value))

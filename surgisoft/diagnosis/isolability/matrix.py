@@ -31,7 +31,7 @@ from surgisoft.diagnosis.isolability.moments import (
 from surgisoft.diagnosis.problem import noise_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
@@ -286,7 +286,7 @@ def uncertainty_of(
     points, length = model.spec.key_points, length_of(model)
     if noise_mm is None:
         noise_mm = np.full(points, CAMERA_SHARE * length)
-    validated = [value or 0.0 for value in model.validation.get("per_key_point_mm", [])]
+    validated = [value or 0.0 for value in model.validation.per_key_point_mm]
     surrogate = np.array(validated or [0.05 * length] * points)
     return Uncertainty(
         np.asarray(noise_mm, float),

@@ -147,7 +147,7 @@ def _own_weight(question: Question, design: Design, setting: Setting) -> tuple[n
         return np.zeros((len(design.index), model.spec.key_points, 3, 1), np.float32), 1.0
     pull = np.asarray(was) if setting.payload_g else np.subtract(setting.gravity(was), was)
     load = make_effect("payload", replace(model.facts, gravity=tuple(float(v) for v in pull)))
-    column = list(load.strengths()).index("tip_sag" if setting.payload_g else "body_sag")
+    column = list(load.amplitudes()).index("tip_sag" if setting.payload_g else "body_sag")
     motion = columns_on(design, [Shape("payload", load)])[0][..., column : column + 1]
     uncertainty = question.uncertainty
     change = float(np.linalg.norm(pull))

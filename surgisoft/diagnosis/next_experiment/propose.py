@@ -16,7 +16,6 @@ from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
 from surgisoft.diagnosis.isolability.matrix import SURE, Isolability
@@ -43,11 +42,12 @@ from surgisoft.diagnosis.verdict import Experiment
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import known_effects, make_effect
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 MINUTES = 15.0
 """Longest time on the bench where none is asked for, minutes."""
@@ -139,7 +139,7 @@ class Recommendation:
         }
 
 
-@on_one_thread
+@torch_threads(1)
 def next_experiment(
     model: Model,
     recordings: Recordings = (),

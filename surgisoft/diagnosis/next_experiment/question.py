@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.candidates import facts_of
+from surgisoft.diagnosis.estimation.effects import with_fitted
 from surgisoft.diagnosis.isolability.designs import (
     PERIOD_S,
     Design,
@@ -27,7 +28,6 @@ from surgisoft.diagnosis.isolability.matrix import (
 )
 from surgisoft.diagnosis.isolability.moments import Moments, Uncertainty, sample_time, unimitated
 from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.refinement.sharpen import with_fitted
 from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 
@@ -193,7 +193,7 @@ def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> l
         if best is None or gains[best] < CLEAR:
             continue
         effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
-        for parameter in effect.strengths().values():
+        for parameter in effect.amplitudes().values():
             part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
             parameter.data.copy_(part.view_as(parameter))
             first += parameter.numel()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Track
-from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
+from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.report import Facts, Page, Picture, Section, Table, Text
 from surgisoft.report.charts import BLUE, RED, chart, drawing
 

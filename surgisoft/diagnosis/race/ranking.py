@@ -11,7 +11,7 @@ from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.race.cross_validation import CrossValidation
 from surgisoft.diagnosis.race.gates import family_p_values
 from surgisoft.diagnosis.race.split import FITTED, Split, static_features
-from surgisoft.surrogate.effects import Effect, Quantity
+from surgisoft.surrogate.effects import Effect, Quantity, hypothesis_of
 
 KNOWN_WEIGHT = 3.0
 """Weight of a reference's rows: an error that changed since is not shared out over both."""
@@ -119,7 +119,7 @@ class Race:
             # Beside more of an effect that the model has, one further shape of it is enough.
             own = any(candidates[way.shape].more for way in ways)
             shapes = [candidates[way.shape].effect for way in ways]
-            for some in [] if own else shapes[0].together(shapes):
+            for some in [] if own else hypothesis_of(shapes[0]).combinations(shapes):
                 if len(some) > 1:
                     ways.append(Option(name, sum((ways[i].picked for i in some), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
@@ -204,7 +204,9 @@ class Race:
         if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
             return False
         some = self.candidates[self.options[way.effect][0].shape].effect
-        return not some.needs_reversals or self._static_share(way, base) <= MOST_STATIC
+        return (
+            not hypothesis_of(some).needs_reversals or self._static_share(way, base) <= MOST_STATIC
+        )
 
     def _static_share(self, way: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""

@@ -15,8 +15,8 @@ from surgisoft.measurement.importing.align import (
     without_holds,
 )
 from surgisoft.measurement.importing.spec import ImportMap
+from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.quality import frozen_channels, spikes
-from surgisoft.measurement.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from surgisoft.measurement.importing.align import renewal_s, renewed_rows, without_holds
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 BACK_S = 0.5
 """Largest shift at which the body moves first [s]."""

@@ -4,7 +4,7 @@ Mounts are drawn from how the arm stands at work: from where the beam comes, how
 the arm is bent then and to which side. Each is judged by the batched engine.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,7 +78,7 @@ class LookSite:
     """Higher is better."""
 
 
-def directions_around(normal: np.ndarray, tilts_rad: Sequence[float], turns: int) -> np.ndarray:
+def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int) -> np.ndarray:
     """(D, 3) unit vectors at each tilt from `normal`, `turns` of them around; tilt 0 once."""
     frame = frames.rotation_from_z(normal)
     around = 2.0 * np.pi * np.arange(turns) / turns

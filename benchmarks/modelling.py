@@ -2,12 +2,12 @@
 
 import multiprocessing
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from surgisoft.progress import Progress
 from surgisoft.workers import begin_worker
 
 ARCHITECTURES = ("64,64", "128,128", "64,64,64", "128,128,128", "64,64,64,64", "128,128,128,128")
@@ -136,7 +136,7 @@ def run(
     seeds: list[int],
     points: int | None,
     processes: int,
-    report: Callable[[float, float, str], None],
+    report: Progress,
     images: Path | None = None,
 ) -> str:
     """The whole study; returns its Markdown. `images` receives loops and bodies of one robot."""

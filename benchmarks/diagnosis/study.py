@@ -9,7 +9,6 @@ of some cases the model is amended by what was named.
 import hashlib
 import json
 import time
-from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from benchmarks.diagnosis.experiment import Settled, settle_both
 from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.workers import workers
 
@@ -104,7 +104,7 @@ def run(
     some: list[Case],
     folder: Path,
     processes: int,
-    report: Callable[[float, float, str], None],
+    report: Progress,
     amend: int = 0,
 ) -> list[Outcome]:
     """All outcomes; base models first, then the cases, over processes.

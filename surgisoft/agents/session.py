@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from surgisoft.agents.distributed import processes
-from surgisoft.agents.evaluate import Evaluation
+from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
 from surgisoft.agents.on_rig import RigConfig, on_rig
-from surgisoft.agents.policies import DRIVERS, check_driver, open_driver
+from surgisoft.agents.policies import POLICIES, check_policy, open_policy
 from surgisoft.agents.presets import Plan, preset_for, steps_for
+from surgisoft.agents.rollout import EpisodeRecorders
 from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
-from surgisoft.agents.selection import FirstEpisode
-from surgisoft.agents.training import Progress, Result, resume, train_new
+from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
@@ -30,9 +31,6 @@ from surgisoft.tasks.registry import (
     with_fields,
 )
 from surgisoft.workers import torch_threads
-
-CONFIDENCE = 0.95
-"""Share of the intervals of an evaluation that hold the true mean."""
 
 
 def task_config(
@@ -121,7 +119,7 @@ def train(
     resume_from: str | Path | None = None,
     device: str = "cpu",
     threads: int = 1,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[TrainingProgress], None] | None = None,
     **fields: Any,
 ) -> TrainedRun:
     """Train the agents of a task with PPO; all of them learn at the same time.
@@ -198,8 +196,8 @@ class EvaluationRequest:
         if not self.policies:
             raise InputError("no policy is given; expected scripted, random or a run's folder")
         for name in self.policies:
-            check_driver(name)
-        runs = [RunFolder(name) for name in self.policies if name not in DRIVERS]
+            check_policy(name)
+        runs = [RunFolder(name) for name in self.policies if name not in POLICIES]
         if self.task is None and not runs:
             raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
         task = self.task or runs[0].config["task"]
@@ -254,7 +252,7 @@ def evaluate(
     policies: str | Path | Sequence[str | Path],
     task: str | None = None,
     *,
-    progress: Callable[[float, float, str], None] | None = None,
+    progress: Progress = silent,
     on_warning: Callable[[str], None] = warnings.warn,
     **fields: Any,
 ) -> Evaluations:
@@ -268,16 +266,20 @@ def evaluate(
     given = [policies] if isinstance(policies, str | Path) else policies
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields)
-    report = progress or (lambda done, total, note: None)
     plain, config = request.resolved(on_warning)
     place = plain if request.rig is None else on_rig(plain, request.rig)
-    opened = {name: open_driver(name, place) for name in request.policies}
-    logs = {name: FirstEpisode(place, name, request.seed, request.place) for name in request.log}
+    opened = {name: open_policy(name, place) for name in request.policies}
+    logs = {
+        name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
+        for name in request.log
+    }
     results = []
     for number, (name, policy) in enumerate(opened.items()):
 
-        def tell(done: float, total: float, first: int = number, name: str = name) -> None:
-            report(first * total + done, len(opened) * total, name)
+        def tell(
+            done: float, total: float, note: str = "", first: int = number, name: str = name
+        ) -> None:
+            progress(first * total + done, len(opened) * total, name)
 
         result = evaluate_policy(
             place,
@@ -296,5 +298,5 @@ def evaluate(
         config_table(config),
         plain.world.config.dt_s,
         tuple(results),
-        {name: each.log() for name, each in logs.items()},
+        {name: each.log(0) for name, each in logs.items()},
     )

@@ -157,7 +157,7 @@ def _show(results) -> None:
     from surgisoft.agents.evaluate import RATES
 
     names = list(dict.fromkeys(name for result in results for name in result.overall))
-    rows = [["", *(Path(result.driver).name for result in results)]]
+    rows = [["", *(Path(result.policy).name for result in results)]]
     for name in names:
         cells = (_cell(result.overall.get(name), name in RATES) for result in results)
         rows.append([name, *cells])
@@ -166,10 +166,10 @@ def _show(results) -> None:
         held = "".join(f"   {cell:>{w}s}" for cell, w in zip(cells, widths[1:], strict=True))
         print(f"{first:{widths[0]}s}{held}")
     for result in results:
-        if result.verdicts is not None:
+        if result.checks is not None:
             facts = result.to_json()["referee"]
             print(
-                f"exact collision checker on {Path(result.driver).name}: of "
+                f"exact collision checker on {Path(result.policy).name}: of "
                 f"{counted(facts['instants'], 'instant')} the batched geometry differs on contact "
                 f"in {facts['contact_differs']} and on what the beam hits in "
                 f"{facts['beam_differs']}; the hit differs by at most {facts['beam_off_mm']:.1g} mm"

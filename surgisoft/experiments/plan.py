@@ -1,4 +1,4 @@
-"""What an experiment plays: every case on every lesion with every combination of what varies."""
+"""Settings of an experiment: every case on every lesion with every combination of what varies."""
 
 from __future__ import annotations
 
@@ -10,24 +10,32 @@ from pathlib import Path
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.config import Where
 from surgisoft.errors import InputError
-from surgisoft.experiments.controllers import PhasedAblation
-from surgisoft.experiments.spec import Case, Experiment, Lesion, Vary, merged, task_config
+from surgisoft.experiments.phases import PhasedTask
+from surgisoft.experiments.spec import (
+    EXPERIMENT_TASK,
+    Case,
+    Experiment,
+    Lesion,
+    Vary,
+    merged,
+    task_config,
+)
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.scene.folder import Scene, open_scene
-from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.registry import config_table
+from surgisoft.tasks.circle_ablation import CircleAblationConfig
+from surgisoft.tasks.registry import config_table, with_present_names
 
 Value = int | float | str
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One condition of the experiment; `repeats` episodes are played in it."""
+    """One condition of the experiment, with `repeats` episodes."""
 
     number: int
     """Its place among all."""
     case: Case
-    """Who plays, on what."""
+    """Policy and plant."""
     lesion: Lesion | None
     """Where is cut; None: the scene's own lesion."""
     values: tuple[tuple[str, Value], ...]
@@ -42,7 +50,7 @@ class Setting:
 
     @property
     def words(self) -> str:
-        """The same for a person."""
+        """The label in words."""
         parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
         return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
 
@@ -111,7 +119,7 @@ def _configured(spec: Experiment, values) -> CircleAblationConfig:
             change: dict | Value = value
             for part in reversed(name.split(".")):
                 change = {part: change}
-            table = merged(table, change)
+            table = merged(table, with_present_names(spec.task, change))
     try:
         return task_config(table, Where(Path(spec.name)))
     except InputError as error:
@@ -119,7 +127,7 @@ def _configured(spec: Experiment, values) -> CircleAblationConfig:
 
 
 def rig_config(setting: Setting, place: Where) -> RigConfig | None:
-    """The bench of a setting; None in simulation."""
+    """The rig of a setting; None in simulation."""
     varied = dict(setting.values)
     if setting.case.plant != "rig":
         return None
@@ -162,15 +170,14 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
     return moved
 
 
-def build_task(spec: Experiment, setting: Setting) -> PhasedAblation:
+def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     """The phased task of a setting, its arms on the rig where the case says so."""
     config = _configured(spec, setting.values)
     arm = setting.case.arm or config.arm
     config = dataclasses.replace(config, arm=arm, scene=spec.scene)
-    base = CircleAblation(dataclasses.replace(config, scene=scene_of(spec, setting)))
-    base.config = config
+    base = EXPERIMENT_TASK.build(config, scene_of(spec, setting))
     rig = rig_config(setting, Where(Path(spec.name)))
     varied = {f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")}
     faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
     spec = dataclasses.replace(spec, faults=faults)
-    return PhasedAblation(base if rig is None else on_rig(base, rig), spec)
+    return PhasedTask(EXPERIMENT_TASK.supervise(base if rig is None else on_rig(base, rig)), spec)

@@ -1,7 +1,7 @@
 """Make a scene from mesh files: read, repair, place the lesion, find mounts, write the folder."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
+from surgisoft.progress import Progress, silent
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
@@ -49,8 +50,6 @@ COARSE_RING = 36
 """Ring points while mounts are searched."""
 CROSSING = "surfaces cross, the outermost counts; faces buried inside"
 """How a body is told of whose surface crosses itself."""
-
-Report = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class NoMounts(InputError):
         self.notes = notes
 
 
-def prepare(request: Request, report: Report = lambda done, total, note: None) -> Prepared:
+def prepare(request: Request, report: Progress = silent) -> Prepared:
     """Read and repair every file; an InputError says why one cannot be used."""
     for role in request.roles:
         if role not in ROLES:
@@ -191,7 +190,7 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[tuple[str, Mesh]]:
     return found
 
 
-def _tell(report: Report, number: int, count: int, name: str, what: str) -> None:
+def _tell(report: Progress, number: int, count: int, name: str, what: str) -> None:
     """What is done to file `number` of `count`; reading takes the first 5 % of the way."""
     report(5.0 * number / count, 100, f"{name}: {what}")
 
@@ -252,7 +251,7 @@ def author(
     reaches: dict[str, ArmReach],
     mounts: dict[str, MountSpec],
     name: str,
-    report: Report = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> Authored:
     """The whole way from mesh files to a checked scene; nothing is written.
 

@@ -39,7 +39,7 @@ class Rule:
     """What a value must hold beyond its type; the text completes 'expected ...'."""
 
     expected: str
-    holds: typing.Callable[[object], bool]
+    holds: typing.Callable[[typing.Any], bool]
 
 
 def one_of(names: typing.Iterable[str]) -> Rule:
@@ -273,7 +273,7 @@ def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = Non
     if base is typing.Any:
         converted = value
     elif dataclasses.is_dataclass(base):
-        converted = from_table(base, value, where)
+        converted = from_table(typing.cast(type, base), value, where)
     elif _is_union(base):
         part = next((part for part in typing.get_args(base) if _admits(part, value)), None)
         if part is None:

@@ -14,7 +14,7 @@ from typing import Protocol
 class Progress(Protocol):
     """What a function that works for long calls now and then."""
 
-    def __call__(self, done: float, total: float, note: str = "") -> None:
+    def __call__(self, done: float, total: float, note: str = "", /) -> None:
         """done of total, in any unit; note: what is being done."""
 
 

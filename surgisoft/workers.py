@@ -23,7 +23,10 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-    asker = multiprocessing.parent_process().sentinel
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise RuntimeError("begin_worker is for a new process, and this is the first one")
+    asker = parent.sentinel
 
     def end_with_it() -> None:
         multiprocessing.connection.wait([asker])

@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow.compute as pc
 
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import Replay, layout_names, write_replay
 from surgisoft.replay.recording import SUFFIX, TIME
 from surgisoft.replay.viewer import (
@@ -80,8 +81,6 @@ def duration_s(recording: Path) -> float | None:
     return max(ends) * 1e-9 if ends else None
 
 
-Report = Callable[[float, float, str], None]
-"""Called with (done, to do, note)."""
 WINDOW = "1600x1000"
 """Size of a picture's window, in points."""
 
@@ -95,7 +94,7 @@ def open_replay(
     size: str = WINDOW,
     time_s: float | None = None,
     view: str | None = None,
-    progress: Report | None = None,
+    progress: Progress = silent,
     on_address: Callable[[str], None] = print,
 ) -> Replay | None:
     """Open an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events.
@@ -128,7 +127,7 @@ def open_replay(
 
 
 @contextlib.contextmanager
-def _recording(found: Path, progress: Report | None) -> Iterator[Path]:
+def _recording(found: Path, progress: Progress) -> Iterator[Path]:
     """A replay itself; the replay of a log for the time of the block."""
     if found.suffix == ".rrd":
         yield found

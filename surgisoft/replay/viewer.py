@@ -154,7 +154,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def view_names(recording: Path) -> tuple[str, ...]:
-    """Names of the views that the layout of an .rrd file defines; empty where it holds no layout."""
+    """Names of the views in the layout of an .rrd file; empty where it holds no layout."""
     from rerun.chunk import RrdReader
 
     column, names = "ViewBlueprint:display_name", []

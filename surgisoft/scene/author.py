@@ -133,7 +133,8 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     if request.unit is not None and request.unit not in MM_PER_UNIT:
         raise unknown_name("unit", request.unit, MM_PER_UNIT)
     notes: list[str] = []
-    names, roles, meshes, holes_mm, scales = [], [], [], [], []
+    names: list[str] = []
+    roles, meshes, holes_mm, scales = [], [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         tell = partial(_tell, report, i, len(request.meshes), path.name)
         tell("reading")
@@ -302,7 +303,7 @@ def author(
             request.camera,
             request.limits,
             {tool: mount.shaft_mm for tool, mount in mounts.items()},
-            lambda done, total, note, span=span: report(
+            lambda done, total, note="", span=span: report(
                 span[0] + span[1] * done / total / 2, 100, note
             ),
         )
@@ -383,6 +384,7 @@ def rounded_mount(position_mm, rotation) -> dict:
 
 
 def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
+    assert check.work is not None, "a scene that was chosen has its arms at work"
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"

@@ -1,8 +1,8 @@
 """Clearance and ray queries for many environments at once, as training needs them.
 
-`BatchedScene` gives the results of `collision.CollisionChecker` for batches of arms: on the CPU with
-Embree and compiled queries, on an accelerator with torch. Both agree with FCL to the tolerances
-that `tests/scene/test_distance.py` and `test_rays.py` state.
+`BatchedScene` gives the results of `collision.CollisionChecker` for batches of arms: on the CPU
+with Embree and compiled queries, on an accelerator with torch. Both agree with FCL to the
+tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
 """
 
 from __future__ import annotations

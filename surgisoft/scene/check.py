@@ -94,7 +94,7 @@ class SceneCheck:
 
 def sentence(check: SceneCheck) -> str:
     """The verdict in one sentence."""
-    if check.good:
+    if check.good and check.work is not None:
         return (
             f"The scene is ready: the laser reaches {100 * check.work.covered:.0f} % of the ring, "
             f"the endoscope sees {100 * check.work.view.min():.0f} % of it, nothing comes closer "

@@ -5,7 +5,7 @@ arm is bent, and to which side. The batched engine evaluates the candidates of e
 the best of both arms are paired.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,7 +80,7 @@ class EndoscopeSite:
     """Higher is better."""
 
 
-def directions_around(normal: np.ndarray, tilts_rad: Sequence[float], turns: int) -> np.ndarray:
+def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int) -> np.ndarray:
     """(D, 3) unit vectors at each tilt from `normal`, `turns` of them around; tilt 0 once."""
     frame = frames.rotation_from_z(normal)
     around = 2.0 * np.pi * np.arange(turns) / turns

@@ -73,16 +73,16 @@ class Tissue:
 
 
 REACH_WAISTS = 2.3
-"""The beam is followed out to so many 1/e^2 radii; 3e-5 of its power lies beyond."""
+"""The beam is cut off at this many 1/e^2 radii; 3e-5 of its power lies beyond."""
 COARSEST_WAISTS = 0.9
-"""Coarser patches than this share of the beam's 1/e^2 radius would lose energy and are refused."""
+"""Largest sample edge as a share of the beam's 1/e^2 radius; coarser patches would lose energy."""
 STEEPEST_COSINE = 0.1
-"""Faces steeper than this to the beam (84 degrees) may miss the outermost part of it."""
+"""Faces steeper to the beam than this cosine (84 degrees) may miss its outermost part."""
 
 
 @dataclass(frozen=True, eq=False)
 class AblationState:
-    """What the laser has done so far, for B environments, P samples, N stations. Frame: patch's."""
+    """Dose and ablated areas so far: B environments, P samples, N stations; the patch's frame."""
 
     dose: torch.Tensor
     """(B, P) float32 J/mm^2: radiant exposure of the surface."""
@@ -107,19 +107,19 @@ class AblationState:
 
 
 _SUMS = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j", "delivered_j")
-"""The parts of the state that begin at zero."""
+"""The fields of the state that start at zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class RingReport:
-    """How far the ring is done; (B,) tensors."""
+    """Progress of the cut; (B,) tensors."""
 
     completion: torch.Tensor
-    """0..1: share of the ring that is ablated to the asked depth."""
+    """0..1: share of the ring that is ablated to the required depth."""
     largest_gap_mm: torch.Tensor
-    """Length of the longest stretch that is not (mm)."""
+    """Length of the longest stretch that is not cut (mm)."""
     largest_gap_deg: torch.Tensor
-    """The same as an angle: 360 degrees are the whole ring."""
+    """Length of the longest uncut stretch as an angle: 360 degrees are the whole ring."""
     width_mm: torch.Tensor
     """Mean width of the cut where the ring is cut (mm), within the band; 0 for no cut."""
     healthy_mm2: torch.Tensor
@@ -133,7 +133,7 @@ class RingReport:
 
 
 class AblationMap:
-    """The laser on one patch with one ring or several to choose from; built once, asked often."""
+    """Accumulates the laser's dose on a patch that has one ring or several to choose from."""
 
     def __init__(
         self,
@@ -197,7 +197,7 @@ class AblationMap:
     ) -> AblationState:
         """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
 
-        With in_place the old state's tensors are given up.
+        With in_place the old state's tensors are overwritten.
         """
         new = self._beam(point_mm, direction, on)
         old = (state.last_point_mm, state.last_direction, state.last_on)
@@ -222,7 +222,7 @@ class AblationMap:
 
         point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
         (B,), held over the step. Where the beam was on the organ at one end of the step only, half
-        of the step's energy goes there. With in_place the old state's tensors are given up.
+        of the step's energy goes there. With in_place the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
         power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)
@@ -268,7 +268,7 @@ class AblationMap:
         return dose, peak, band, area, joule
 
     def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
-        """The same on an accelerator: every sample of every environment, a few at a time."""
+        """`_deposit` in torch, for accelerators: every sample, a few environments at a time."""
         points, normals, areas = (t.float() for t in self._samples)
         size = max(1, 8_000_000 // len(points))
         for i in range(0, len(dose), size):
@@ -288,7 +288,7 @@ class AblationMap:
         return dose, peak, band, area, joule
 
     def report(self, state: AblationState) -> RingReport:
-        """How far the ring of each environment is done."""
+        """Progress of the cut in each environment."""
         cut = state.peak >= self.cut_dose
         length = self._ring_mm[state.ring] / self.patch.stations
         gap = longest_run(~cut)

@@ -1,6 +1,6 @@
-"""Arms as geometry sees them: a centreline with a radius, a chain of capsules.
+"""The geometric model of an arm: a centreline with a radius, which is a chain of capsules.
 
-Closed forms for capsules against rays and against each other; numpy and torch alike, batched.
+Closed forms for capsules against rays and against each other, batched, for numpy and torch.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from surgisoft.errors import InputError
 from surgisoft.scene.frames import dot, norm, normalise
 
 HORIZON_MM = 60.0
-"""Clearances saturate here in both engines: farther is reported as this far (mm)."""
+"""Clearances saturate at this value in both engines (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:
-    """One arm at one moment: a chain of K - 1 capsules with round ends."""
+    """The shape of one arm at one moment: a chain of K - 1 capsules with round ends."""
 
     centreline_mm: np.ndarray
     """(K, 3) float64, mm, world frame, base to tip."""
@@ -43,7 +43,7 @@ class ArmShape:
 
 @dataclass(frozen=True, eq=False)
 class BatchClearance:
-    """Signed clearances (mm) of a batch, as `collision.Clearance` defines them, saturating."""
+    """Signed clearances (mm) of B environments, as `collision.Clearance` defines them."""
 
     bodies_mm: torch.Tensor
     """(B, A, N) arm by body, in the order of the scene's arms and bodies."""
@@ -65,7 +65,7 @@ class BatchClearance:
 
 
 def self_contact_gap_mm(radius_mm: float) -> float:
-    """Arc length (mm) from which two stretches of one arm can be told to touch.
+    """Arc length (mm) between two parts of one arm beyond which they can be said to touch.
 
     A body of radius r cannot bend tighter than a circle of radius r without folding its own inner
     side, and an arc of length s on such a curve has a chord of at least 2 r sin(s / 2 r) (Schur
@@ -89,7 +89,7 @@ def folding_pairs(centreline_mm, radius_mm: float):
 
 
 def ray_free_segments(centreline_mm, radius_mm: float):
-    """(..., K-1) bool: segments far enough from the tip to stand in the way of its own beam."""
+    """(..., K-1) bool: segments far enough from the tip to block the beam that leaves it."""
     arc = arc_lengths(centreline_mm)
     return arc[..., -1:] - arc[..., 1:] >= self_contact_gap_mm(radius_mm)
 
@@ -98,8 +98,8 @@ def segment_distance(p1, q1, p2, q2):
     """Distance (...) between segments p1 q1 and p2 q2, each (..., 3) mm, broadcast.
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; segments of length zero allowed.
-    The first s is that of the two lines (0 if parallel); one turn of exact line searches after it
-    lands on the box constraints.
+    The first s is that of the two infinite lines (0 if parallel). One exact line search in each of
+    t, s, t then meets the bounds of both segments.
     """
     lib = torch if isinstance(p1, torch.Tensor) else np
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
@@ -157,8 +157,8 @@ def ray_capsule(origin, direction, a, b, radius_mm: float):
 def ray_chain(origin, direction, centreline_mm, radius_mm: float, free=None):
     """First hit of unit rays (..., 3) on an arm's centreline (..., K, 3): distance, segment.
 
-    Returns (...) mm, inf for a miss, and (...) the segment's index. `free` (..., K-1) bool leaves
-    segments out where it is False (the ones around the beam's own tip).
+    Returns (...) mm, inf for a miss, and (...) the segment's index. Segments where `free`
+    (..., K-1) bool is False are ignored (those near the tip that the beam leaves).
     """
     lib = torch if isinstance(origin, torch.Tensor) else np
     a, b = centreline_mm[..., :-1, :], centreline_mm[..., 1:, :]

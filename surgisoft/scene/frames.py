@@ -1,8 +1,8 @@
-"""Rigid poses and rotations, for numpy arrays and torch tensors alike.
+"""Rigid poses and rotations for numpy arrays and torch tensors.
 
 A pose is a (..., 4, 4) matrix that maps points of its own frame into its parent's frame:
 `p_parent = pose @ p_own`. World frame: z up, millimetres.
-Every function returns the kind it was given (numpy stays numpy, torch keeps dtype and device).
+Every function returns the type it was given: numpy stays numpy, torch keeps dtype and device.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def rotation_from_z(z_axis, roll_rad=0.0):
 
 
 def pose_from_z(position_mm, z_axis, roll_rad=0.0):
-    """Pose (..., 4, 4) at position_mm (..., 3) with its z along z_axis (..., 3), see above."""
+    """Pose (..., 4, 4) at position_mm (..., 3) z along z_axis (..., 3), see rotation_from_z."""
     position_mm, z_axis, roll_rad = _as_arrays(position_mm, z_axis, roll_rad)
     return pose_from(rotation_from_z(z_axis, roll_rad), position_mm)
 

@@ -19,9 +19,9 @@ from surgisoft.scene.capsules import arc_lengths, ray_chain, segment_distance
 from surgisoft.scene.frames import cross, dot, norm
 
 LEVELS_A_STEP = 3
-"""Tree levels that one step goes down."""
+"""Tree levels that one step descends."""
 QUERIES_AT_ONCE = 16_384
-"""Queries that go down together; more are taken in turns to bound the memory."""
+"""Queries that descend the tree together; larger batches are split to bound the memory."""
 
 
 class TorchTree:
@@ -193,11 +193,11 @@ def segment_triangle_d2(p, q, corners):
 
 
 PAIRS_AT_ONCE = 4_000_000
-"""Segment pairs that are measured together; larger batches are taken in turns."""
+"""Segment pairs that are evaluated together; larger batches are split to bound the memory."""
 
 
 class TorchSurface:
-    """One body's surface on a device: its field, its tree, its normals."""
+    """One body's surface on a device: its distance field, tree and normals."""
 
     def __init__(self, tree, field, device):
         self._tree = TorchTree(tree, device)

@@ -9,7 +9,7 @@ heat conduction and no shielding by the plume, and the surface keeps its shape.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +78,10 @@ COARSEST_WAISTS = 0.9
 """Largest sample edge as a share of the beam's 1/e^2 radius; coarser patches would lose energy."""
 STEEPEST_COSINE = 0.1
 """Faces steeper to the beam than this cosine (84 degrees) may miss its outermost part."""
+
+
+Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""New linear colours (N, 3) for faces (N,), points (N, 3) mm and their colours (N, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +177,16 @@ class AblationMap:
         lengths = [one.ring_length_mm for one in self.patches]
         self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
 
-    def start(self, point_mm, direction, on, ring=None) -> AblationState:
+    def start(
+        self,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        ring: torch.Tensor | None = None,
+    ) -> AblationState:
         """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool.
 
-        ring (B,) int64 says which ring is to be cut; None: the first.
+        ring (B,) int64 is the number of the ring to cut; None: the first.
         """
         count, patch = len(point_mm), self.patch
         sizes = (
@@ -193,7 +203,14 @@ class AblationMap:
         return AblationState(**sums, **self._last(*self._beam(point_mm, direction, on)), ring=ring)
 
     def reset(
-        self, state: AblationState, mask, point_mm, direction, on, in_place=False, ring=None
+        self,
+        state: AblationState,
+        mask: torch.Tensor,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        in_place: bool = False,
+        ring: torch.Tensor | None = None,
     ) -> AblationState:
         """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
 
@@ -216,12 +233,19 @@ class AblationMap:
         return AblationState(**sums, **self._last(*beam), ring=torch.where(mask, ring, state.ring))
 
     def advance(
-        self, state: AblationState, point_mm, direction, on, power_w, dt_s: float, in_place=False
+        self,
+        state: AblationState,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        power_w: torch.Tensor | float,
+        dt_s: float,
+        in_place: bool = False,
     ) -> AblationState:
         """The state dt_s later, the beam having swept from its last place to this one.
 
         point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
-        (B,), held over the step. Where the beam was on the organ at one end of the step only, half
+        (B,), constant over the step. Where the beam was on the organ at one end of the step only, half
         of the step's energy goes there. With in_place the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
@@ -306,7 +330,7 @@ class AblationMap:
             delivered_j=state.delivered_j,
         )
 
-    def paint(self, state: AblationState, environment: int = 0):
+    def paint(self, state: AblationState, environment: int = 0) -> Paint:
         """For `render`: colours one environment's patch by dose, from blanched to charred."""
         dose = state.dose[environment].detach().cpu().numpy()
         share = np.clip(dose / self.threshold, 0.0, None)
@@ -322,7 +346,14 @@ class AblationMap:
         return recolour
 
 
-def sweep_fluence(began, ended, direction, energy, waist_mm: float, points_mm):
+def sweep_fluence(
+    began: torch.Tensor,
+    ended: torch.Tensor,
+    direction: torch.Tensor,
+    energy: torch.Tensor,
+    waist_mm: float,
+    points_mm: torch.Tensor,
+) -> torch.Tensor:
     """Fluence (B, P) J/mm^2 across the beam at points (P, 3) mm, for a straight sweep.
 
     A Gaussian beam, 2 E / (pi w^2) exp(-2 r^2 / w^2) (Siegman 1986, section 17.1), whose axis moves

@@ -123,7 +123,7 @@ class NoMounts(InputError):
 
 
 def prepare(request: Request, report: Progress = silent) -> Prepared:
-    """Read and repair every file; an InputError says why one cannot be used."""
+    """Read and repair every file; an InputError gives the reason why one cannot be used."""
     for role in request.roles:
         if role not in ROLES:
             raise unknown_name("role", role, ROLES)
@@ -137,8 +137,8 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     names: list[str] = []
     roles, meshes, holes_mm, scales = [], [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
-        tell = partial(_tell, report, i, len(request.meshes), path.name)
-        tell("reading")
+        on_step = partial(_report_step, report, i, len(request.meshes), path.name)
+        on_step("reading")
         parts = read_parts(path)
         corners = np.concatenate([part.vertices[used_indices(part.faces)[0]] for part in parts])
         size = float(np.ptp(corners, axis=0).max())
@@ -146,14 +146,14 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             raise InputError(f"{path}: all vertices are one point; expected a surface")
         if request.unit is None:
             guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
-            unit, told = guess.unit, guess.sentence
+            unit, unit_note = guess.unit, guess.sentence
         else:
-            unit, told = request.unit, given_unit(size, request.unit)
+            unit, unit_note = request.unit, given_unit(size, request.unit)
         scales.append(MM_PER_UNIT[unit])
         if role == "organ":
-            check_organ_size(path, size * scales[-1], told)
-        notes.append(f"{path.name}: unit {told}")
-        found = _closed_bodies(path, parts, scales[-1], notes, tell)
+            check_organ_size(path, size * scales[-1], unit_note)
+        notes.append(f"{path.name}: unit {unit_note}")
+        found = _closed_bodies(path, parts, scales[-1], notes, on_step)
         found = sorted(found, key=lambda body: -_area(body[1]))
         for i, (name, mesh, hole_mm) in enumerate(found):
             names.append(_free_name(name, names))
@@ -181,12 +181,12 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     )
 
 
-def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
+def _closed_bodies(path, parts, scale, notes, on_step) -> list[_NamedBody]:
     """Repair every part; if one cannot be repaired, take all parts as one surface.
 
     If that cannot be repaired either, the broken parts are left out; an error if nothing is left.
     """
-    found, failures, done = _repaired(path, parts, scale, tell)
+    found, failures, done = _repaired(path, parts, scale, on_step)
     if failures and len(parts) > 1:
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         whole = Part(
@@ -194,7 +194,7 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
             np.concatenate([part.vertices for part in parts]),
             np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
         )
-        together, broken, done_together = _repaired(path, [whole], scale, tell)
+        together, broken, done_together = _repaired(path, [whole], scale, on_step)
         if not broken:
             notes.append(f"{path.name}: its {len(parts)} parts make up one surface")
             found, failures, done = together, [], done_together
@@ -208,25 +208,25 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
     return found
 
 
-def _tell(report: Progress, number: int, count: int, name: str, what: str) -> None:
+def _report_step(report: Progress, number: int, count: int, name: str, what: str) -> None:
     """Report the step for file `number` of `count`; reading is the first 5 % of the work."""
     report(5.0 * number / count, 100, f"{name}: {what}")
 
 
-def _repaired(path, parts, scale, tell) -> tuple[list[_NamedBody], list[InputError], dict]:
+def _repaired(path, parts, scale, on_step) -> tuple[list[_NamedBody], list[InputError], dict]:
     """Named closed bodies of the parts, errors of parts beyond repair, counts of repairs."""
     found, failures = [], []
     done: dict[str, int] = {}
     for part in parts:
         what = str(path) if len(parts) == 1 else f"{path} ({part.name})"
         try:
-            repaired = repair(part.vertices * scale, part.faces, what, tell)
+            repaired = repair(part.vertices * scale, part.faces, what, on_step)
         except InputError as error:
             failures.append(error)
             continue
         for fix in repaired.repairs:
             done[fix.done] = done.get(fix.done, 0) + fix.count
-        tell("looking for faces inside the solid")
+        on_step("looking for faces inside the solid")
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem

@@ -17,10 +17,10 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
-from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
 from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
-from surgisoft.scene.field import MOST_NODES, load_field
+from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
 from surgisoft.scene.torch_queries import (
@@ -217,13 +217,22 @@ class BatchedScene:
 class CompiledSurface:
     """One body's surface on the CPU: compiled clearance queries, rays by Embree."""
 
-    def __init__(self, tree, field, device):
+    def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree, self._field = tree, field
         self._closed = tree.mesh.is_watertight
         self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
-    def clearance(self, lines, given, turn, shift, radius, within, horizon) -> torch.Tensor:
+    def clearance(
+        self,
+        lines: torch.Tensor,
+        given: torch.Tensor,
+        turn: torch.Tensor,
+        shift: torch.Tensor,
+        radius: float,
+        within: float,
+        horizon: float,
+    ) -> torch.Tensor:
         """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
 
         given (K,) bool: the centreline's own points, where depth inside the body counts.
@@ -249,7 +258,9 @@ class CompiledSurface:
         )
         return out
 
-    def first_hit(self, origins, directions, range_mm) -> tuple[torch.Tensor, torch.Tensor]:
+    def first_hit(
+        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
         distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
         return torch.from_numpy(distance), torch.from_numpy(face)

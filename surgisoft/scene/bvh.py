@@ -345,7 +345,9 @@ class TriangleTree:
         """What the compiled queries walk: triangles, starts, lower, upper."""
         return self.triangles_mm, self.starts, self.lower, self.upper
 
-    def nearest(self, points_mm, bound_mm: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(
+        self, points_mm: np.ndarray, bound_mm: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Unsigned distance (N,) mm and face (N,) of points (N, 3) mm; bound_mm and -1 beyond."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         distance, place = np.empty(len(points)), np.empty(len(points), np.int64)

@@ -91,7 +91,9 @@ class Clearance:
         return min(values, default=float("inf"))
 
 
-def collect_all(first, second, pairs) -> bool:
+def collect_all(
+    first: fcl.CollisionObject, second: fcl.CollisionObject, pairs: list[tuple[int, int]]
+) -> bool:
     """FCL broad-phase callback that tests every candidate pair and collects those that collide.
 
     FCL's default callback stops once `num_max_contacts` is reached over all pairs together and so
@@ -165,7 +167,7 @@ class _Chain:
         return geometry in self.segment_of
 
     def folds(self) -> list[int]:
-        """Segments that overlap a stretch of the same arm far enough away along it."""
+        """Segments that overlap another part of the arm, far enough away along it to touch."""
         least = self.fold_bounds()
         allowed = np.isfinite(least)
         if least.min() > 2.0 * self.shape.radius_mm:
@@ -349,7 +351,9 @@ def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
     return fcl.CollisionObject(surface_model(corners, np.array([[0, 1, 2]])))
 
 
-def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
+def ray_triangles(
+    origin: np.ndarray, direction: np.ndarray, triangles_mm: np.ndarray
+) -> np.ndarray:
     """(N,) distances along a ray to triangles (N, 3, 3), inf for a miss; from either side.
 
     Moeller & Trumbore 1997; a hit on an edge belongs to the triangle within rounding.

@@ -44,7 +44,7 @@ class Scene:
             raise InputError(f"{self.folder / FILE}: {error}") from None
 
     def with_lesion(self, lesion: LesionSpec) -> "Scene":
-        """The same scene with another lesion on the same organ."""
+        """A copy of the scene with another lesion on the same organ."""
         return replace(self, spec=replace(self.spec, lesion=lesion))
 
     @cached_property

@@ -121,7 +121,7 @@ class Mesh:
         digest.update(self.faces.astype("<i4").tobytes())
         return digest.hexdigest()
 
-    def transformed(self, pose) -> Mesh:
+    def transformed(self, pose: np.ndarray) -> Mesh:
         """The same mesh moved by a pose (4, 4): vertices in the pose's parent frame."""
         return Mesh(frames.apply(pose, self.vertices_mm), self.faces)
 

@@ -140,13 +140,13 @@ def laser_sites(
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
     poses = _standing(engine, "laser", reach, poses, shaft_mm, limits, ring)
 
-    def judge(pose: np.ndarray) -> LaserSite:
+    def evaluate(pose: np.ndarray) -> LaserSite:
         return _evaluate_laser(engine, MountedArm(reach, pose, shaft_mm), ring, laser, limits)
 
-    return _best_first(judge, poses, ring, lambda site: site.good.all(), report, "laser mounts")
+    return _best_first(evaluate, poses, ring, lambda site: site.good.all(), report, "laser mounts")
 
 
-def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -> list:
+def _best_first(evaluate, poses, ring: Ring, sufficient, report: Progress, note: str) -> list:
     """Evaluate every pose, best first; while none is sufficient, search around the best ones.
 
     The local search rotates a pose about the lesion and moves it along the line of sight, at random
@@ -156,11 +156,11 @@ def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -
     total = len(poses) + ROUNDS * TRIES
     sites = []
     for i, pose in enumerate(poses):
-        sites.append(judge(pose))
+        sites.append(evaluate(pose))
         report(i + 1, total, note)
     for number in range(ROUNDS):
         sites.sort(key=lambda site: -site.score)
-        if enough(sites[0]):
+        if sufficient(sites[0]):
             break
         spread = NEAR_RAD / (number + 1)
         for i in range(TRIES):
@@ -171,7 +171,7 @@ def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -
             pose[:3, :3] = turn @ pose[:3, :3]
             pose[:3, 3] = ring.centre_mm + turn @ (pose[:3, 3] - ring.centre_mm)
             pose[:3, 3] += NEAR_MM / (number + 1) * rng.normal() * away
-            sites.append(judge(pose))
+            sites.append(evaluate(pose))
             report(len(poses) + number * TRIES + i + 1, total, note)
     return sorted(sites, key=lambda site: -site.score)
 
@@ -246,17 +246,17 @@ def endoscope_sites(
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
     poses = _standing(engine, "endoscope", reach, poses, shaft_mm, limits, ring)
 
-    def judge(pose: np.ndarray) -> EndoscopeSite:
+    def evaluate(pose: np.ndarray) -> EndoscopeSite:
         return _evaluate_endoscope(engine, MountedArm(reach, pose, shaft_mm), ring, camera, limits)
 
-    def enough(site: EndoscopeSite) -> bool:
+    def sufficient(site: EndoscopeSite) -> bool:
         return sees(site, limits)
 
-    return _best_first(judge, poses, ring, enough, report, "endoscope mounts")
+    return _best_first(evaluate, poses, ring, sufficient, report, "endoscope mounts")
 
 
 def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
-    """Whether the endoscope sees enough of the ring without touching anything."""
+    """Whether the endoscope sees sufficient of the ring without touching anything."""
     return bool(site.visible.mean() >= limits.view_fraction and site.score > 50.0)
 
 
@@ -410,7 +410,11 @@ def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
 
 
 def least_view(
-    engine, look: EndoscopePose, laser_lines_mm, ring: Ring, camera: CameraSpec
+    engine: BatchedScene,
+    look: EndoscopePose,
+    laser_lines_mm: np.ndarray,
+    ring: Ring,
+    camera: CameraSpec,
 ) -> float:
     """Smallest fraction of the ring in view with the laser arm at each of its centrelines."""
     poses = torch.from_numpy(np.tile(look.pose, (len(laser_lines_mm), 1, 1)))

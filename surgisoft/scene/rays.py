@@ -66,17 +66,17 @@ class RayHit:
     """(...) rad in 0..pi/2 between the ray and the surface's normal; 0 for a miss."""
 
     @property
-    def on_organ(self):
+    def on_organ(self) -> Any:
         """(...) bool: the ray hits the organ first."""
         return self.struck == int(Struck.ORGAN)
 
     @property
-    def missed(self):
+    def missed(self) -> Any:
         """(...) bool: nothing within the range."""
         return self.struck == int(Struck.NOTHING)
 
     @property
-    def blocked(self):
+    def blocked(self) -> Any:
         """(...) bool: the ray hits something other than the organ first."""
         return self.struck > int(Struck.ORGAN)
 

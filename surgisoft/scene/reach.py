@@ -82,7 +82,7 @@ class ArmReach:
         return np.concatenate((flat, self.tip_direction), axis=1)
 
     def _blend(self, table: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Multilinear interpolation of table rows at commands (M, P), held within the grid."""
+        """Multilinear interpolation of table rows at commands (M, P), clipped to the grid."""
         low, part = [], []
         for axis, value in zip(self.axes, commands.T, strict=True):
             cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
@@ -138,7 +138,7 @@ def solve_aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim
     Targets are in the base frame.
 
     Damped Gauss-Newton from commands `start` (M, P), smallest change of commands first (Nocedal &
-    Wright, 2006, section 10.3), held within the arm's range. M arms are solved at once.
+    Wright, 2006, section 10.3), clipped to the arm's range. M arms are solved at once.
     """
     commands = np.clip(start, *reach.bounds)
     count = commands.shape[1]

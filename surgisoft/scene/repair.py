@@ -61,26 +61,29 @@ class _Shell:
 
 
 def repair(
-    vertices: np.ndarray, faces: np.ndarray, what: str, tell: Callable[[str], None] = lambda _: None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    what: str,
+    on_step: Callable[[str], None] = lambda _: None,
 ) -> Repaired:
     """Closed bodies from vertices (V, 3) mm and faces (F, 3); `what` names them in errors.
 
-    `tell` is called with the name of each step, because a million faces take seconds.
+    `on_step` is called with the name of each step, because a million faces take seconds.
     """
     used, _ = used_indices(faces)
     size = float(np.ptp(vertices[used], axis=0).max())
     if size == 0.0:
         raise InputError(f"{what}: all vertices are one point; expected a surface")
     log: dict[str, int] = {}
-    tell("joining corners")
+    on_step("joining corners")
     vertices, faces = _join(vertices, faces, size, log)
     vertices, faces = _unbranch(vertices, faces)
     vertices, faces = _drop_specks(vertices, faces, size, log)
     if len(faces) < 4:
         raise InputError(f"{what}: {len(faces)} faces enclose nothing; expected a closed body")
-    tell("winding faces alike")
+    on_step("winding faces alike")
     faces = _wind_alike(faces, what, log)
-    tell("closing holes")
+    on_step("closing holes")
     vertices, faces, hole_mm = _close_holes(vertices, faces, what, log)
     shells = _outward(vertices, faces, hole_mm, log)
     if not all(shell.mesh.is_watertight for shell in shells):

@@ -274,7 +274,9 @@ def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path, cap
     arguments = (tmp_path / "ball.ply", f"{tmp_path / 'lid.ply'}:support", "--lesion", 60, 0, -20)
     assert new(tmp_path / "scene", *arguments) == 0
     # sqrt(60^2 + 20^2) - 60 = 3.246 mm outside the ball, whose facets lie up to 0.15 mm within
-    said = re.search(r"given lies (\S+) mm off the surface: moved", capsys.readouterr().out)
+    said = re.search(
+        r"given point was (\S+) mm off the surface and was moved", capsys.readouterr().out
+    )
     assert 3.2 < float(said[1]) < 3.5
     scene = open_scene(tmp_path / "scene")
     assert scene.spec.body("lid").role == "support"

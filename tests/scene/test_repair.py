@@ -1,4 +1,4 @@
-"""Repairs: each kind of damage gives back the body whose volume is known, and is counted."""
+"""Repairs: each kind of damage is counted, and the body has its known volume afterwards."""
 
 import contextlib
 

@@ -162,9 +162,9 @@ EVALUATE = {
     "dt_s": ("dt_s",),
     "overall": ("drivers.*.overall",),
     "per_episode": ("drivers.*.per_episode",),
-    "referee": ("drivers.*.referee",),
+    "referee": ("drivers.*.referee", None),
 }
-"""Recorded name -> where `evaluate --json` has it."""
+"""Recorded name -> where `evaluate --json` has it; None: it may be absent, without a scene."""
 
 MODEL_CONFIG = {
     "heldout_rmse_mm": ("validation.rmse_mm",),
@@ -173,10 +173,11 @@ MODEL_CONFIG = {
     "low": ("arm.low",),
     "high": ("arm.high",),
     "band": ("arm.band",),
-    "directions": ("network.directions", "network.kind"),
+    "network": ("network.kind",),
+    "directions": ("network.directions", None),
     "model_effects": ("effects",),
 }
-"""Recorded name -> where the fitted model's config.json has it."""
+"""Recorded name -> where the fitted model's config.json has it; None: it may be absent."""
 
 MODEL_REPORT = {
     "stage": ("stages[].name",),
@@ -248,11 +249,14 @@ def follow(value, path: str):
     return {"/".join(str(one[field]) for field in fields): follow(one, rest) for one in entry or ()}
 
 
-def take(document: dict, names: dict[str, tuple[str, ...]]) -> dict:
+def take(document: dict, names: dict[str, tuple[str | None, ...]]) -> dict:
     """Recorded name -> value, by the first accepted path that the document has."""
     values = {}
     for name, paths in names.items():
         for path in paths:
+            if path is None:
+                values[name] = None
+                break
             try:
                 values[name] = follow(document, path)
                 break
@@ -451,7 +455,9 @@ class Session:
         return ["import", *files, "--map", self.maps / map_name]
 
     def model(self, name: str) -> Path:
-        """One of `MODELS`, fitted, or amended."""
+        """One of `MODELS`, fitted to an input recording; `default` is the package's own."""
+        if name == "default":
+            return Path(name)
         read, words = MODELS[name]
         recording = self.public(read) if read in PUBLIC else self.recording(read)
         return self.made(name, "fit", recording, *words.split(), "-o", f"{{out}}/{name}")
@@ -508,7 +514,6 @@ HALF = [
 RECORDINGS = {
     "mixed_0_clean": "mixed --seed 0",
     "mixed_5_clean": "mixed --seed 5",
-    "mixed_0_take1": "mixed --seed 0 --take 1",
     **{f"mixed_0_{name}": f"mixed --seed 0 --hidden {name}" for name in HIDDEN},
     **{f"mixed_5_{name}_half": f"mixed --seed 5 --hidden {name}:0.5" for name in HALF},
     "mixed_0_creep_payload": "mixed --seed 0 --hidden creep payload",
@@ -520,6 +525,7 @@ RECORDINGS = {
     "ladder_5_softening": "ladder --seed 5 --points 12000 --hidden softening",
     "ladder_5_twist": "ladder --seed 5 --points 12000 --hidden twist",
     "walk": "walk --seed 3 --points 2000",
+    "walk_5": "walk --seed 5 --points 4000",
     "test": "test --seed 3",
 }
 """Input recording -> arguments of `collect`."""
@@ -546,8 +552,9 @@ PUBLIC = {
 MODELS = {
     "asl_model": ("asl_0g", "--epochs 40 --seed 1"),
     "asu_model": ("asu", "--epochs 20 --seed 1"),
+    "arm_5": ("walk_5", "--effects hysteresis --inputs pressure --epochs 60 --seed 1"),
 }
-"""Input model -> recording, arguments of `fit`."""
+"""Input model -> recording, arguments of `fit`. The default arm was fitted to specimen 0."""
 
 CIRCLE = "--task track_circle --steps 200000 --seed 1"
 RING = "--task circle_ablation --steps 200000 --seed 1"
@@ -588,7 +595,7 @@ def add_compare(case: str) -> None:
         return take(read_json(done), COMPARE)
 
 
-def add_diagnose(case: str, *more: str, name: str = "") -> None:
+def add_diagnose(case: str, *more: str, name: str = "", model: str = "default") -> None:
     """More arguments; `@NAME` is one of the recordings."""
     name = f"diagnose.{name or case}"
 
@@ -596,8 +603,9 @@ def add_diagnose(case: str, *more: str, name: str = "") -> None:
     def _(session: Session) -> dict:
         recording = session.recording(case)
         words = [session.recording(w[1:]) if w.startswith("@") else w for w in more]
+        judged = session.model(model)
         done = session.raw(
-            name, "diagnose", "default", recording, "--json", "{out}/answer.json", *words
+            name, "diagnose", judged, recording, "--json", "{out}/answer.json", *words
         )
         return diagnosed(done)
 
@@ -759,9 +767,10 @@ for _case in (
     add_compare(_case)
 
 for _case in RECORDINGS:
-    if _case.startswith(("mixed", "holds", "ladder")) and not _case.endswith("take1"):
-        add_diagnose(_case)
-add_diagnose("mixed_0_creep", "@mixed_0_take1", name="two_recordings")
+    if _case.startswith(("mixed", "holds", "ladder")):
+        add_diagnose(_case, model="arm_5" if _case.endswith("half") else "default")
+add_diagnose("mixed_5_clean", name="own_model", model="arm_5")
+add_diagnose("mixed_0_creep", "@holds_0_creep", name="two_recordings")
 add_diagnose("mixed_0_drift", "--reference", "@mixed_0_clean", name="reference")
 add_diagnose("mixed_0_contact", "--without", "contact", name="without")
 

@@ -408,7 +408,7 @@ def test_a_weight_scales_its_reward_term_and_no_other(name):
     for agent, terms in usual.items():
         weights = table["weights"].get(agent, table["weights"])
         term = next(iter(terms))
-        for factor in (3.0, 0.0):
+        for factor in (3.0, 0.0) if len(terms) > 1 else (3.0,):
             change = {term: factor * weights[term]}
             change = {agent: change} if agent in table["weights"] else change
             change = {"weights": change}

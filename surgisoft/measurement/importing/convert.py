@@ -1,4 +1,4 @@
-"""Somebody else's files into recordings, as a map says.
+"""Turns a laboratory's own files into recordings, as a map says.
 
 The steps: every file gets its role, files that belong together form a set, a set's files are joined
 to one row a sample, positions are brought into the arm's base frame, rows are tidied, and the sets

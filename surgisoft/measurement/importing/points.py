@@ -339,7 +339,7 @@ def _chord(joined: Joined, rest: np.ndarray, frame: FrameMap) -> np.ndarray:
 
 
 def _note_tilt(key_points: np.ndarray, frame: FrameMap, notes: list[str]) -> None:
-    """Say so where the arm at rest does not point along z."""
+    """Add a note where the arm at rest does not point along z."""
     rest = _rest(key_points, frame.rest_rows)
     start = rest[0] if len(rest) > 1 else np.zeros(3)
     chord = rest[-1] - start

@@ -1,4 +1,4 @@
-"""Raw tables: columns of somebody else's file by name or number, and what a reader of them is."""
+"""Raw tables: columns of a laboratory's own file by name or number, and the readers' interface."""
 
 import difflib
 from collections.abc import Callable, Sequence

@@ -1,7 +1,7 @@
 """What a map file can say, as frozen dataclasses; docs/recordings.md describes every field.
 
-A map says how somebody else's files become recordings: which files, which columns, which units and
-which frame. `load_map` reads one; surgisoft/config.py gives every bad field its line.
+A map says how a laboratory's own files become recordings: which files, columns, units and frame.
+`load_map` reads one; surgisoft/config.py gives every bad field its line.
 """
 
 import math

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings import KINDS
+from surgisoft.measurement.recordings.recording import KINDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +25,9 @@ class Protocol:
     t_s: np.ndarray | None = None
     """(T,) float64, time of each row from the start of its run [s]; continuous protocols only."""
     settle_s: float = 3.0
-    """Time between a command and its first sample [s], for steady-state points.
-
-    Source: Chen et al. 2025, section III-B."""
+    """Time between a command and its sample [s]; steady-state only (Chen et al. 2025, III-B)."""
     average_s: float = 1.0
-    """Time over which samples are averaged to one [s], for steady-state points (same source)."""
+    """Time over which samples are averaged to one [s]; steady-state only (same source)."""
     unit: str = "kPa"
     """Unit of the commands."""
 

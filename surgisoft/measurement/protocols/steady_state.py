@@ -1,10 +1,10 @@
 """Protocols of steady-state points: grid, traverse, random walk, validation and test.
 
-The order of the points decides what a data set can teach about hysteresis. After a plain
-back-and-forth traverse the slow chamber has only ever risen, and the direction of the others
-follows from the position: direction and memory are then confounded with position. `grid` visits the
-same lattice so that at every position every chamber has been approached from both sides,
-after reversals of all sizes.
+The order of the points decides what a data set can teach about hysteresis. After a plain back-and-
+forth traverse the slow chamber has only ever risen, and the direction of the others follows from
+the position: direction and memory are then confounded with position. `grid` visits the same lattice
+so that at every position every chamber has been approached from both sides, after reversals of all
+sizes.
 """
 
 import itertools

@@ -76,7 +76,7 @@ def amend(
     if json_file:
         write_json(json_file, result.to_json())
     if report:
-        from surgisoft.diagnosis.pages.amend import amend_page
+        from surgisoft.diagnosis.pages.amendment import amend_page
         from surgisoft.report import write_page
 
         title = f"{model.name} with {' + '.join(result.effects)}"

@@ -43,9 +43,9 @@ def next_experiment(
     force: Force = False,
 ) -> None:
     """Find the experiment that best tells rival effects apart, ready for the rig."""
-    from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS, schedule_text
-    from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
-    from surgisoft.diagnosis.problem import pose
+    from surgisoft.diagnosis.design.next_experiment import likely_rivals, propose, recommend
+    from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
+    from surgisoft.diagnosis.residuals import problem_of
     from surgisoft.surrogate.checkpoint import load_model
 
     if output.suffix != ".csv":
@@ -58,11 +58,11 @@ def next_experiment(
     check_free(json_file, "separates")
     arm = load_model(model)
     rivals = [name for item in between or [] for name in item.split(",") if name] or None
-    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
+    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
     if recordings:
         measured = read_recordings(recordings)
         under_weight(arm, measured)
-        problem = pose(arm, measured)
+        problem = problem_of(arm, measured)
         answer = recommend(problem, rivals or likely_rivals(problem), minutes, settings)
     else:
         answer = propose(arm, rivals, minutes, settings)
@@ -73,7 +73,7 @@ def next_experiment(
 
 
 def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> None:
-    from surgisoft.diagnosis.isolability.matrix import SURE
+    from surgisoft.diagnosis.design.isolability import SURE
 
     print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
     print(f"why: {answer.why}")

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.race.cross_validation import RIDGES, CrossValidation
-from surgisoft.diagnosis.race.discrepancy import kernel
-from surgisoft.diagnosis.race.split import PERSISTENCE, ROOM, static_features
+from surgisoft.diagnosis.cross_validation import (
+    PERSISTENCE,
+    RIDGES,
+    ROOM,
+    CrossValidation,
+    static_features,
+)
+from surgisoft.diagnosis.discrepancy import kernel
 
 ROWS, POINTS, COLUMNS, BLOCKS = 120, 2, 3, 10
 

@@ -8,24 +8,28 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.isolability.matrix import isolability
-from surgisoft.diagnosis.next_experiment.catalogue import (
+from surgisoft.diagnosis.design.isolability import isolability
+from surgisoft.diagnosis.design.next_experiment import (
+    likely_rivals,
+    make_plans,
+    pose_question,
+    propose,
+    recommend,
+)
+from surgisoft.diagnosis.design.schedules import (
     AS_IT_STANDS,
-    FIGURES,
+    EXCITATIONS,
     ON_THE_RIG,
     RUN_S,
-    SETTINGS,
+    SETUPS,
     bench_minutes,
     draw_run,
     limits_within,
     schedule,
     schedule_text,
+    words_for,
 )
-from surgisoft.diagnosis.next_experiment.plans import make_plans
-from surgisoft.diagnosis.next_experiment.propose import likely_rivals, propose, recommend
-from surgisoft.diagnosis.next_experiment.question import pose_question
-from surgisoft.diagnosis.next_experiment.words import words_for
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recordings.recording import save_recording
@@ -48,10 +52,10 @@ def lagging():
 
 @pytest.fixture(scope="module")
 def problem(arm, lagging):
-    return pose(arm, [lagging])
+    return problem_of(arm, [lagging])
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", EXCITATIONS)
 @pytest.mark.parametrize(
     "limits", [[[-15.0, 54.0]] * 3, [[0.0, 1.0]], [[-90.0, 90.0]] * 6, [[2.0, 9.0], [0.0, 30.0]]]
 )
@@ -90,12 +94,12 @@ def test_a_schedule_is_read_back_as_it_was_written(tmp_path):
 def test_turned_benches_have_the_rigs_own_gravity():
     weight = np.array([0.42, 0.1, 0.9])
     weight /= np.linalg.norm(weight)
-    for name, setting in SETTINGS.items():
+    for name, setting in SETUPS.items():
         if setting.roll_deg:
             truth = VirtualRig(0, gravity=weight, roll_deg=setting.roll_deg).gravity
             np.testing.assert_allclose(setting.gravity(weight), truth, atol=1e-12)
             assert setting.options == f"--roll-deg {setting.roll_deg:g}", name
-    np.testing.assert_allclose(SETTINGS["upside_down"].gravity(weight), -weight)
+    np.testing.assert_allclose(SETUPS["upside_down"].gravity(weight), -weight)
 
 
 def test_the_recommended_schedule_runs_on_the_rig(arm):
@@ -152,11 +156,11 @@ def test_the_recommended_schedule_settles_on_the_rig_what_one_speed_leaves_open(
     poor = Protocol("sweeps", "continuous", commands, np.zeros(9), 8.0 * np.arange(9.0))
     for true, rival in (("hysteresis", "line_lag"), ("line_lag", "hysteresis")):
         first, _ = VirtualRig(0, take=1, hidden=[(true, 1.0)]).record(poor)
-        problem = pose(arm, [first])
+        problem = problem_of(arm, [first])
         answer = recommend(problem, [true, rival], 5.0, (AS_IT_STANDS,))
         assert answer.pairs[0].before < 0.95
         second, _ = VirtualRig(0, take=2, hidden=[(true, 1.0)]).record(answer.protocol)
-        assert lead(pose(arm, [first, second]), true, rival) > 30.0 + abs(
+        assert lead(problem_of(arm, [first, second]), true, rival) > 30.0 + abs(
             lead(problem, true, rival)
         )
 
@@ -176,7 +180,7 @@ def test_where_gravity_is_not_known_no_bench_is_turned(arm):
     free = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
     limits = limits_within(spec.low, spec.high)
     question = pose_question(free, None, ["payload", "gain_mismatch"])
-    plans = make_plans(question, limits, 8.0, tuple(SETTINGS))
+    plans = make_plans(question, limits, 8.0, tuple(SETUPS))
     assert {plan.setting for plan in plans} == {AS_IT_STANDS, "bare_tip"}
 
 
@@ -189,7 +193,7 @@ def test_no_chamber_leaves_what_was_recorded_of_it(arm, lagging):
     measured = lagging.measured.copy()
     measured[:, 2] = 5.0 + 2.0 * (measured[:, 2] - measured[:, 2].min()) / np.ptp(measured[:, 2])
     still = replace(lagging, measured=measured)
-    answer = recommend(pose(shy, [still]), ["creep", "line_lag"], minutes=5.0)
+    answer = recommend(problem_of(shy, [still]), ["creep", "line_lag"], minutes=5.0)
     rows = answer.protocol.commands
     assert np.ptp(rows[:, 0]) > 10.0
     np.testing.assert_allclose(rows[:, 1], 3.0)
@@ -261,10 +265,10 @@ def test_a_bench_is_spoken_of_in_its_own_words(arm, unit, said):
 def test_every_word_of_the_catalogue_is_filled_in():
     for unit in ("kPa", "deg", "V"):
         words = asdict(words_for(unit))
-        for thing in (*SETTINGS.values(), *FIGURES.values()):
+        for thing in (*SETUPS.values(), *EXCITATIONS.values()):
             assert "{" not in thing.about.format(**words)
         if unit != "kPa":
-            texts = " ".join(thing.about.format(**words) for thing in SETTINGS.values())
+            texts = " ".join(thing.about.format(**words) for thing in SETUPS.values())
             assert not {"valve", "valves", "vented", "chamber", "tubes"} & set(texts.split())
 
 
@@ -272,7 +276,7 @@ def test_after_a_change_by_hand_the_new_recording_is_diagnosed_alone(tmp_path, l
     model = str(files("surgisoft") / "assets" / "default_arm")
     data, out = tmp_path / "r.parquet", tmp_path / "s.csv"
     save_recording(lagging, data)
-    answer = recommend(pose(default_arm(), [lagging]), ["line_lag", "rate_dependence"])
+    answer = recommend(problem_of(default_arm(), [lagging]), ["line_lag", "rate_dependence"])
     arguments = ["next-experiment", model, str(data), "-o", str(out)]
     assert run([*arguments, "--between", "line_lag", "rate_dependence"]) == 0
     printed = capsys.readouterr().out

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.diagnosis.cross_validation import FITTED, CrossValidation
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.race.cross_validation import CrossValidation
-from surgisoft.diagnosis.race.split import FITTED
 from surgisoft.measurement.recordings.recording import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from tests.diagnosis.synthetic import POINTS, recording, still_model, walk

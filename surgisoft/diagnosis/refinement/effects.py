@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import torch
 
-from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.ranking import PRICE
+from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.refinement.intervals import Parameter, intervals
 from surgisoft.diagnosis.refinement.large import refine_large
 from surgisoft.diagnosis.refinement.refine import Fit, free_parameters, refine
 from surgisoft.diagnosis.refinement.start import starts
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import Effect
 from surgisoft.surrogate.model import ArmModel
@@ -133,5 +133,5 @@ def _added(problem: Problem, name: str) -> ArmModel:
         else:
             misfit = refine(model, problem, [name], FIRST_ITERATIONS).misfit
         values = sum(p.numel() for p in effect.strengths().values())
-        tried.append((misfit * (1.0 + PRICE) ** values, model))
+        tried.append((misfit * (1.0 + CRITERIA.selection.amplitude_price) ** values, model))
     return min(tried, key=lambda one: one[0])[1]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.effects import Context, Memoryless
 from surgisoft.surrogate.model import ArmModel, context_of

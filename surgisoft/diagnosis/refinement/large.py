@@ -9,10 +9,10 @@ held-out blocks. The shapes stay as they are.
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.refinement.forward import Forward
 from surgisoft.diagnosis.refinement.nuisance import Nuisance, judging_parts
 from surgisoft.diagnosis.refinement.refine import Fit, Predictor, block_slopes, set_vector, vector
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.model import ArmModel
 
 STEPS = 3

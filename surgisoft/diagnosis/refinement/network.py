@@ -18,8 +18,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.refinement.nuisance import judging_parts
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy import linalg
 from scipy.sparse import csgraph
 
-from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.split import static_features
+from surgisoft.diagnosis.cross_validation import static_features
+from surgisoft.diagnosis.residuals import Problem
 
 PERSISTENCE = 10.0
 """Rows over which what is left hangs together: so many fewer of them are independent."""

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from surgisoft.diagnosis.problem import Problem
 from surgisoft.diagnosis.refinement.forward import Forward
 from surgisoft.diagnosis.refinement.nuisance import Nuisance
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.model import ArmModel
 
 ITERATIONS = 25

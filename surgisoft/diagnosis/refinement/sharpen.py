@@ -14,11 +14,10 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.candidates import Candidate, with_effect
-from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.ranking import Race, Standing
 from surgisoft.diagnosis.refinement.effects import shrink
 from surgisoft.diagnosis.refinement.forward import Forward
 from surgisoft.diagnosis.refinement.refine import refine
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.effects import Effect
 from surgisoft.surrogate.model import ArmModel
 
@@ -29,7 +28,7 @@ MOST_VALUES = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Sharpened(Candidate):
+class Refined(Candidate):
     """An effect in its fitted shape; its one column is what it changes at its fitted strengths."""
 
     @torch.no_grad()
@@ -41,23 +40,24 @@ class Sharpened(Candidate):
         return effect
 
 
-def sharpened(problem: Problem, race: Race, some: Sequence[Standing]) -> list[Candidate]:
-    """Some effects of a race in shapes fitted to the problem, those left out that change nothing
-    or are not fitted (`with_fitted`)."""
+def refined_candidates(problem: Problem, some: Sequence[tuple[str, Effect]]) -> list[Candidate]:
+    """Effects, by name and with amplitudes to start from, with refined nonlinear parameters.
+
+    Those are left out that change nothing or are not fitted (`with_fitted`).
+    """
     with torch.no_grad():
         before = Forward(problem.model, problem, [])().double().numpy()
     answer = []
-    for standing in some:
-        effect = race.in_place(race.single(standing.option))
-        model = None if effect is None else with_fitted(problem, standing.effect, effect)
+    for name, effect in some:
+        model = with_fitted(problem, name, effect)
         if model is None:
             continue
         with torch.no_grad():
-            after = Forward(model, problem, [standing.effect])().double().numpy()
+            after = Forward(model, problem, [name])().double().numpy()
         column = (after - before)[..., None]
         if np.isfinite(column).all() and np.abs(column).max() > 1e-6:
-            fitted = model.effects[standing.effect].requires_grad_(False)
-            answer.append(Sharpened(standing.effect, fitted, column, fitted=True))
+            fitted = model.effects[name].requires_grad_(False)
+            answer.append(Refined(name, fitted, column, fitted=True))
     return answer
 
 

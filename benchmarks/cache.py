@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from surgisoft.config import write_atomically
+from surgisoft.files import write_atomically
 
 Report = Callable[[float, float, str], None]
 """Called with what is done, what there is to do, and a note."""

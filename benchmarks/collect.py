@@ -38,16 +38,16 @@ def speed() -> dict:
 
 
 def arm(seed: int) -> dict:
-    """Largest gap, bends of single chambers, extension and noise of one specimen."""
+    """Largest gap, bends of single chambers, extension and noise of one robot."""
     design = ArmDesign()
-    specimen = fabricate(design, seed, np.array(MOUNT))
+    robot = fabricate(design, seed, np.array(MOUNT))
     poses = np.array([[0.0, 0, 0], [54, 0, 0], [0, 54, 0], [0, 0, 54], [54, 54, 54]])
-    tips = [settled_tips(specimen, plain_loads(MOUNT), pose[None])[0] for pose in poses]
+    tips = [settled_tips(robot, plain_loads(MOUNT), pose[None])[0] for pose in poses]
     rig = VirtualRig(seed)
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 2000))
     return {
         "seed": seed,
-        "gap_mm": single_chamber_gap(specimen, design, np.array(MOUNT)),
+        "gap_mm": single_chamber_gap(robot, design, np.array(MOUNT)),
         "tip_travel_mm": [float(np.linalg.norm(tip - tips[0])) for tip in tips[1:4]],
         "extension_mm": float(tips[4][2] - tips[0][2]),
         "noise_mm": recording.noise_mm,

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from surgisoft.cli.files import check_folder, write_text
+from surgisoft.cli.files import check_folder
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_atomically
 
 app = typer.Typer(help="Long studies on the virtual rig.", no_args_is_help=True)
 
@@ -34,7 +35,7 @@ def _show(title: str, command: str, body: str, output: Path | None) -> None:
     today = datetime.date.today().isoformat()
     text = f"# {title}\n\nPrinted by `{command}` on {today}.\n\n{body}"
     if output:
-        write_text(output, text)
+        write_atomically(output, text)
     print(text)
 
 

@@ -6,6 +6,7 @@ import functools
 import hashlib
 from pathlib import Path
 
+import numba
 from numba import njit
 
 
@@ -21,9 +22,12 @@ def compiled(function):
 
     numba looks for changes in the function's own file only, so a kernel that calls one of another
     file would go on running the other's old code; the stamp of all files of its folder closes that
-    hole.
+    hole. The stamp is part of the index's version too, which numba reads before it unpickles the
+    index: a class that was renamed since would stop the program there.
     """
     dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
     folder = Path(function.__code__.co_filename).parent
-    dispatcher._cache._cache_file._source_stamp = _source_stamp(folder)
+    index = dispatcher._cache._cache_file
+    index._source_stamp = _source_stamp(folder)
+    index._version = f"{numba.__version__} {index._source_stamp}"
     return dispatcher

@@ -8,9 +8,7 @@ A field's type says what is expected: `float`, `int`, `str`, `bool`, a fixed tup
 import dataclasses
 import difflib
 import math
-import os
 import re
-import tempfile
 import tomllib
 import types
 import typing
@@ -20,6 +18,7 @@ from pathlib import Path
 import tomli_w
 
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -126,19 +125,6 @@ def to_table(config) -> dict:
     return config
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write to a temporary file beside the target, then move it there."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
 def write_toml(path: Path, table: dict) -> None:
     """Write the table as TOML, short rows of numbers on one line; floats keep every bit."""
     text = re.sub(
@@ -146,7 +132,7 @@ def write_toml(path: Path, table: dict) -> None:
         lambda rows: f"[{', '.join(re.findall(r'[-+.0-9A-Za-z_]+', rows[1]))}]",
         tomli_w.dumps(table),
     )
-    write_atomically(path, text.encode("utf-8"))
+    write_atomically(path, text)
 
 
 def describe(value: object) -> str:

@@ -6,17 +6,18 @@ import multiprocessing.connection
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries of linear algebra read when a process starts."""
 
 
-def begin_worker() -> None:
+def begin_worker(prepare: Callable[[], object] | None = None) -> None:
     """One thread; Ctrl-C is for the process that asked, and this one ends with it.
 
     However that ends, by a kill too: the system then closes the pipe that is waited for.
+    prepare: called in the new process, which begins without the state of the one that asked.
     """
     import torch
 
@@ -29,15 +30,22 @@ def begin_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_it, daemon=True).start()
+    if prepare is not None:
+        prepare()
 
 
 @contextlib.contextmanager
-def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes; what is still waiting is given up where the block is left by an error."""
+def workers(
+    processes: int, prepare: Callable[[], object] | None = None
+) -> Iterator[ProcessPoolExecutor]:
+    """So many processes; what is still waiting is given up where the block is left by an error.
+
+    prepare: called once in each new process.
+    """
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=begin_worker)
+    pool = ProcessPoolExecutor(processes, context, initializer=begin_worker, initargs=(prepare,))
     try:
         yield pool
     except BaseException:

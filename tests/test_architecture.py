@@ -17,7 +17,16 @@ MAY_IMPORT = {
     "tasks": set(),
     "tasks/world": {"scene", "surrogate"},
     "agents": {"scene", "surrogate", "measurement", "rig", "tasks", "report"},
-    "experiments": {"agents", "scene", "measurement", "rig", "tasks", "replay", "report"},
+    "experiments": {
+        "agents",
+        "scene",
+        "surrogate",
+        "measurement",
+        "rig",
+        "tasks",
+        "replay",
+        "report",
+    },
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
@@ -42,7 +51,7 @@ FLOORS = {
     "diagnosis": (
         ("body_frame", "criteria", "effect_knowledge", "history_features", "statistics", "weight"),
         ("residuals",),
-        ("discrepancy", "data_quality", "error_axes"),
+        ("discrepancy", "data_quality", "error_axes", "inputs"),
         ("cross_validation",),
         ("black_box", "candidates"),
         ("refinement",),

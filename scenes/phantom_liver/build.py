@@ -1,16 +1,16 @@
 """Build the phantom's meshes from an implicit liver: `python scenes/phantom_liver/build.py [DIR]`.
 
-Everything is made of formulas in this file; the same file gives the same meshes. The liver is drawn
-in its anatomical frame (mm; x from the right lobe to the left, y upwards to the diaphragm, z to
-the front) and then laid on a tray on its under side (world frame, mm, z up).
+Everything is made of formulas in this file. The liver is drawn in its anatomical frame (mm; x from
+the right lobe to the left, y upwards to the diaphragm, z to the front) and then laid on a tray on
+its under side (world frame, mm, z up). Needs scikit-image, which the extra `dev` brings.
 """
 
 import sys
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
-from surgisoft.scene.isosurface import settle, surface_nets
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 
@@ -121,12 +121,52 @@ def tray():
 
 def mesh_of(field, spacing_mm, bounds_mm, rounds=40):
     """Vertices (V, 3) mm and faces (F, 3) of the field's zero level, evened out."""
+    from skimage.measure import marching_cubes
+
     low, high = np.asarray(bounds_mm, dtype=float)
     axes = [np.arange(a, b + spacing_mm, spacing_mm) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     values = np.concatenate([field(slab[None]) for slab in grid])
-    vertices, faces = surface_nets(values, low, spacing_mm)
-    return settle(vertices, faces, field, rounds, 0.05 * spacing_mm), faces
+    vertices, faces, _, _ = marching_cubes(
+        values, 0.0, spacing=(spacing_mm,) * 3, gradient_direction="descent"
+    )
+    return settle(vertices + low, faces, field, rounds, 0.05 * spacing_mm), faces
+
+
+def settle(vertices, faces, field, rounds, step_mm):
+    """Even out the faces along the surface and pull every vertex onto the field's zero level.
+
+    Each round moves the vertices halfway to the mean of their neighbours within the tangent plane
+    (Field, 1988, "Laplacian smoothing and Delaunay triangulations", section 2) and then takes one
+    Newton step along the field's gradient, found by central differences of `step_mm`.
+    """
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    neighbours = trimesh.smoothing.laplacian_calculation(solid, equal_weight=True)
+    for _ in range(rounds):
+        slope = gradient(field, vertices, step_mm)
+        normal = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+        pull = 0.5 * (neighbours @ vertices - vertices)
+        vertices = vertices + pull - np.sum(pull * normal, axis=1, keepdims=True) * normal
+        vertices = onto_surface(vertices, field, step_mm)
+    return onto_surface(vertices, field, step_mm, steps=3)
+
+
+def onto_surface(points, field, step_mm, steps=1):
+    """Newton steps along the gradient to the zero level, each at most 2 mm."""
+    for _ in range(steps):
+        slope = gradient(field, points, step_mm)
+        move = -(field(points) / np.maximum(np.sum(slope**2, axis=1), 1e-9))[:, None] * slope
+        length = np.linalg.norm(move, axis=1, keepdims=True)
+        points = points + move * np.minimum(1.0, 2.0 / np.maximum(length, 1e-12))
+    return points
+
+
+def gradient(field, points, step_mm):
+    """Gradient (n, 3) of the field at points (n, 3) mm by central differences."""
+    steps = step_mm * np.eye(3)
+    return np.stack(
+        [(field(points + s) - field(points - s)) / (2.0 * step_mm) for s in steps], axis=1
+    )
 
 
 def bodies(fineness=1.0):

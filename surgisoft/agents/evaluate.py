@@ -8,19 +8,19 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
+from scipy.stats import binomtest
 from torch import Tensor
 
 from surgisoft.agents.policies import Driver
 from surgisoft.agents.referee import EpisodeReferee, Verdict, contacts_of, has_referee
 from surgisoft.agents.rollout import BATCH, Instant, Rollout, rollout
+from surgisoft.files import json_safe
 from surgisoft.tasks.base import Task
 
 RESAMPLES = 2000
 """Times that the episodes are drawn anew for an interval."""
 CONFIDENCE = 0.95
 """Share of intervals that hold the true mean."""
-NORMAL = 1.959963984540054
-"""Quantile of the normal distribution for that share."""
 
 SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "completion": Rollout.end,
@@ -69,9 +69,9 @@ class Evaluation:
     def to_json(self) -> dict:
         """Plain numbers and lists; what does not apply is null."""
         answer = {
-            "overall": {name: _plain(asdict(value)) for name, value in self.overall.items()},
+            "overall": {name: json_safe(asdict(value)) for name, value in self.overall.items()},
             "per_episode": {
-                name: _plain(value.tolist()) for name, value in self.per_episode.items()
+                name: json_safe(value.tolist()) for name, value in self.per_episode.items()
             },
         }
         if self.verdicts is not None:
@@ -80,7 +80,7 @@ class Evaluation:
                 "contact_differs": sum(v.contact_differs for v in self.verdicts),
                 "beam_differs": sum(v.beam_differs for v in self.verdicts),
                 "beam_off_mm": max(v.beam_off_mm for v in self.verdicts),
-                "clearance_off_mm": _plain(max(v.clearance_off_mm for v in self.verdicts)),
+                "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.verdicts)),
                 "contacts": [_contact(v) for v in self.verdicts],
             }
         return answer
@@ -148,27 +148,21 @@ def episode_table(
 def _in_view(task: Task, played: Rollout) -> Tensor:
     """(N,) share of the steps at which the endoscope sees as much as the scene asks for."""
     seen = played.measures["view_fraction"]
-    enough = (seen >= task.world.surroundings.spec.limits.view_fraction).float()
+    enough = (seen >= task.world.scene.spec.limits.view_fraction).float()
     return enough.where(seen.isfinite(), seen).nanmean(1)
 
 
 def summary(values: np.ndarray, rate: bool = False) -> Summary:
-    """Mean of (N,) numbers with its interval: Wilson's for a rate, else by bootstrap."""
+    """Mean of (N,) numbers with its interval: Wilson's (1927) for a rate, else by bootstrap."""
     known = values[np.isfinite(values)]
     if not len(known):
         return Summary(*(math.nan,) * 5, 0)
-    mean = float(known.mean())
-    low, high = wilson(mean, len(known)) if rate else bootstrap(known)
-    return Summary(mean, low, high, float(known.min()), float(known.max()), len(known))
-
-
-def wilson(share: float, count: int) -> tuple[float, float]:
-    """Ends of the 95 % interval of a rate seen as `share` of `count` (Wilson 1927)."""
-    z2 = NORMAL**2
-    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = NORMAL / (1 + z2 / count)
-    half *= math.sqrt(share * (1 - share) / count + z2 / (4 * count**2))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    if rate:
+        low, high = binomtest(round(known.sum()), len(known)).proportion_ci(CONFIDENCE, "wilson")
+    else:
+        low, high = bootstrap(known)
+    ends = (float(known.min()), float(known.max()))
+    return Summary(float(known.mean()), float(low), float(high), *ends, len(known))
 
 
 def bootstrap(values: np.ndarray) -> tuple[float, float]:
@@ -178,15 +172,6 @@ def bootstrap(values: np.ndarray) -> tuple[float, float]:
     tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(means, [tail, 100.0 - tail])
     return float(low), float(high)
-
-
-def _plain(value):
-    """The same with None for what is not finite."""
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _contact(verdict: Verdict) -> dict | None:

@@ -1,19 +1,20 @@
-"""A task played on the virtual rig: the world goes on, but its arms are on benches.
+"""Tasks with virtual rigs as the plants: every arm of every episode is a rig of its own.
 
-Each arm of each episode is a `VirtualRig` of its own: commands go to its pumps, pressures and key
-points come from its sensors and cameras. The task, its goals and its surroundings stay as they
-are. Bodies, beams and errors are judged by where the plant is, without the cameras' noise. What
-drivers see is measured: the arm's model runs beside the bench, fed with the measured pressures,
-and is held to the cameras and the pumps by a filter each, which takes over a share of every new
-difference (an output disturbance, as in offset-free predictive control: Pannocchia & Rawlings
-2003). Key points are seen through that filter; with trust = 1 as the cameras give them.
+Commands go to the rig's pumps, pressures and key points come from its sensors and cameras; goals,
+scene and scores of the task stay as they are. The true body, the beam and the errors are those of
+the plant, without the cameras' noise. Policies and the task's controllers see measurements only.
+
+An observer makes an estimate of them: the arm's model runs beside the rig, driven by the measured
+pressures, and its output is corrected by a filtered output disturbance, as in offset-free model
+predictive control (Pannocchia & Rawlings 2003). With `observer_gain` = 1 the estimate is the raw
+measurement.
 """
 
 from __future__ import annotations
 
 import copy
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,45 +22,73 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.rig import VirtualRig
+from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import Arm, ArmPart
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.pytree import Objects
+from surgisoft.tasks.world.random_streams import Stream
 
 
 @dataclass(frozen=True)
 class RigConfig:
-    """Which bench, and how its measurements are used."""
+    """Which virtual rig takes the place of each arm, and how its measurements are filtered."""
 
     seed: int = 0
-    """Which specimen of the arm was cast; the default arm model was fitted on 0."""
+    """Seed of the virtual robot; the default arm model was fitted to robot 0."""
     hidden: tuple[tuple[str, float], ...] = ()
     """Hidden effects by name and strength."""
     noise: float = 1.0
     """Factor on all sensor and camera noise."""
     cameras: bool = True
-    """Whether the key points are measured; else drivers get the model's, as it foresees them."""
-    trust: float = 0.3
-    """Share of a new difference between cameras and model that is taken over in a step, 0..1."""
-    drift: float = 0.01
-    """Share of it that is taken for a steady drift, added in every later step, 0..1."""
-    pump_trust: float = 0.3
-    """Share of a new difference between the pumps and the world's that is taken over, 0..1."""
+    """Whether cameras measure the key points; else the model alone estimates them."""
+    observer_gain: float = 0.3
+    """Share of the innovation (cameras minus estimate) that a step takes over, 0..1: the alpha of
+    an alpha-beta filter."""
+    drift_gain: float = 0.01
+    """Share of the innovation that is added to the disturbance's rate, 0..1: the filter's beta."""
+    pump_gain: float = 0.3
+    """Share of the difference between measured and expected pressure that a step takes over into
+    the estimated offset of the pumps, 0..1."""
     settle_s: float = 4.0
-    """Time at each pressure that an arm goes through before an episode, s."""
+    """Time at each pressure of the random history before an episode, s."""
 
     def __post_init__(self):
-        for name in ("trust", "drift", "pump_trust"):
+        for name in ("observer_gain", "drift_gain", "pump_gain"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"rig: {name} is {getattr(self, name)}, expected 0 to 1")
         if not self.settle_s > 0.0:
             raise InputError(f"rig: settle_s is {self.settle_s}, expected more than 0 s")
 
 
+BuildRig = Callable[[RigConfig, int], SimulatedRig]
+"""Makes the rig of one arm of one episode from the configuration and the number of its trial."""
+
+
+def virtual_rig(config: RigConfig, trial: int = 0) -> VirtualRig:
+    """The virtual rig of a configuration; another trial has other noise on the same robot."""
+    return VirtualRig(config.seed, hidden=config.hidden, noise=config.noise, take=trial)
+
+
+@dataclass(frozen=True, eq=False)
+class RigPlant:
+    """State of B rigs as `ArmPart.plant`: the rigs themselves, and the observer's memory of them.
+
+    A rig is stepped in place, as a real one would be: a state is stepped once, and of two states
+    that hold the same rig only the later one is true.
+    """
+
+    rigs: Objects[SimulatedRig]
+    """The B rigs."""
+    target_kPa: Tensor
+    """(B, m) kPa: pressures that were commanded last."""
+    drift_mm: Tensor
+    """(B, n, 3) mm, world frame: by how much the output disturbance grows in a step."""
+
+
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What B benches show at one instant, float32."""
+    """What B rigs measure at one instant, float32."""
 
     pressure: Tensor
     """(B, m) kPa, as measured."""
@@ -69,27 +98,19 @@ class Reading:
     """(B, n, 3) mm, base frame: what the cameras would measure without noise."""
 
 
-@dataclass(eq=False)
-class Bench:
-    """One arm of one episode; changes with every reading."""
-
-    rig: VirtualRig
-    """The arm itself."""
-    told_kPa: np.ndarray
-    """(m,) what the controllers were told last."""
-    drift_mm: Tensor | None = None
-    """(n, 3) mm, world frame: by how much the body leaves the model further in a step."""
-
-
 class RigArm:
-    """An `Arm` of the world whose body is on benches; all that is not said here is the arm's.
+    """An arm of the world whose plant is a batch of rigs; see `Arm` for each attribute and method.
 
-    The benches are no part of the state: an episode finds its own by its stream's key.
+    Predictions (`predict`, `settled`) come from the arm's model within the rig's pressure limits.
+    Holds no state: the rigs are in `ArmPart.plant`.
     """
 
-    def __init__(self, arm: Arm, config: RigConfig, dt_s: float):
-        self.arm, self.config = arm, config
-        rig = VirtualRig(config.seed, hidden=config.hidden, noise=config.noise)
+    def __init__(
+        self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig
+    ):
+        """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
+        self.config, self.build = config, build
+        rig = build(config, 0)
         if (rig.chambers, rig.key_planes) != (arm.chambers, arm.key_points):
             raise InputError(
                 f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
@@ -101,109 +122,136 @@ class RigArm:
                 f"dt_s is {dt_s} s; on the rig expected a multiple of its {rig.period_s} s"
             )
         self.period_s = rig.period_s
-        low, high = (torch.tensor(end, dtype=torch.float32) for end in rig.limits.T)
-        self.low, self.high = torch.maximum(arm.low, low), torch.minimum(arm.high, high)
-        self._benches: dict[int, Bench] = {}
-
-    def __getattr__(self, name: str):
-        return getattr(self.arm, name)
+        low, high = (torch.tensor(end).to(arm.low) for end in rig.limits.T)
+        self.simulated = _limited(arm, low, high)
+        arm = self.simulated
+        self.name, self.device, self.vary = arm.name, arm.device, arm.vary
+        self.chambers, self.key_points = arm.chambers, arm.key_points
+        self.model, self.backbone, self.pneumatics = arm.model, arm.backbone, arm.pneumatics
+        self.low, self.high, self.first = arm.low, arm.high, arm.first
+        self.pose, self.shaft = arm.pose, arm.shaft
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
-        """Rested benches that went through random pressures, at the start of an episode."""
-        benches = []
-        for key, count in zip(stream.key.tolist(), stream.count.tolist(), strict=True):
-            self._benches[key] = self._fresh(key, count)
-            benches.append(self._benches[key])
+        """Rigs at rest that then went through random pressures, at the start of an episode."""
+        trials = zip(stream.key.tolist(), stream.count.tolist(), strict=True)
+        rigs = Objects(self._fresh(key, count) for key, count in trials)
         salt = zlib.crc32(f"history {self.name}".encode())
         own = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
         _, share = own.uniform(0.0, 1.0, self.vary.history, self.chambers)
-        stream, part = self.arm.start(stream)
-        first = torch.minimum(torch.maximum(part.pressure, self.low), self.high)
+        stream, part = self.simulated.start(stream)
+        first = part.pressure
         passed = (self.low + (self.high - self.low) * share).unbind(1)
-        model = self.model.initial_state(len(benches))
-        part = replace(part, gain=torch.ones_like(part.gain), arm=model, command=first)
+        part = replace(
+            part,
+            gain=torch.ones_like(part.gain),
+            arm=self.model.initial_state(len(rigs)),
+            plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
+        )
         for target in (*passed, first):
             for _ in range(round(self.config.settle_s / self.period_s)):
-                part, reading = self._read(benches, part, target)
-        return stream, self._shown(benches, replace(part, command=reading.pressure), reading)
+                part, reading = self._read(part, target)
+        part = replace(part, command=reading.pressure)
+        return stream, self._observed(part, reading, begins=True)
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
         """One step with changes of pressure (B, m), kPa, asked for now.
 
-        `part.command` is what a pump of the world would be told to do what the bench's does: the
-        two differ by the bench's offset, which is followed here.
+        `part.command` is the command after which a pump of the simulated arm would give what the
+        rig's pump gives: the two differ by an offset, which is estimated here.
         """
-        benches = [self._benches[key] for key in stream.key.tolist()]
-        target = torch.tensor(np.stack([bench.told_kPa for bench in benches])).to(action)
+        target = part.plant.target_kPa.to(action)
         shift = part.command - target
         target = self.pneumatics.command(target, action, self.low, self.high)
         expected = self.pneumatics.follow(part.pressure, target + shift, dt_s)
         for _ in range(self.reads):
-            part, reading = self._read(benches, part, target)
+            part, reading = self._read(part, target)
         surprise = (reading.pressure - expected) / self.pneumatics.share(dt_s)
-        shift = shift + self.config.pump_trust * surprise
-        part = replace(part, command=target + shift)
-        return stream, self._shown(benches, part, reading)
+        shift = shift + self.config.pump_gain * surprise
+        return stream, self._observed(replace(part, command=target + shift), reading)
 
-    def _fresh(self, key: int, count: int) -> Bench:
-        take = zlib.crc32(f"{self.name} {key} {count}".encode())
-        config = self.config
-        rig = VirtualRig(config.seed, hidden=config.hidden, noise=config.noise, take=take)
+    def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """One-step prediction of the key points, see `Arm.predict`, with the estimated offset."""
+        return self.simulated.predict(part, pressure, dt_s)
+
+    def settled(self, pressure: Tensor) -> Tensor:
+        """The model's steady-state key points, see `Arm.settled`."""
+        return self.simulated.settled(pressure)
+
+    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float):
+        """The model's state and key points, see `ModelArm.bent`."""
+        return self.simulated.bent(part, pressure, dt_s)
+
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The part with its body where the key points are, see `ModelArm.posed`."""
+        return self.simulated.posed(part, points_mm)
+
+    def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
+        """Lowest and highest pressure a step from now, see `Arm.within_reach`."""
+        return self.simulated.within_reach(part, dt_s)
+
+    def action_for(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """The action that leads to a pressure, see `Arm.action_for`."""
+        return self.simulated.action_for(part, pressure, dt_s)
+
+    def _fresh(self, key: int, count: int) -> SimulatedRig:
+        rig = self.build(self.config, zlib.crc32(f"{self.name} {key} {count}".encode()))
         rig.reset()
-        return Bench(rig, np.zeros(rig.chambers))
+        return rig
 
-    def _read(
-        self, benches: Sequence[Bench], part: ArmPart, target: Tensor
-    ) -> tuple[ArmPart, Reading]:
-        """One period of the benches towards pressures (B, m) kPa; the model goes along."""
+    def _read(self, part: ArmPart, target: Tensor) -> tuple[ArmPart, Reading]:
+        """One period of the rigs towards pressures (B, m) kPa; the model goes along."""
         rows = []
-        for bench, told in zip(benches, target.double().cpu().numpy(), strict=True):
-            bench.told_kPa = np.clip(told, *bench.rig.limits.T)
-            bench.rig.command(bench.told_kPa)
-            sample, truth = bench.rig.read_beside_truth()
+        for rig, asked in zip(part.plant.rigs.things, target.double().cpu().numpy(), strict=True):
+            rig.command(np.clip(asked, *rig.limits.T))
+            sample, truth = rig.read_beside_truth()
             rows.append((sample.measured, sample.key_points_mm, truth.noise_free_mm[0]))
         columns = (np.stack(column) for column in zip(*rows, strict=True))
         row = {"dtype": torch.float32, "device": self.device}
         reading = Reading(*(torch.tensor(column, **row) for column in columns))
-        model, points = self.arm.bent(part, reading.pressure, self.period_s)
-        return replace(part, arm=model, points_mm=points, pressure=reading.pressure), reading
+        model, points = self.bent(part, reading.pressure, self.period_s)
+        plant = replace(part.plant, target_kPa=target)
+        part = replace(part, arm=model, points_mm=points, pressure=reading.pressure, plant=plant)
+        return part, reading
 
-    def _shown(self, benches: Sequence[Bench], part: ArmPart, reading: Reading) -> ArmPart:
-        """The part as measured and as it truly is; its points as yet are the model's."""
-        seen, offset = part.points_mm, part.offset_mm
+    def _observed(self, part: ArmPart, reading: Reading, begins: bool = False) -> ArmPart:
+        """The part as estimated and as it truly is; its key points so far are the model's.
+
+        An alpha-beta filter (Kalata 1984) estimates by how much the body lies off the model: it
+        follows a steady drift without lag. At the beginning of an episode the whole first
+        innovation is taken over.
+        """
+        seen, offset, plant = part.points_mm, part.offset_mm, part.plant
         if self.config.cameras:
             measured = frames.apply(part.mount, reading.points_mm)
             surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
-            now, offset = self._offsets(benches, offset, surprise)
-            seen = seen + now
-        part = self.arm.posed(part, frames.apply(part.mount, reading.true_mm))
-        return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset)
-
-    def _offsets(
-        self, benches: Sequence[Bench], offset: Tensor, surprise: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """How far the body is off the model now, and in a step from now, (B, n, 3) mm each.
-
-        An alpha-beta filter (Kalata 1984) on the offset that was expected for now and what the
-        cameras showed beyond it: it follows a steady drift without lag. The first surprise of an
-        episode is taken over whole.
-        """
-        share, now = self.config.trust, []
-        for bench, expected, new in zip(benches, offset, surprise, strict=True):
-            first = bench.drift_mm is None
-            bench.drift_mm = 0.0 * new if first else bench.drift_mm + self.config.drift * new
-            now.append(expected + (new if first else share * new))
-        drift = torch.stack([bench.drift_mm for bench in benches])
-        return torch.stack(now), torch.stack(now) + drift
+            if begins:
+                drift, now = plant.drift_mm, offset + surprise
+            else:
+                drift = plant.drift_mm + self.config.drift_gain * surprise
+                now = offset + self.config.observer_gain * surprise
+            seen, offset = seen + now, now + drift
+            plant = replace(plant, drift_mm=drift)
+        part = self.posed(part, frames.apply(part.mount, reading.true_mm))
+        return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
 
 
-def on_rig(task: Task, config: RigConfig | None = None) -> Task:
-    """The same task with every arm on the rig; the given task stays as it is."""
+def _limited(arm: ModelArm, low: Tensor, high: Tensor) -> ModelArm:
+    """The arm within pressures low, high (m,) kPa besides its own."""
+    limited = copy.copy(arm)
+    limited.low, limited.high = torch.maximum(arm.low, low), torch.minimum(arm.high, high)
+    return limited
+
+
+def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtual_rig) -> Task:
+    """The task with every arm on a rig; the given task stays as it is.
+
+    Tasks ask their world for its arms, so that this exchanges the world only.
+    """
     config = config or RigConfig()
-    world, moved = copy.copy(task.world), copy.copy(task)
+    world, moved = task.world, copy.copy(task)
     dt_s = world.config.dt_s
-    world.arms = {name: RigArm(arm, config, dt_s) for name, arm in world.arms.items()}
-    moved.world = world
+    arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
+    moved.world = world.with_arms(arms)
     return moved

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Task, TaskState
-from surgisoft.tasks.world.random import Stream, streams
+from surgisoft.tasks.world.random_streams import Stream, streams
 
 
 class Driver(Protocol):

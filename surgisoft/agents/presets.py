@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.registry import spec_of
 
 
 @dataclass(frozen=True)
@@ -83,38 +84,9 @@ PRESETS: dict[str, Preset] = {
 Schulman et al. (2017)."""
 
 
-STEPS: dict[str, int] = {
-    "track_circle": 4_000_000,
-    "track_square": 4_000_000,
-    "laser_plane": 4_000_000,
-    "circle_ablation": 1_000_000,
-}
-"""Task -> steps that the `fast` preset trains it unless told otherwise."""
 PAPER_STEPS = 20_000_000
-"""Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of what `STEPS` leaves out."""
-
-_FOLLOW = {
-    "envs": 1024,
-    "batches": 16,
-    "gamma": 0.6,
-    "desired_kl": 0.03,
-    "evaluate_every": 25,
-}
-"""Following a path each action shows at once what it was worth. Many small minibatches: the number
-of gradient steps decides how finely a path is followed at last."""
-
-TASK_CHANGES: dict[str, dict] = {
-    "track_circle": _FOLLOW,
-    "track_square": _FOLLOW,
-    "laser_plane": _FOLLOW,
-    "circle_ablation": {
-        "rollout": 16,
-        "last_noise": 0.05,
-        "evaluate_every": 50,
-        "evaluation_episodes": 16,
-    },
-}
-"""Task -> fields in which its `fast` preset differs."""
+"""Steps of the paper's training (Chen et al. 2025, sec. IV-A), and of tasks that name no number of
+their own."""
 
 
 def preset_for(name: str, task: str, **changes) -> Preset:
@@ -124,14 +96,15 @@ def preset_for(name: str, task: str, **changes) -> Preset:
     """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
-    own = TASK_CHANGES.get(task, {}) if name == "fast" else {}
+    own = spec_of(task).preset if name == "fast" else {}
     given = {key: value for key, value in changes.items() if value is not None}
     return replace(PRESETS[name], **{**own, **given})
 
 
 def steps_for(name: str, task: str) -> int:
     """Steps that a preset trains a task unless told otherwise."""
-    return STEPS.get(task, PAPER_STEPS) if name == "fast" else PAPER_STEPS
+    own = spec_of(task).training_steps if name == "fast" else None
+    return PAPER_STEPS if own is None else own
 
 
 @dataclass(frozen=True)

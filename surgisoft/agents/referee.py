@@ -70,7 +70,7 @@ class EpisodeReferee:
 
     def __init__(self, task: Task):
         """The task's world has surroundings, see `has_referee`."""
-        around = task.world.surroundings
+        around = task.world.scene
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.referee = Referee(around.geometry.bodies)
         self.beam_mm = around.beam_mm if LASER in task.world.arms else None
@@ -97,7 +97,7 @@ class EpisodeReferee:
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         notes.steps += 1
-        clearance = world.scenery.clearance
+        clearance = world.scene.clearance
         notes.contact_differs += bool(found) != bool(clearance.collides[row])
         notes.closest.append((float(clearance.least_mm[row]), step, arms))
         notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
@@ -106,7 +106,7 @@ class EpisodeReferee:
 
     def _look_along(self, notes: _Notes, state: TaskState, row: int, arms) -> None:
         """The beam's end by the referee beside that of the batched path."""
-        beam, hit = state.world.arms[LASER], state.world.scenery.hit
+        beam, hit = state.world.arms[LASER], state.world.scene.hit
         origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
         exact = self.referee.cast(origin, aim, self.beam_mm, arms, own=LASER)
         if int(exact.struck) != int(hit.struck[row]):
@@ -131,7 +131,7 @@ class EpisodeReferee:
 
 def has_referee(task: Task) -> bool:
     """Whether there is anything around that an arm could touch."""
-    return task.world.surroundings is not None
+    return task.world.scene is not None
 
 
 def contacts_of(verdicts: list[Verdict]) -> torch.Tensor:

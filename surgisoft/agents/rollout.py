@@ -139,7 +139,7 @@ def _played(
     watch: Callable[[Instant], None] | None,
 ) -> Rollout:
     """Episodes `first` to `first + count - 1` at once; those that are over leave the batch."""
-    play, device = Episodes(task), task.world.device
+    play, device = Episodes(task, donate=True), task.world.device
     state = play.seeded(seed, count, first)
     at = torch.arange(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
@@ -151,7 +151,7 @@ def _played(
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
         actions = driver.act(task, state, play.observe(state))
-        state, outcome = play.step(state, actions, in_place=True)
+        state, outcome = play.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
         for name, value in outcome.measures.items():

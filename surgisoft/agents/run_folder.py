@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import shutil
-import tempfile
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -22,8 +21,9 @@ import torch
 
 import surgisoft
 from surgisoft.agents.presets import Plan, Preset
-from surgisoft.config import to_table, write_atomically, write_toml
+from surgisoft.config import to_table, write_toml
 from surgisoft.errors import InputError
+from surgisoft.files import new_folder, write_atomically
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE
 from surgisoft.surrogate.checkpoint import save_model
@@ -59,9 +59,7 @@ def check_free(folder: Path) -> None:
 def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: int) -> RunFolder:
     """Write a new run, whole or not at all; `agents`: agent -> its widths, see `config.json`."""
     check_free(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with new_folder(folder) as fresh:
         for name, arm in task.world.arms.items():
             (fresh / "arms").mkdir(exist_ok=True)
             save_model(arm.model, fresh / "arms" / name)
@@ -88,13 +86,6 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
         }
         (fresh / "checkpoints").mkdir()
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
-        fresh.chmod(0o755)
-        if folder.exists():
-            folder.rmdir()
-        os.replace(fresh, folder)
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
     return RunFolder(folder)
 
 

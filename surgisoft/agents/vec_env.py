@@ -30,7 +30,7 @@ class JointEnv:
     def __init__(self, task: Task, count: int, seed: int, action_kPa: float, first: int = 0):
         """Episodes `first` to `first + count - 1` of a seed, each at another point of its time."""
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
-        self.episodes = Episodes(task)
+        self.episodes = Episodes(task, donate=True)
         with torch.inference_mode():
             state = self.episodes.seeded(seed, count, first)
             # Else all episodes would be over in the same step for ever.
@@ -54,8 +54,8 @@ class JointEnv:
         (agent -> term -> (B,)) and `measures` (name -> (B,)) of the step, as rsl-rl wants them.
         """
         asked = {agent: self.action_kPa * action for agent, action in actions.items()}
-        state, outcome = self.episodes.step(self.state, asked, in_place=True)
-        self.state = self.episodes.reset(state, outcome.done, in_place=True)
+        state, outcome = self.episodes.step(self.state, asked)
+        self.state = self.episodes.reset(state, outcome.done)
         extras = {
             "time_outs": outcome.truncated,
             "terms": outcome.terms,

@@ -7,10 +7,11 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
-from surgisoft.cli.options import Force, JsonFile, Model, NewModel, Report
+from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model, NewModel, Report
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_json
 
 
 @app.command()
@@ -27,6 +28,7 @@ def amend(
     output: NewModel,
     json_file: JsonFile = None,
     report: Report = None,
+    effect_files: EffectFiles = None,
     force: Force = False,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write NEW even where no fall can be claimed.")
@@ -45,26 +47,23 @@ def amend(
     The parameters are fitted to the first three quarters of each recording; the last quarter,
     locked until then, judges. Without a fall beyond chance nothing is written (exit code 1).
     """
-    import torch
-
     from surgisoft.diagnosis.amend import amend as amend_model
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model
+    from surgisoft.surrogate.checkpoint import load_model
     from surgisoft.surrogate.effects import named_effect
 
     claim_other_folder(output, model, force)
     check_free(json_file, "error_mm")
     check_folder(report)
-    arm, known = load_model(model), load_known_error(model)
+    # Files of effects first: the model may hold one of them.
     names = [named_effect(given) for given in effects]
+    arm = load_model(model)
     measured = read_recordings(data)
-    arm = under_weight(arm, measured)
-    torch.set_num_threads(1)
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
             arm, measured, names, not keep_network, lambda text: tell(next(stages), 4, text)
         )
-    warn_outside(arm, measured)
+    warn_all(result.notes)
     for name in result.refitted:
         print(f"{name}: the model has it; its parameters were fitted anew")
     show_parameters(result.parameters)
@@ -72,7 +71,7 @@ def amend(
         print("the network's last layer was re-tuned: held-out motion rewards it")
     claimed = result.claimed
     if claimed or anyway:
-        save_amended(result, output, model, measured, force, known)
+        save_amended(result, output, model, measured, force)
     if json_file:
         write_json(json_file, result.to_json())
     if report:

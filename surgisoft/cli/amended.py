@@ -17,7 +17,7 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
     claim_folder(output, force)
 
 
-def save_amended(result, output: Path, model: Path, recordings, force: bool, known) -> None:
+def save_amended(result, output: Path, model: Path, recordings, force: bool) -> None:
     """Write the new model with the account of how it came about."""
     from surgisoft.surrogate.checkpoint import save_model
 
@@ -25,9 +25,7 @@ def save_amended(result, output: Path, model: Path, recordings, force: bool, kno
         "amended_from": model.name,
         "recordings": [recording.name for recording in recordings],
     }
-    # A network that was re-tuned is off elsewhere.
-    kept = None if account["network_retuned"] else known
-    save_model(result.model, output, account, force, kept)
+    save_model(result.model, output, account, force)
 
 
 def show_parameters(parameters) -> None:

@@ -3,9 +3,10 @@
 import math
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
-from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
-from surgisoft.cli.options import JsonFile, Model, Recordings, Replay, Report
+from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Replay, Report
+from surgisoft.files import write_json
 
 AXES_SHOWN = 5
 """Axes that the terminal lists; the page and the JSON file have all of them."""
@@ -20,6 +21,7 @@ def compare(
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Compare an arm model with measurements: the error, and what it depends on."""
     check_free(json_file, "rmse_mm")
@@ -31,9 +33,8 @@ def compare(
 
     arm = load_model(model)
     measured = read_recordings(recordings)
-    under_weight(arm, measured)
     result, rest = compare_model(arm, measured)
-    warn_outside(arm, measured)
+    warn_all(result.notes)
     print(result.sentence)
     print(arm.summary())
     _show(result)

@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
+from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_json
 
 
 @app.command()
@@ -39,27 +40,20 @@ def diagnose(
 
     Looks at the first three quarters of each recording; the last quarter stays locked for `amend`.
     """
-    import torch
-
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model
-    from surgisoft.surrogate.effects import register_effect_file
+    from surgisoft.surrogate.checkpoint import load_model
 
     check_free(json_file, "verdict")
     check_folder(report)
-    for path in effect_files or []:
-        register_effect_file(path)
     arm = load_model(model)
     measured = read_recordings(recordings)
-    arm = under_weight(arm, measured)
-    before = read_recordings(reference) if reference else load_known_error(model)
-    torch.set_num_threads(1)
+    before = read_recordings(reference) if reference else None
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(
             arm, measured, lambda text: tell(next(stages), 5, text), before, without or ()
         )
-    warn_outside(arm, measured)
+    warn_all(found.notes)
     if json_file:
         write_json(json_file, found.to_json())
     _show(found)

@@ -7,11 +7,12 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay, write_json
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import hidden_effects, warn
 from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
+    EffectFiles,
     Hidden,
     JsonFile,
     Replay,
@@ -21,6 +22,7 @@ from surgisoft.cli.options import (
 )
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import write_json
 
 PLACES = ("simulation", "rig")
 """Where episodes are played."""
@@ -66,6 +68,7 @@ def evaluate(
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,
+    effect_files: EffectFiles = None,
     json_file: JsonFile = None,
     replay: Replay = None,
     report: Report = None,
@@ -133,7 +136,7 @@ def _rig_config(
     from surgisoft.agents.on_rig import RigConfig
 
     own = RigConfig(seed=specimen or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
-    return own if trust is None else replace(own, trust=trust)
+    return own if trust is None else replace(own, observer_gain=trust)
 
 
 def _task(drivers: list[str], task: str | None, config: Path | None, arm: str | None, scene):

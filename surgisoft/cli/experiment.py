@@ -7,10 +7,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, write_text
-from surgisoft.cli.options import ExperimentFile
+from surgisoft.cli.files import check_folder
+from surgisoft.cli.options import EffectFiles, ExperimentFile
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 
 commands = typer.Typer(
     no_args_is_help=True, help="Scripted experiments on a scene: run, check, list."
@@ -44,6 +45,7 @@ def run(
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Play an experiment; write tables, logs, pictures, replays and one HTML report."""
     from surgisoft.experiments.plan import settings
@@ -69,6 +71,7 @@ def run(
 @commands.command("check")
 def check(
     file: ExperimentFile,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Say what an experiment would play; a bad file is one line with its line and field."""
     from surgisoft.experiments.plan import settings
@@ -162,7 +165,7 @@ def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
     if replays:
         files += _replays(results)
     text = markdown(results)
-    write_text(output / "summary.md", text)
+    write_atomically(output / "summary.md", text)
     print(text)
     return [*files, output / "summary.md"]
 

@@ -1,8 +1,7 @@
-"""Files that commands write: whole or not at all."""
+"""What may be written where, before a command spends its time."""
 
 import json
 import os
-import tempfile
 from pathlib import Path
 
 from surgisoft.errors import InputError
@@ -45,22 +44,3 @@ def check_replay(path: Path | None) -> None:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected a file to write")
     check_folder(path.absolute().parent)
-
-
-def write_json(path: Path, table: dict) -> None:
-    """Write numbers and texts as JSON."""
-    write_text(path, json.dumps(table, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file through a temporary one beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise

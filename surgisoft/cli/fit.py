@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import read_recordings
-from surgisoft.cli.options import SEED_MAX, Force, Recordings, Threads
+from surgisoft.cli.options import SEED_MAX, EffectFiles, Force, Recordings, Threads
 from surgisoft.cli.progress import progress
 
 
@@ -53,6 +53,7 @@ def fit(
         int, typer.Option(min=0, max=SEED_MAX, help="Seed of weights and order of rows.")
     ] = 0,
     threads: Threads = 1,
+    effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings.

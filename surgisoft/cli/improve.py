@@ -7,8 +7,8 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free, write_json
-from surgisoft.cli.inputs import read_recordings, under_weight, warn_outside
+from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import read_recordings, warn_all
 from surgisoft.cli.options import (
     EffectFiles,
     Force,
@@ -19,6 +19,7 @@ from surgisoft.cli.options import (
     Report,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.files import write_json
 
 
 @app.command()
@@ -39,22 +40,14 @@ def improve(
     The last quarter of each recording judges at the end. Where nothing was added, or the error
     did not fall beyond chance, nothing is written (exit code 1).
     """
-    import torch
-
     from surgisoft.diagnosis.improve import improve as improve_model
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model
-    from surgisoft.surrogate.effects import register_effect_file
+    from surgisoft.surrogate.checkpoint import load_model
 
     claim_other_folder(output, model, force)
     check_free(json_file, "rounds")
     check_folder(report)
-    for path in effect_files or []:
-        register_effect_file(path)
-    arm, known = load_model(model), load_known_error(model)
+    arm = load_model(model)
     measured = read_recordings(recordings)
-    arm = under_weight(arm, measured)
-    warn_outside(arm, measured)
-    torch.set_num_threads(1)
     with progress("improve") as tell:
         done = []
 
@@ -62,10 +55,11 @@ def improve(
             done.append(each)
             tell(len(done), most + 2, each.step or each.verdict)
 
-        result = improve_model(arm, measured, most, after, known)
+        result = improve_model(arm, measured, most, after)
+    warn_all(result.notes)
     _show(result)
     if result.claimed:
-        save_amended(result, output, model, measured, force, known)
+        save_amended(result, output, model, measured, force)
     if json_file:
         write_json(json_file, result.to_json())
     if report:

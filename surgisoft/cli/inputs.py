@@ -32,19 +32,7 @@ def hidden_effects(given: Iterable[str] | None) -> list[tuple[str, float]]:
     return answer
 
 
-def warn_outside(arm, recordings) -> None:
-    """Warn where recordings leave the range of actuation that an arm model was fitted to."""
-    from surgisoft.measurement.histories import outside_range
-
-    for note in outside_range(arm.spec, recordings):
-        warn(note)
-
-
-def under_weight(arm, recordings):
-    """The arm model for the recordings' direction of weight; warns where it is another one."""
-    from surgisoft.diagnosis.weight import under_weight as turned
-
-    model, notes = turned(arm, recordings)
+def warn_all(notes: Iterable[str]) -> None:
+    """Each note of a result as a line of warning."""
     for note in notes:
         warn(note)
-    return model

@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, write_json, write_text
-from surgisoft.cli.inputs import read_recordings, under_weight
-from surgisoft.cli.options import Force, JsonFile, Model
+from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
 """Chambers and unit of the arm that the virtual rig has."""
@@ -40,12 +41,12 @@ def next_experiment(
         bool, typer.Option("--as-it-stands", help="Ask for no change of the bench itself.")
     ] = False,
     json_file: JsonFile = None,
+    effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
     """Find the experiment that best tells rival effects apart, ready for the rig."""
-    from surgisoft.diagnosis.design.next_experiment import likely_rivals, propose, recommend
+    from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
     from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
-    from surgisoft.diagnosis.residuals import problem_of
     from surgisoft.surrogate.checkpoint import load_model
 
     if output.suffix != ".csv":
@@ -59,14 +60,10 @@ def next_experiment(
     arm = load_model(model)
     rivals = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
-    if recordings:
-        measured = read_recordings(recordings)
-        under_weight(arm, measured)
-        problem = problem_of(arm, measured)
-        answer = recommend(problem, rivals or likely_rivals(problem), minutes, settings)
-    else:
-        answer = propose(arm, rivals, minutes, settings)
-    write_text(output, schedule_text(answer.protocol))
+    measured = read_recordings(recordings) if recordings else []
+    answer = find_experiment(arm, measured, rivals, minutes, settings)
+    warn_all(answer.notes)
+    write_atomically(output, schedule_text(answer.protocol))
     if json_file:
         write_json(json_file, answer.to_json())
     _show(answer, arm.spec, model, recordings or [], output)

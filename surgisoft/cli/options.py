@@ -5,6 +5,8 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from surgisoft.errors import InputError
+
 SEED_MAX = 2**31
 """Largest seed."""
 
@@ -19,14 +21,31 @@ NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder 
 NewRecording = Annotated[
     Path, Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv.")
 ]
+
+
+def _register(paths: list[Path] | None) -> list[Path] | None:
+    """Register the user-defined effects of files, before anything opens a model that holds them."""
+    for path in paths or []:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; expected a .py file with one Effect in it")
+    if paths:
+        from surgisoft.surrogate.effects import register_effect_files
+
+        register_effect_files(paths)
+    return paths
+
+
 EffectFiles = Annotated[
     list[Path] | None,
     Option(
         "--effect-file",
         metavar="FILE.py...",
-        help="Also try effects of your own (docs/effects.md).",
+        callback=_register,
+        help="Files of user-defined effects (docs/effects.md): models may hold them, and diagnose, "
+        "improve and next-experiment consider them. The files are run: trust them.",
     ),
 ]
+"""Of every command that opens a model. The effects are registered when the command line is read."""
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
 ExperimentFile = Annotated[Path, Argument(metavar="FILE.toml", help="The experiment.")]
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import Force, SaveReplay, Screenshot, Web
+from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
@@ -49,9 +49,9 @@ def new(
     force: Force = False,
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
-    from surgisoft.cli.arms import reach_of
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
     from surgisoft.scene.spec import TOOLS, MountSpec
+    from surgisoft.tasks.world.reach import reach_of
 
     request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
     check_target(output, force)
@@ -80,11 +80,12 @@ def check(
         Path | None,
         typer.Option("--map", metavar="FILE.png", help="Write a picture of the reachability here."),
     ] = None,
+    effect_files: EffectFiles = None,
 ) -> int:
     """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
-    from surgisoft.cli.arms import reaches_of
     from surgisoft.scene.check import check_scene, reach_patch
     from surgisoft.scene.folder import open_scene
+    from surgisoft.tasks.world.reach import reaches_of
 
     scene = open_scene(folder)
     reaches = reaches_of(scene)
@@ -105,13 +106,14 @@ def show(
     web: Web = False,
     screenshot: Screenshot = None,
     save: SaveReplay = None,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
-    from surgisoft.cli.arms import reaches_of
     from surgisoft.replay.scene_view import save_scene_view
     from surgisoft.replay.screenshot import take_screenshot
     from surgisoft.replay.viewer import open_viewer, serve_viewer, temporary_recording
     from surgisoft.scene.folder import open_scene
+    from surgisoft.tasks.world.reach import reaches_of
 
     scene = open_scene(folder)
     reaches = reaches_of(scene)

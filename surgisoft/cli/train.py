@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import INTERRUPTED, app
-from surgisoft.cli.options import SEED_MAX, Arm, Run, SceneFolder, TaskConfig, Threads
+from surgisoft.cli.options import SEED_MAX, Arm, EffectFiles, Run, SceneFolder, TaskConfig, Threads
 from surgisoft.cli.progress import progress
 
 
@@ -52,6 +52,7 @@ def train(
         str, typer.Option(metavar="cpu|cuda", help="Where to simulate and to learn.")
     ] = "cpu",
     threads: Threads = 1,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Train the agents of a task with PPO; every agent learns at once.
 

@@ -7,17 +7,18 @@ enough to matter.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.refinement.effects import fit_effects
 from surgisoft.diagnosis.refinement.intervals import Parameter
 from surgisoft.diagnosis.refinement.network import retune
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 
 LEAST_FALL = 0.05
@@ -104,6 +105,8 @@ class Amendment:
     """The error along the training and along the held-out rows."""
     seconds: float
     """Time that it took, s."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def claimed(self) -> bool:
@@ -131,24 +134,31 @@ class Amendment:
             "error_open_mm": asdict(training) | {"ci95": list(training.ci95)},
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
+            "notes": list(self.notes),
             "seconds": self.seconds,
         }
 
 
+@on_one_thread
 def amend(
-    model: ArmModel,
-    recordings: list[Recording],
-    names: list[str],
+    model: Model,
+    recordings: Recordings,
+    effects: str | Iterable[str],
     retune_network: bool = True,
     progress: Progress | None = None,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
+    Model and recordings may be given by their paths.
+
+    effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
     effects alone make the error fall.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
+    names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
     table = residual_table(model, recordings)
     problem = table.training()
@@ -164,6 +174,8 @@ def amend(
     alone = fall_of(held_out, held_out.with_model(fitted.model))
     if retuned and not (alone.claimed and fall_of(held_out, held_out.with_model(better)).claimed):
         better, retuned = fitted.model, False
+    # The residuals of the fit say nothing of a network that was re-tuned since.
+    better.training_residuals = None if retuned else model.training_residuals
     pairs = [(part, part.with_model(better)) for part in (problem, held_out)]
     return Amendment(
         model=better,
@@ -176,6 +188,7 @@ def amend(
         retuned=retuned,
         tracks=(track_of(*pairs[0]), track_of(*pairs[1])),
         seconds=time.perf_counter() - begin,
+        notes=notes,
     )
 
 

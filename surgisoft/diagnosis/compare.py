@@ -1,5 +1,6 @@
 """`compare`: a model's error on recordings, what it depends on, and the best achievable error."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -8,6 +9,13 @@ from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.body_frame import COMPONENTS
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.error_axes import AxisShare, Band, bands, shares
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    on_one_thread,
+    open_inputs,
+    with_known_residuals,
+)
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
     Floor,
@@ -20,9 +28,9 @@ from surgisoft.diagnosis.residuals import (
 from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe
 from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.surrogate.known_error import KnownError
-from surgisoft.surrogate.model import ArmModel
 
 WORST = 5
 """Worst moments that are listed."""
@@ -94,6 +102,8 @@ class Comparison:
     """Error and bias in bands of every axis."""
     worst: tuple[Moment, ...]
     """The worst moments, each from another stretch of time."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def explainable(self) -> float | None:
@@ -151,27 +161,27 @@ class Comparison:
             "ceiling_ci95_mm": top and top["ci95_mm"],
             "explainable": self.explainable,
         }
-        return _known(values)
+        return json_safe(values)
 
 
+@on_one_thread
 def compare(
-    model: ArmModel,
-    recordings: list[Recording],
+    model: Model,
+    recordings: Recordings,
     part: Part = "all",
-    reference: list[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | KnownError | None = None,
 ) -> tuple[Comparison, ResidualTable]:
-    """Evaluate a model on recordings.
+    """Evaluate a model on recordings; both may be given by their paths.
 
     part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
     for `diagnose`, which takes it into account for the best achievable error.
     """
+    model, recordings, notes = open_inputs(model, recordings)
     whole = residual_table(model, recordings)
     if np.isnan(whole.only(part).measured_mm).all():
         raise InputError("no key point was measured in any row of the recordings")
-    problem = whole.view(part, least_blocks=1)
+    problem = with_known_residuals(whole.view(part, least_blocks=1), reference)
     table, block = problem.table, problem.block_of_row
-    if reference is not None:
-        problem = problem.with_reference(reference)
     square = np.square(table.error_mm)
     seen = ~np.isnan(square).all(axis=1)
     looked_at = np.full(len(seen), True)
@@ -199,6 +209,7 @@ def compare(
             missing=int((looked_at & ~seen).sum()),
             bands=tuple(bands(problem)),
             worst=tuple(_worst(table)),
+            notes=notes,
         ),
         table,
     )
@@ -256,15 +267,6 @@ def _root_interval(square: np.ndarray, block: np.ndarray) -> tuple[float, float]
 
 def _mm(value: float) -> str:
     return f"{value:.2f} mm" if value >= 0.095 else f"{value:.3f} mm"
-
-
-def _known(value):
-    """The value with None for NaN, which JSON cannot say; through dicts and lists."""
-    if isinstance(value, dict):
-        return {name: _known(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_known(each) for each in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _nanmean(values: np.ndarray) -> float:

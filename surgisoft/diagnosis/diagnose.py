@@ -12,7 +12,7 @@ System identification of a grey-box model in five steps:
 """
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.candidates import candidates
@@ -22,7 +22,14 @@ from surgisoft.diagnosis.decision import Evidence, Kind, decide, evidence_of
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    identification_problem,
+    on_one_thread,
+    open_inputs,
+)
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -34,7 +41,6 @@ from surgisoft.errors import unknown_name
 from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
-from surgisoft.surrogate.model import ArmModel
 
 MOST_RIVALS = CRITERIA.selection.most_competing
 """Most competing effects that an experiment is sought for."""
@@ -106,6 +112,8 @@ class Diagnosis:
     """The experiment that would tell competing effects apart; None where nothing is open."""
     checks: tuple[str, ...] = ()
     """Data-quality warnings."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
     axis: str | None = None
     """The axis that the remaining error depends on most, where it is known."""
     seconds: float = 0.0
@@ -118,26 +126,28 @@ class Diagnosis:
         return asdict(self)
 
 
+@on_one_thread
 def diagnose(
-    model: ArmModel,
-    recordings: list[Recording],
+    model: Model,
+    recordings: Recordings,
     progress: Progress | None = None,
-    reference: list[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | KnownError | None = None,
     without: Collection[str] = (),
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
+    Model and recordings may be given by their paths.
+
     Only the training rows are looked at: the view of the residual table that is worked on holds no
-    other key points. reference: recordings from before a change in question, or the training
-    residuals that the model's folder keeps. without: effects that cannot act, such as a contact on
-    a bench without anything to touch.
+    other key points. reference: recordings from before a change in question; without them the
+    residuals that the model keeps of its fit. without: effects that cannot act, such as a contact
+    on a bench without anything to touch.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
+    model, recordings, notes = open_inputs(model, recordings)
     report("predicting")
-    problem = residual_table(model, recordings).training()
-    if reference is not None:
-        problem = problem.with_reference(reference)
+    problem = identification_problem(model, recordings, reference)
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -147,7 +157,7 @@ def diagnose(
     result = result_of(find(problem, tried, report))
     if result.verdict.kind == "unknown_effect":
         result = with_axis(result, problem)
-    return replace(result, seconds=time.perf_counter() - begin)
+    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:

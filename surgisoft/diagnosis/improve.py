@@ -7,11 +7,12 @@ end, for the errors of all rounds, and decide nothing but whether the whole fall
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
+from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
 from surgisoft.diagnosis.refinement.effects import fit_effects, fit_plausible
 from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
 from surgisoft.diagnosis.refinement.network import retune
@@ -70,6 +71,8 @@ class Improvement:
     """The error along the training and along the held-out rows."""
     seconds: float
     """Time that it took, s."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -98,18 +101,22 @@ class Improvement:
             "error_mm": asdict(self.held_out) | {"ci95": list(self.held_out.ci95)},
             "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
+            "notes": list(self.notes),
             "seconds": self.seconds,
         }
 
 
+@on_one_thread
 def improve(
-    model: ArmModel,
-    recordings: list[Recording],
+    model: Model,
+    recordings: Recordings,
     most_effects: int = MOST_EFFECTS,
     progress: Progress | None = None,
-    reference: list[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | KnownError | None = None,
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
+
+    Model and recordings may be given by their paths.
 
     reference: as for `diagnose`.
     """
@@ -117,6 +124,8 @@ def improve(
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
+    model, recordings, notes = open_inputs(model, recordings)
+    reference = model.training_residuals if reference is None else reference
     table = residual_table(model, recordings)
     problem = table.training()
     models, rounds, parameters = [model], [], ()
@@ -161,6 +170,10 @@ def improve(
         why = f"held-out motion rewards a re-tuned network by {100 * tuned.gain:.0f} %"
         models.append(tuned.model)
         note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
+    if models[-1] is not model:
+        kept = not (added and tuned.kept)
+        # The residuals of the fit say nothing of a network that was re-tuned since.
+        models[-1].training_residuals = model.training_residuals if kept else None
     held_out = table.final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []
@@ -174,6 +187,7 @@ def improve(
         held_out=fall_of(held_out, final),
         tracks=(track_of(problem, problem.with_model(models[-1])), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
+        notes=notes,
     )
 
 

@@ -9,6 +9,7 @@ view can see them.
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -423,7 +424,7 @@ class Problem:
             predicted = self.rows(model.predict(self.history)).double().numpy()
         return replace(self, model=model, predicted=predicted)
 
-    def with_reference(self, given: list[Recording] | KnownError) -> "Problem":
+    def with_reference(self, given: Sequence[Recording] | KnownError) -> "Problem":
         """The problem with residuals from before the change in question.
 
         The model discrepancy has to explain these rows too, by the same function of actuation and
@@ -431,8 +432,8 @@ class Problem:
         """
         spec = self.model.spec
         if not isinstance(given, KnownError):
-            check_fits(spec, given)
-            given = KnownError.of(self.model, [history_of(given, spec.actuation)], ROWS)
+            check_fits(spec, list(given))
+            given = KnownError.of(self.model, [history_of(list(given), spec.actuation)], ROWS)
         low, half = np.array(spec.low), np.array(spec.span) / 2
         known = Reference(
             pressure=(given.actuation.double().numpy() - low) / half - 1.0,

@@ -65,11 +65,9 @@ def under_weight(model: ArmModel, recordings: list[Recording]) -> tuple[ArmModel
 def _without_direction(model: ArmModel) -> ArmModel:
     """The same model, whose loads may have any direction."""
     spec = replace(model.spec, gravity=None)
-    return (
-        ArmModel(spec, model.network, dict(model.effects), model.rest_mm, model.validation)
-        .to(model.rest_mm.device)
-        .train(model.training)
-    )
+    free = ArmModel(spec, model.network, dict(model.effects), model.rest_mm, model.validation)
+    free.training_residuals = model.training_residuals
+    return free.to(model.rest_mm.device).train(model.training)
 
 
 def _shown(direction) -> str:

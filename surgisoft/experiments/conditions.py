@@ -25,7 +25,7 @@ class Condition:
 
 
 def _centred(task: CircleAblation, state: TaskState, within: float) -> Tensor:
-    view = state.world.scenery.view
+    view = state.world.scene.view
     return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
 
 
@@ -34,7 +34,7 @@ def _aimed(task: CircleAblation, state: TaskState, within: float) -> Tensor:
 
 
 def _cut(task: CircleAblation, state: TaskState, within: float) -> Tensor:
-    return task.surroundings.ablation.report(state.world.scenery.dose).completion >= within
+    return task.scene.ablation.report(state.world.scene.dose).completion >= within
 
 
 def _retracted(task: CircleAblation, state: TaskState, within: float) -> Tensor:

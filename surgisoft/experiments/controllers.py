@@ -15,8 +15,8 @@ from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.experiments.spec import NOMINAL, DriverSpec, Experiment
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.trajectories import Cut
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.trajectories.closed_path import RingCut
+from surgisoft.tasks.world.random_streams import Stream
 
 RUNNING, CLOSE, LOST, LATE = range(4)
 REASONS = ("", "too close", "lesion out of sight", "phase took too long")
@@ -27,7 +27,7 @@ REASONS = ("", "too close", "lesion out of sight", "phase took too long")
 class Progress:
     """How far a batch of episodes is."""
 
-    cut: Cut
+    cut: RingCut
     """How far the cut is."""
     phase: Tensor
     """(B,) int64: number of the phase; one more than the last: all are done."""
@@ -89,11 +89,11 @@ class PhasedAblation:
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the endoscope sees as much of the ring as the scene asks for."""
-        return state.world.scenery.view.fraction >= self.base.spec.limits.view_fraction
+        return state.world.scene.view.fraction >= self.base.spec.limits.view_fraction
 
     def safe(self, state: TaskState) -> Tensor:
         """(B,) bool: the lesion is in sight and everything is clear: else there is no beam."""
-        clearance = state.world.scenery.clearance
+        clearance = state.world.scene.clearance
         clear = (clearance.least_mm >= self.clear_mm) & ~clearance.collides
         return self.in_sight(state) & clear & ~state.world.failed
 
@@ -102,11 +102,11 @@ class PhasedAblation:
         goal = state.goal
         return self.beam[goal.phase] & (goal.reason == RUNNING) & self.safe(state)
 
-    def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
         """As for `Task`."""
         plain = self.plain(state)
         fired = self.base.fires(plain) & self.released(state)
-        after = self.base.advance(plain, self._broken(state, actions), in_place, fired)
+        after = self.base.advance(plain, self._broken(state, actions), fired)
         return replace(after, goal=self._further(state.goal, after))
 
     def _broken(self, state: TaskState, actions: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -123,7 +123,7 @@ class PhasedAblation:
 
     def _further(self, old: Progress, after: TaskState) -> Progress:
         """Phases and limits a step later; `after` has the cut as its goal."""
-        clearance = after.world.scenery.clearance
+        clearance = after.world.scene.clearance
         holds = torch.zeros_like(after.world.failed)
         for number, phase in enumerate(self.phases):
             here = old.phase == number
@@ -167,7 +167,7 @@ class PhasedAblation:
     def ended(self, state: TaskState) -> Tensor:
         """(B,) bool: all phases are done, or something is hit."""
         done = state.goal.phase >= len(self.phases)
-        return done | state.world.scenery.clearance.collides
+        return done | state.world.scene.clearance.collides
 
     def measures(self, state: TaskState) -> dict[str, Tensor]:
         """The ablation task's; success asks besides that nothing was aborted.
@@ -243,7 +243,7 @@ class Waypoints:
     def __call__(self, task: PhasedAblation, agent: str, state: TaskState, seen) -> Tensor:
         """As for `Hand`."""
         target = _between(self.times, self.values, (state.goal.since + 1) * task.dt_s)
-        return task.base.aims[agent].action(state.world.arms[agent], target)
+        return task.base.pointing[agent].action(state.world.arms[agent], target)
 
 
 class Nominal:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.agents.report_charts import episode_charts
-from surgisoft.config import write_atomically
 from surgisoft.experiments.results import Results
+from surgisoft.files import write_atomically
 from surgisoft.report import Picture
 from surgisoft.tasks.episodes.log import EpisodeLog
 

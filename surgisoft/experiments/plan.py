@@ -15,7 +15,7 @@ from surgisoft.experiments.spec import Case, Experiment, Lesion, Vary, merged, t
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.registry import config_table
+from surgisoft.tasks.registry import config_table, with_present_names
 
 Value = int | float | str
 
@@ -111,7 +111,7 @@ def _configured(spec: Experiment, values) -> CircleAblationConfig:
             change: dict | Value = value
             for part in reversed(name.split(".")):
                 change = {part: change}
-            table = merged(table, change)
+            table = merged(table, with_present_names(spec.task, change))
     try:
         return task_config(table, Where(Path(spec.name)))
     except InputError as error:

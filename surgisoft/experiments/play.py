@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,6 +15,7 @@ from surgisoft.agents.rollout import Instant, Rollout, rollout
 from surgisoft.experiments.controllers import REASONS, Hands, PhasedAblation
 from surgisoft.experiments.plan import Setting, build_task
 from surgisoft.experiments.spec import Experiment
+from surgisoft.files import json_safe
 from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
@@ -108,7 +108,7 @@ def _rows(
     return [
         about
         | {"episode": first + i, "outcome": outcomes[i]}
-        | {name: _plain(values[i]) for name, values in table.items()}
+        | {name: json_safe(float(values[i])) for name, values in table.items()}
         for i in range(played.episodes)
     ]
 
@@ -149,7 +149,3 @@ def _outcomes(task: PhasedAblation, played: Rollout, verdicts: list[Verdict]) ->
         else:
             found.append("done" if played.terminated[i] else "time out")
     return found
-
-
-def _plain(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

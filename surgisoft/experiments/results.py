@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -11,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.agents.evaluate import RATES, Summary, summary
-from surgisoft.config import write_atomically
 from surgisoft.experiments.play import Row, badness
 from surgisoft.experiments.run import log_file
 from surgisoft.experiments.spec import Experiment
+from surgisoft.files import write_atomically, write_json
 from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 
@@ -112,13 +111,13 @@ def write_tables(results: Results) -> list[Path]:
                 "values": setting.values,
                 "episodes": len(setting.rows),
                 "outcomes": setting.outcomes,
-                "overall": {name: _plain(asdict(v)) for name, v in setting.overall.items()},
+                "overall": {name: asdict(v) for name, v in setting.overall.items()},
             }
             for setting in results.settings
         },
     }
     path = folder / "summary.json"
-    write_atomically(path, (json.dumps(about, indent=2) + "\n").encode())
+    write_json(path, about)
     return [*files, path]
 
 
@@ -136,10 +135,3 @@ def drop_logs(results: Results) -> None:
 
 def _numbers(values: list) -> np.ndarray:
     return np.array([math.nan if value is None else value for value in values], dtype=float)
-
-
-def _plain(table: dict) -> dict:
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in table.items()
-    }

@@ -11,16 +11,18 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from surgisoft.agents.run_folder import versions
-from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import Setting, scene_of, settings
 from surgisoft.experiments.play import Row, opened, play_block
 from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
+from surgisoft.files import write_json
+from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.workers import workers
 
@@ -81,7 +83,7 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
     (folder / "rows").mkdir(parents=True, exist_ok=True)
     scene = scene_of(spec, settings(spec)[0])
     about = {"versions": versions(), "scene_hash": scene.content_hash}
-    write_atomically(folder / "versions.json", (json.dumps(about, indent=2) + "\n").encode())
+    write_json(folder / "versions.json", about)
     save_experiment(spec, folder / FILE)
 
 
@@ -143,8 +145,7 @@ def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
     for number, log in block.logs.items():
         save_episode(log, log_file(folder, job.setting.label, number))
     for row in block.rows:
-        text = json.dumps(row, indent=1) + "\n"
-        write_atomically(row_file(folder, job.setting, row["episode"]), text.encode())
+        write_json(row_file(folder, job.setting, row["episode"]), row)
 
 
 def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
@@ -153,7 +154,8 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
     from concurrent.futures.process import BrokenProcessPool
 
     try:
-        with workers(processes) as pool:
+        prepare = partial(register_effect_files, registered_files())
+        with workers(processes, prepare) as pool:
             waiting = {pool.submit(_play, spec, folder, job): job for job in left}
             for future in as_completed(waiting):
                 future.result()

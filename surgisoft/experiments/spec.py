@@ -15,7 +15,7 @@ from surgisoft.errors import InputError
 from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.scene.spec import Length, Point
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import config_table
+from surgisoft.tasks.registry import config_table, with_present_names
 
 FORMAT = 1
 """Version of the file's format."""
@@ -207,7 +207,7 @@ def load_experiment(path: str | Path) -> Experiment:
                 "does not belong here", "the scene at the top, the arm in a case"
             )
     plain = config_table(CircleAblationConfig()) | {"scene": ""}
-    task = task_config(merged(plain, own), where)
+    task = task_config(merged(plain, with_present_names(CircleAblationConfig(), own)), where)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
     return _absolute(spec, where)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from surgisoft.errors import InputError
+from surgisoft.files import new_file
 from surgisoft.replay.plots import Line
 
 SUFFIX = ".rrd"
@@ -29,20 +28,12 @@ def new_recording(
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=SUFFIX, dir=path.parent)
-    os.close(handle)
-    try:
+    with new_file(path) as fresh:
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
-        recording.save(name, default_blueprint=blueprint)
+        recording.save(fresh, default_blueprint=blueprint)
         yield recording
         recording.flush()
         recording.disconnect()
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 class Columns:

@@ -6,8 +6,8 @@ import time
 import warnings
 from pathlib import Path
 
-from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.replay.viewer import LOCAL, free_port, running, wait_for_port
 
 WINDOW = (1600, 1000)

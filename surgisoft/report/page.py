@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft import __version__
-from surgisoft.config import write_atomically
 from surgisoft.errors import unknown_name
+from surgisoft.files import write_atomically
 from surgisoft.report.parts import Part, Section, anchor
 from surgisoft.report.style import STYLE
 

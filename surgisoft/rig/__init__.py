@@ -1,7 +1,13 @@
-"""The virtual rig, and what it has in common with a bench: command pressures, read samples."""
+"""Rigs: what a bench with a soft arm is to the program, and a virtual one that simulates it.
+
+`interface` says what a rig offers, real or virtual; `collect` drives any of them through a protocol
+into a recording. `virtual` is the simulated rig: `arm` (with `rod`, `wall`, `friction`),
+`pneumatics`, `motion_capture` and the hidden `effects`, stepped together in `bench`. It shares no
+code and no formula with the arm models and imports neither them nor torch.
+"""
 
 from surgisoft.rig.collect import collect
-from surgisoft.rig.interface import Rig, Sample
-from surgisoft.rig.virtual import Truth, VirtualRig
+from surgisoft.rig.interface import Rig, Sample, SimulatedRig, Truth
+from surgisoft.rig.virtual import VirtualRig, VirtualRigConfig
 
-__all__ = ["Rig", "Sample", "Truth", "VirtualRig", "collect"]
+__all__ = ["Rig", "Sample", "SimulatedRig", "Truth", "VirtualRig", "VirtualRigConfig", "collect"]

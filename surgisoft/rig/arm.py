@@ -1,10 +1,10 @@
-"""The arm of the virtual rig: its design, and one fabricated specimen a seed.
+"""The arm of the virtual rig: its design, and one fabricated robot for each seed.
 
 The design follows Chen et al. (2025, sec. II): 70 mm x 15 mm, a 3 mm channel, three chambers at 120
 degrees, fibres wound at 7 degrees from the circumference, magnet caps at both ends. What the paper
 does not state (wall thickness, silicone, masses) is chosen so that an arm of that size bends by
-60 to 90 degrees with one chamber at 54 kPa. No two specimens are equal: areas, offsets, angles,
-stiffness, rest shape and friction spread as in hand casting.
+60 to 90 degrees with one chamber at 54 kPa. No two robots are equal: areas, offsets, angles,
+stiffness, rest shape and friction spread as in casting by hand.
 """
 
 import itertools
@@ -58,7 +58,7 @@ class ArmDesign:
     odd: float = 4.0
     """Third-order stiffening of the wall [-]."""
     friction_lines: int = 6
-    """Lines of the wall that carry fibre friction."""
+    """Fibres of the wall that carry fibre friction."""
     slip_strain: float = 0.012
     """Strain over which fibres come loose after a reversal [-]."""
     largest_gap: float = 0.034
@@ -75,7 +75,7 @@ class ArmDesign:
 
 
 class Friction(NamedTuple):
-    """Friction of the wall's lines; see friction.py for the density."""
+    """Friction of the wall's fibres; see friction.py for the density."""
 
     at: np.ndarray
     """(J, 2) x, y of each line, body frame [mm]."""
@@ -91,7 +91,7 @@ class Friction(NamedTuple):
     """(J,) r2 [-]."""
 
 
-class Specimen(NamedTuple):
+class Robot(NamedTuple):
     """One fabricated arm."""
 
     rod: Rod
@@ -101,7 +101,7 @@ class Specimen(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """History of the wall's lines."""
+    """History of the wall's fibres."""
 
     free: np.ndarray
     """(3,) strains eps, u_x, u_y of a free section under the present pressures."""
@@ -119,17 +119,17 @@ def new_memory(lines: int) -> Memory:
 
 
 @compiled
-def remember(specimen, pressures, thrusts, memory):
-    """Take the wall's lines to the strains of a free section under the chamber pressures.
+def remember(robot, pressures, thrusts, memory):
+    """Take the wall's fibres to the strains of a free section under the chamber pressures.
 
     pressures: (m,) [kPa]; thrusts: (m,) scratch. The free section (no weight) mixes the chambers
     in every line; between two calls the strains must have moved monotonically. False: no strain.
     """
-    wall = specimen.rod.wall
+    wall = robot.rod.wall
     for i in range(pressures.shape[0]):
         thrusts[i] = pressures[i] * 1e-3 * wall.areas[i]
     taken = strain_under(wall, 1.0, thrusts, 0.0, 0.0, 0.0, memory.free)
-    at = specimen.friction.at
+    at = robot.friction.at
     for j in range(at.shape[0]):
         strain = line_strain(memory.free, at[j, 0], at[j, 1])
         move(j, strain, memory.last, memory.depth, memory.stack)
@@ -169,19 +169,19 @@ def chamber_thrusts(rod, pressures, thrusts):
 
 
 @compiled
-def settle_path(specimen, loads, path, memory, shape, tips):
+def settle_path(robot, loads, path, memory, shape, tips):
     """Quasi-static tips (T, 3) [mm] along chamber pressures (T, m) [kPa]; False: failed."""
-    forces = np.empty(specimen.friction.force.shape[0])
+    forces = np.empty(robot.friction.force.shape[0])
     scratch = np.empty(path.shape[1])
-    thrusts = np.empty((specimen.rod.stiffness.shape[0], path.shape[1]))
+    thrusts = np.empty((robot.rod.stiffness.shape[0], path.shape[1]))
     for t in range(path.shape[0]):
-        if not remember(specimen, path[t], scratch, memory):
+        if not remember(robot, path[t], scratch, memory):
             return False
-        friction_forces(specimen.friction, memory, forces)
+        friction_forces(robot.friction, memory, forces)
         shape.active[:] = 0.0
-        add_line_forces(specimen.friction, forces, shape.active)
-        chamber_thrusts(specimen.rod, path[t], thrusts)
-        if not balance(specimen.rod, loads, 1.0, thrusts, specimen.rod.base, shape):
+        add_line_forces(robot.friction, forces, shape.active)
+        chamber_thrusts(robot.rod, path[t], thrusts)
+        if not balance(robot.rod, loads, 1.0, thrusts, robot.rod.base, shape):
             return False
         tips[t] = shape.centres[-1]
     return True
@@ -200,7 +200,7 @@ def plain_loads(gravity: np.ndarray) -> Loads:
     )
 
 
-def single_chamber_gap(specimen: Specimen, design: ArmDesign, gravity: np.ndarray) -> float:
+def single_chamber_gap(robot: Robot, design: ArmDesign, gravity: np.ndarray) -> float:
     """Largest distance [mm] of the tip between loading and unloading at the same pressure.
 
     Each chamber alone goes through the whole pressure range twice, in 3 kPa steps; the second
@@ -212,18 +212,18 @@ def single_chamber_gap(specimen: Specimen, design: ArmDesign, gravity: np.ndarra
     for chamber in range(design.chambers):
         path = np.zeros((4 * len(up), design.chambers))
         path[:, chamber] = np.concatenate([up, up[::-1], up, up[::-1]])
-        tips = tips_along(specimen, plain_loads(gravity), path)
+        tips = tips_along(robot, plain_loads(gravity), path)
         rising, falling = tips[2 * len(up) : 3 * len(up)], tips[3 * len(up) :][::-1]
         largest = max(largest, float(np.linalg.norm(rising - falling, axis=1).max()))
     return largest
 
 
-def tips_along(specimen: Specimen, loads: Loads, path: np.ndarray) -> np.ndarray:
+def tips_along(robot: Robot, loads: Loads, path: np.ndarray) -> np.ndarray:
     """Tip centres (T, 3) [mm] of the rested arm along quasi-static pressures (T, m) [kPa]."""
-    memory = new_memory(len(specimen.friction.force))
+    memory = new_memory(len(robot.friction.force))
     tips = np.empty((len(path), 3))
-    shape: Shape = new_shape(specimen.rod)
-    if not settle_path(specimen, loads, np.asarray(path, np.float64), memory, shape, tips):
+    shape: Shape = new_shape(robot.rod)
+    if not settle_path(robot, loads, np.asarray(path, np.float64), memory, shape, tips):
         raise no_equilibrium()
     return tips
 
@@ -236,13 +236,13 @@ def no_equilibrium() -> InputError:
     )
 
 
-def calibrated(specimen: Specimen, design: ArmDesign, gravity: np.ndarray) -> Specimen:
-    """The specimen with its friction scaled so that the largest gap is the design's."""
+def calibrated(robot: Robot, design: ArmDesign, gravity: np.ndarray) -> Robot:
+    """The robot with its friction scaled so that the largest gap is the design's."""
     target = design.largest_gap * design.length_mm
 
-    def scaled(factor: float) -> Specimen:
-        friction = specimen.friction._replace(force=factor * specimen.friction.force)
-        return specimen._replace(friction=friction)
+    def scaled(factor: float) -> Robot:
+        friction = robot.friction._replace(force=factor * robot.friction.force)
+        return robot._replace(friction=friction)
 
     def excess(factor: float) -> float:
         return single_chamber_gap(scaled(factor), design, gravity) - target
@@ -253,8 +253,8 @@ def calibrated(specimen: Specimen, design: ArmDesign, gravity: np.ndarray) -> Sp
     return scaled(brentq(excess, 0.0, upper, xtol=1e-9, rtol=1e-9))
 
 
-def fabricate(design: ArmDesign, seed: int, gravity: np.ndarray) -> Specimen:
-    """Cast one arm; the seed stands for everything that hand work leaves to chance.
+def fabricate(design: ArmDesign, seed: int, gravity: np.ndarray) -> Robot:
+    """Fabricate one robot; its seed draws everything in which hand-cast arms differ.
 
     gravity: (3,) unit vector of weight in the base frame, under which the friction is calibrated.
     """
@@ -262,7 +262,7 @@ def fabricate(design: ArmDesign, seed: int, gravity: np.ndarray) -> Specimen:
     steps, planes = _steps(design, rng)
     rod = _rod(design, steps, planes, rng)
     friction = _friction(design, rod, rng)
-    return calibrated(Specimen(rod, friction), design, gravity)
+    return calibrated(Robot(rod, friction), design, gravity)
 
 
 def _steps(design: ArmDesign, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

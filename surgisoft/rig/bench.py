@@ -1,7 +1,7 @@
-"""The bench's clockwork: pumps, arm and cameras step by step, in compiled code.
+"""Pumps, arm and cameras of the virtual rig, stepped together in compiled code.
 
-Randomness comes from outside as a tape of standard normal numbers, so that one sample after the
-other and a whole schedule at once read the same numbers in the same order.
+Random numbers come from the caller as a tape of standard normals, so that stepping sample by sample
+and running a whole schedule at once read the same numbers in the same order.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from surgisoft.compiled import compiled
 from surgisoft.rig.arm import (
     Memory,
-    Specimen,
+    Robot,
     add_line_forces,
     chamber_thrusts,
     friction_forces,
@@ -64,25 +64,25 @@ from surgisoft.rig.wall import line_strain
 
 
 class Plant(NamedTuple):
-    """Everything about the bench that does not change."""
+    """All parameters of a virtual rig; constant."""
 
-    specimen: Specimen
+    robot: Robot
     """The arm."""
     loads: Loads
-    """What acts on it."""
+    """External loads on the arm."""
     pumps: Pumps
-    """Its pneumatics."""
+    """The pneumatics."""
     cameras: Cameras
-    """Its motion capture."""
+    """The motion capture."""
     effects: Effects
-    """What is hidden in it."""
+    """Amplitudes of the hidden effects."""
 
 
 class State(NamedTuple):
-    """Everything that does change, in place."""
+    """The state of a virtual rig; changed in place."""
 
     steps: np.ndarray
-    """(1,) int64 controller periods since the bench was switched on."""
+    """(1,) int64 controller periods since the rig was switched on."""
     gas: np.ndarray
     """(m, COLUMNS) pumps."""
     target: np.ndarray
@@ -102,7 +102,7 @@ class State(NamedTuple):
     tracking: Tracking
     """The cameras."""
     forces: np.ndarray
-    """(J,) friction of the wall's lines [N]."""
+    """(J,) friction of the wall's fibres [N]."""
     thrusts: np.ndarray
     """(K, m) chamber thrusts along the arm [N]."""
     scratch: np.ndarray
@@ -127,9 +127,9 @@ class Frames(NamedTuple):
 
 
 def new_state(plant: Plant) -> State:
-    """A rested, vented arm on a bench just switched on."""
-    rod = plant.specimen.rod
-    m, lines = len(rod.wall.areas), len(plant.specimen.friction.force)
+    """A vented arm at rest on a rig that was just switched on."""
+    rod = plant.robot.rod
+    m, lines = len(rod.wall.areas), len(plant.robot.friction.force)
     return State(
         steps=np.zeros(1, np.int64),
         gas=vented(plant.pumps),
@@ -192,7 +192,7 @@ def rest(plant: Plant, state: State) -> None:
 def advance(plant, state, steps, tape, at):
     """Pumps and wall over `steps` controller periods; the tape's next index, -1 on failure."""
     pumps, effects = plant.pumps, plant.effects
-    wall = plant.specimen.rod.wall
+    wall = plant.robot.rod.wall
     for _ in range(steps):
         time = state.steps[0] * pumps.step
         for i in range(state.gas.shape[0]):
@@ -216,7 +216,7 @@ def advance(plant, state, steps, tape, at):
         effective_pressures(
             effects, time, pumps.step, state.chamber, state.history, state.effective
         )
-        if not remember(plant.specimen, state.effective, state.scratch, state.memory):
+        if not remember(plant.robot, state.effective, state.scratch, state.memory):
             return -1
         follow_lines(effects, pumps.step, state.memory.last, state.history)
         state.steps[0] += 1
@@ -226,17 +226,17 @@ def advance(plant, state, steps, tape, at):
 @compiled
 def take_shape(plant, state):
     """The arm's equilibrium under the present pressures and memory; False where none was found."""
-    specimen, effects, active = plant.specimen, plant.effects, state.shape.active
-    friction_forces(specimen.friction, state.memory, state.forces)
+    robot, effects, active = plant.robot, plant.effects, state.shape.active
+    friction_forces(robot.friction, state.memory, state.forces)
     add_effect_forces(effects, state.memory.last, state.history, state.forces)
     active[:] = 0.0
-    add_line_forces(specimen.friction, state.forces, active)
+    add_line_forces(robot.friction, state.forces, active)
     add_twist(effects, state.effective, active)
-    chamber_thrusts(specimen.rod, state.effective, state.thrusts)
+    chamber_thrusts(robot.rod, state.effective, state.thrusts)
     time = state.steps[0] * plant.pumps.step
     softness = 1.0 - effects.warmth * (room_temperature(effects, time) - 22.0)
-    drifted_base(effects, time, specimen.rod.base, state.base)
-    return balance(specimen.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
+    drifted_base(effects, time, robot.rod.base, state.base)
+    return balance(robot.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
 
 
 @compiled
@@ -264,7 +264,7 @@ def look_at(plant, state, tape, at, frames, index):
 
 
 @compiled
-def play(plant, state, commands, pause, steps, count, tape, frames):
+def run_commands(plant, state, commands, pause, steps, count, tape, frames):
     """After each row of commands (P, m) [kPa] a pause, then `count` samples; False on failure.
 
     pause: controller periods without samples (0: none); steps: controller periods from sample to

@@ -23,7 +23,7 @@ cos^2n with n = 3)."""
 
 
 class Effects(NamedTuple):
-    """Amplitudes of all hidden effects; m chambers, J wall lines."""
+    """Amplitudes of all hidden effects; m chambers, J wall fibres."""
 
     friction: float
     """Added share of the fibres' friction [-]."""
@@ -42,7 +42,7 @@ class Effects(NamedTuple):
     creep: float
     """Added push after about a minute at 54 kPa [kPa]."""
     rate: float
-    """Viscous force of a wall line at 0.1 strain a second [N]."""
+    """Viscous force of a wall fibre at 0.1 strain a second [N]."""
     stick: np.ndarray
     """(2,) stiffness [N] and break-away strain [-] of lines that stick and slip."""
     softening: float
@@ -91,7 +91,7 @@ class History(NamedTuple):
 
 
 def no_effects(chambers: int, line_stiffness: float) -> Effects:
-    """Everything off. line_stiffness: modulus times area of one wall line [N]."""
+    """Everything off. line_stiffness: modulus times area of one wall fibre [N]."""
     return Effects(
         friction=0.0,
         line=np.zeros(2),

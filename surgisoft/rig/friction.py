@@ -1,4 +1,4 @@
-"""Rate-independent friction between fibres and wall: a Preisach memory of each wall line's strain.
+"""Rate-independent friction between fibres and wall: a Preisach memory of each wall fibre's strain.
 
 The wall is divided into lines along the arm. Sliding fibres make the stress of a line depend on
 the history of its strain through the Preisach plane (Preisach 1935; Mayergoyz 1986): relays that
@@ -59,7 +59,7 @@ def virgin(strain, slip, slope, bow):
 
 @compiled
 def move(line, strain, last, depth, stack):
-    """Take the strain of one line to a new value: turning points come and are wiped out.
+    """Take the strain of one fibre to a new value: turning points are added and wiped out.
 
     last: (J,) strain before; depth: (J,) number of turning points; stack: (J, DEPTH) turning
     points, oldest first; all three are updated. Between two calls the strain moved monotonically.

@@ -1,7 +1,7 @@
-"""Hidden effects by name: what `--hidden NAME --strength X` switches on.
+"""Hidden effects of the virtual rig by name: what `--hidden NAME --strength X` switches on.
 
-At strength 1 an effect changes the tip by about a millimetre (root mean square over the `mixed`
-protocol); benchmarks/collect.py measures it. Signs and places vary with the arm's seed.
+At strength 1 an effect moves the tip by about a millimetre (root mean square over the `mixed`
+protocol); benchmarks/collect.py measures it. Signs and places vary with the robot's seed.
 """
 
 import zlib
@@ -16,14 +16,15 @@ from surgisoft.rig.arm import STANDARD_GRAVITY, chamber_thrusts, no_equilibrium
 from surgisoft.rig.effects import REFERENCE_KPA, Effects
 from surgisoft.rig.rod import Loads, Rod, balance, new_shape
 
-MOMENT_S = (40.0, 100.0)
-"""Between when something happens that happens once [s]: within the two and a half minutes of the
-shortest recordings, and before their last quarter."""
+EVENT_WINDOW_S = (40.0, 100.0)
+"""Default window of time since switching on within which an event that occurs once (a knock, a
+broken fibre) falls, evenly distributed [s]: after the first reset (30 s) and some motion of the
+intact arm, and well within the shortest protocol (150 s)."""
 
 
 @dataclass
-class Bench:
-    """What an effect may change, and the arm that it changes."""
+class Setup:
+    """The parts of a rig that a hidden effect may change, and what it needs to know of the rest."""
 
     effects: Effects
     """Amplitudes."""
@@ -31,6 +32,8 @@ class Bench:
     """Outside loads."""
     rod: Rod
     """The arm's statics."""
+    event_window_s: tuple[float, float] = EVENT_WINDOW_S
+    """Window of time in which events that occur once fall [s]."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,12 @@ class Hidden:
     """Where in the chain it acts: line, material, body or sensor."""
     about: str
     """One line."""
-    switch_on: Callable[[Bench, float, np.random.Generator], None]
-    """Change the bench by a strength, with the arm's own random numbers."""
+    switch_on: Callable[[Setup, float, np.random.Generator], None]
+    """Changes the setup by a strength, with random numbers of the robot's seed."""
 
 
-def _set(bench: Bench, **amplitudes) -> None:
-    bench.effects = bench.effects._replace(**amplitudes)
+def _set(setup: Setup, **amplitudes) -> None:
+    setup.effects = setup.effects._replace(**amplitudes)
 
 
 def _pattern(rng: np.random.Generator, m: int) -> np.ndarray:
@@ -62,83 +65,83 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
     return v / np.linalg.norm(v)
 
 
-def _hysteresis(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, friction=1.0 * strength)
+def _hysteresis(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, friction=1.0 * strength)
 
 
-def _rate_dependence(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, rate=0.026 * strength)
+def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, rate=0.026 * strength)
 
 
-def _line_lag(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, line=np.array([1700.0, 950.0]) / strength)
+def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, line=np.array([1700.0, 950.0]) / strength)
 
 
-def _creep(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, creep=7.5 * strength)
+def _creep(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, creep=7.5 * strength)
 
 
-def _softening(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, softening=0.08 * strength)
+def _softening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, softening=0.08 * strength)
 
 
-def _stiffening(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, stiffening=0.03 * strength)
+def _stiffening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, stiffening=0.03 * strength)
 
 
-def _dead_zone(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, dead_zone=1.2 * strength)
+def _dead_zone(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, dead_zone=1.2 * strength)
 
 
-def _gain_mismatch(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, gain=0.05 * strength * _pattern(rng, len(bench.effects.gain)))
+def _gain_mismatch(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, gain=0.05 * strength * _pattern(rng, len(setup.effects.gain)))
 
 
-def _coupling(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    m = len(bench.effects.gain)
+def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    m = len(setup.effects.gain)
     matrix = 3.0 * strength * rng.uniform(0.6, 1.4, (m, m))
     np.fill_diagonal(matrix, 0.0)
-    _set(bench, coupling=matrix)
+    _set(setup, coupling=matrix)
 
 
-def _payload(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     angle = rng.uniform(0, 2 * np.pi)
-    weight = bench.loads.payload + 0.7e-3 * strength * STANDARD_GRAVITY
+    weight = setup.loads.payload + 0.7e-3 * strength * STANDARD_GRAVITY
     at = np.array([2.0 * np.cos(angle), 2.0 * np.sin(angle), 2.0])
-    bench.loads = bench.loads._replace(payload=weight, payload_at=at)
+    setup.loads = setup.loads._replace(payload=weight, payload_at=at)
 
 
-def _contact(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """A support across the arm's way: touched at 40 % of the body's reach towards it.
 
     At strength 1 it keeps the tip back by 4 mm where the free arm would go deepest into it.
     """
-    m = len(bench.effects.gain)
-    plane = int(rng.integers(2, max(3, len(bench.rod.planes) - 1)))
+    m = len(setup.effects.gain)
+    plane = int(rng.integers(2, max(3, len(setup.rod.planes) - 1)))
     angle = rng.uniform(0, 2 * np.pi)
     normal = np.array([np.cos(angle), np.sin(angle), 0.0])
     singles = REFERENCE_KPA * np.eye(m)
     poses = [np.zeros(m), *singles, *(REFERENCE_KPA - singles)]
-    towards = [-float(_posed(bench, bench.loads, p)[plane] @ normal) for p in poses]
+    towards = [-float(_posed(setup, setup.loads, p)[plane] @ normal) for p in poses]
     deepest = poses[int(np.argmax(towards))]
-    free = _posed(bench, bench.loads, deepest)[-1]
-    support = bench.loads._replace(
-        support=int(bench.rod.planes[plane]),
+    free = _posed(setup, setup.loads, deepest)[-1]
+    support = setup.loads._replace(
+        support=int(setup.rod.planes[plane]),
         support_normal=normal,
         support_gap=-(towards[0] + 0.4 * (max(towards) - towards[0])),
     )
 
     def kept_back(log_stiffness: float) -> float:
         loads = support._replace(support_stiffness=float(np.exp(log_stiffness)))
-        return float(np.linalg.norm(_posed(bench, loads, deepest)[-1] - free)) - 4.0
+        return float(np.linalg.norm(_posed(setup, loads, deepest)[-1] - free)) - 4.0
 
     stiffness = np.exp(brentq(kept_back, np.log(1e-4), np.log(0.5), xtol=1e-3))
-    bench.loads = support._replace(support_stiffness=float(strength * stiffness))
+    setup.loads = support._replace(support_stiffness=float(strength * stiffness))
 
 
-def _posed(bench: Bench, loads: Loads, pressures: np.ndarray) -> np.ndarray:
+def _posed(setup: Setup, loads: Loads, pressures: np.ndarray) -> np.ndarray:
     """Key planes' centres (n, 3) [mm] of the frictionless arm under pressures (m,) [kPa]."""
-    rod, shape = bench.rod, new_shape(bench.rod)
+    rod, shape = setup.rod, new_shape(setup.rod)
     thrusts = np.empty((len(rod.stiffness), len(pressures)))
     chamber_thrusts(rod, np.asarray(pressures, np.float64), thrusts)
     if not balance(rod, loads, 1.0, thrusts, rod.base, shape):
@@ -146,74 +149,74 @@ def _posed(bench: Bench, loads: Loads, pressures: np.ndarray) -> np.ndarray:
     return shape.centres
 
 
-def _misalignment(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _misalignment(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     turn = np.radians(0.8) * strength * _direction(rng)
     shift = 0.4 * strength * _direction(rng)
     warp = 1e-4 * strength * rng.choice([-1.0, 1.0])
-    _set(bench, misalignment=np.concatenate([turn, shift, [warp]]))
+    _set(setup, misalignment=np.concatenate([turn, shift, [warp]]))
 
 
-def _drift(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.radians(1.2) * strength
-    _set(bench, drift=turn * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    _set(setup, drift=turn * np.array([np.cos(angle), np.sin(angle), 0.0]))
 
 
-def _thermal_drift(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, warmth=0.022 * strength)
+def _thermal_drift(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, warmth=0.022 * strength)
 
 
-def _stick_slip(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, stick=np.array([0.5 * strength, 0.04]))
+def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, stick=np.array([0.5 * strength, 0.04]))
 
 
-def _leak(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    leak = np.zeros(len(bench.effects.leak))
+def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    leak = np.zeros(len(setup.effects.leak))
     leak[rng.integers(len(leak))] = 5.0 * strength
-    _set(bench, leak=leak)
+    _set(setup, leak=leak)
 
 
-def _twist(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, twist=0.5 * strength * rng.choice([-1.0, 1.0]))
+def _twist(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, twist=0.5 * strength * rng.choice([-1.0, 1.0]))
 
 
-def _sensor_crosstalk(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    _set(bench, crosstalk=0.03 * strength)
+def _sensor_crosstalk(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    _set(setup, crosstalk=0.03 * strength)
 
 
-def _marker_slip(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _marker_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     marker = rng.integers(3)
-    slip = np.array([len(bench.rod.planes) - 1, marker, 4.0 * strength, np.radians(30.0)])
-    _set(bench, slip=slip)
+    slip = np.array([len(setup.rod.planes) - 1, marker, 4.0 * strength, np.radians(30.0)])
+    _set(setup, slip=slip)
 
 
-def _breathing(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _breathing(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """About 15 breaths a minute."""
     shift = 2.0 * strength * _direction(rng)
     period = rng.uniform(3.5, 4.5)
-    _set(bench, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
+    _set(setup, breath=np.array([*shift, period, rng.uniform(0.0, period)]))
 
 
-def _valve_jam(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _valve_jam(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Every 8 s on average one valve sticks (the clogged valve of Bartys et al. 2006)."""
     gaps = rng.exponential(8.0, 2000)
     lasts = strength * rng.uniform(0.5, 1.5, len(gaps))
     begins = np.cumsum(gaps) + np.concatenate([[0.0], np.cumsum(lasts)[:-1]])
     spells = np.stack([begins, begins + lasts], axis=1)
-    _set(bench, jam=spells, jammed=int(rng.integers(len(bench.effects.gain))))
+    _set(setup, jam=spells, jammed=int(rng.integers(len(setup.effects.gain))))
 
 
-def _knock(bench: Bench, strength: float, rng: np.random.Generator) -> None:
+def _knock(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     angle = rng.uniform(0, 2 * np.pi)
     turn = np.radians(1.2) * strength
-    moment = rng.uniform(*MOMENT_S)
-    _set(bench, knock=np.array([turn * np.cos(angle), turn * np.sin(angle), 0.0, moment]))
+    moment = rng.uniform(*setup.event_window_s)
+    _set(setup, knock=np.array([turn * np.cos(angle), turn * np.sin(angle), 0.0, moment]))
 
 
-def _fibre_break(bench: Bench, strength: float, rng: np.random.Generator) -> None:
-    broken = np.zeros(len(bench.effects.broken))
+def _fibre_break(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    broken = np.zeros(len(setup.effects.broken))
     broken[rng.integers(len(broken))] = 5.0 * strength
-    _set(bench, broken=broken, break_s=float(rng.uniform(*MOMENT_S)))
+    _set(setup, broken=broken, break_s=float(rng.uniform(*setup.event_window_s)))
 
 
 HIDDEN: dict[str, Hidden] = {
@@ -241,7 +244,7 @@ HIDDEN: dict[str, Hidden] = {
     "thermal_drift": Hidden(
         "material", "the wall softens as the room warms; temp_C", _thermal_drift
     ),
-    "stick_slip": Hidden("material", "wall lines that stick and let go at once", _stick_slip),
+    "stick_slip": Hidden("material", "wall fibres that stick and let go at once", _stick_slip),
     "leak": Hidden("line", "a crack in one chamber that opens with pressure", _leak),
     "twist": Hidden("body", "fibres wound unequally: pressure twists the arm", _twist),
     "sensor_crosstalk": Hidden(
@@ -257,8 +260,8 @@ HIDDEN: dict[str, Hidden] = {
 }
 
 
-def switch_on(bench: Bench, names: Iterable[tuple[str, float]], seed: int) -> Bench:
-    """The bench with the named effects, each with its strength (0: off)."""
+def switch_on(setup: Setup, names: Iterable[tuple[str, float]], seed: int) -> Setup:
+    """The setup with the named effects, each with its strength (0: off)."""
     seen: set[str] = set()
     for name, strength in names:
         if name not in HIDDEN:
@@ -270,5 +273,5 @@ def switch_on(bench: Bench, names: Iterable[tuple[str, float]], seed: int) -> Be
         seen.add(name)
         if strength > 0:
             rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-            HIDDEN[name].switch_on(bench, float(strength), rng)
-    return bench
+            HIDDEN[name].switch_on(setup, float(strength), rng)
+    return setup

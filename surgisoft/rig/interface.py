@@ -1,6 +1,7 @@
-"""What a rig is: a bench that takes pressures and gives samples. The virtual one is in virtual.py.
+"""What a rig offers: a bench with one soft arm that takes pressures and gives samples.
 
-A real bench stands in its place by offering the same few methods; `collect` drives either.
+`Rig` has four methods and eight attributes. Any object that has them can be driven by `collect`;
+it needs to inherit from nothing. `SimulatedRig` adds the truth that only a simulation knows.
 """
 
 from dataclasses import dataclass
@@ -13,48 +14,70 @@ from surgisoft.measurement.recordings.recording import ArmInfo
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What the bench measured at one instant."""
+    """What a rig measured at one instant."""
 
     t_s: float
-    """Time since the bench was switched on [s]."""
+    """Time since the rig was switched on [s]."""
     measured: np.ndarray
     """(m,) readings of the pressure sensors [the rig's unit]."""
     commanded: np.ndarray
-    """(m,) pressures that the controllers were told to reach [the rig's unit]."""
+    """(m,) set points of the pressure controllers [the rig's unit]."""
     key_points_mm: np.ndarray
     """(n, 3) centres of the key planes, arm base frame [mm]; NaN where the cameras lost one."""
     temp_C: float | None = None
     """Temperature beside the arm [degrees Celsius], where there is a thermometer."""
 
 
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """State of T samples that only a simulation knows and no sensor measures."""
+
+    centres_mm: np.ndarray
+    """(T, n, 3) centres of the key planes, arm base frame [mm]."""
+    noise_free_mm: np.ndarray
+    """(T, n, 3) what the cameras would measure without noise, arm base frame [mm]."""
+    pressures_kPa: np.ndarray
+    """(T, m) pressures in the chambers [kPa]."""
+
+
 class Rig(Protocol):
-    """A bench with one arm of m chambers and n key planes."""
+    """A bench with one arm of m chambers whose cameras track n key planes."""
 
     chambers: int
-    """m."""
+    """Number m of chambers, or of other actuators."""
     key_planes: int
-    """n."""
+    """Number n of tracked planes, from the base to the tip."""
     unit: str
     """Unit of the actuation, such as kPa."""
     limits: np.ndarray
-    """(m, 2) lowest and highest actuation [unit]."""
+    """(m, 2) lowest and highest actuation that `command` accepts [unit]."""
     period_s: float
     """Time from sample to sample [s]."""
     arm: ArmInfo
-    """The arm's size."""
+    """Length and diameter of the arm, where they are known [mm]."""
     gravity: np.ndarray | None
-    """(3,) unit vector of weight, arm base frame; None where unknown."""
+    """(3,) unit vector of weight, arm base frame; None where it is unknown."""
     payload_g: float | None
     """Known mass attached to the arm [g]; None where none was weighed."""
 
     def reset(self) -> None:
-        """Vent the arm and let it rest, so that it remembers nothing: the start of a run."""
+        """Vent the arm and wait until it has no memory of earlier pressures: the start of a run."""
 
     def command(self, pressures: np.ndarray) -> None:
-        """Tell the controllers the pressures (m,) [unit] to reach from now on."""
+        """Set the pressures (m,) [unit] that the controllers reach for from now on.
+
+        Raises InputError for a wrong shape, for values that are not finite or beyond `limits`.
+        """
 
     def wait(self, seconds: float) -> None:
-        """Let time pass without reading."""
+        """Let time [s] pass without a sample; the last command holds."""
 
     def read(self) -> Sample:
-        """Let one period pass and read a sample."""
+        """Wait for one period, then return what sensors and cameras measure."""
+
+
+class SimulatedRig(Rig, Protocol):
+    """A rig that can also give the true state, as tasks on a rig need it to score errors."""
+
+    def read_beside_truth(self) -> tuple[Sample, Truth]:
+        """Do what `read` does, and return the true state of the same instant (T = 1) with it."""

@@ -1,11 +1,12 @@
-"""The virtual rig: a bench in numbers that stands in where there is none.
+"""The virtual rig: a simulation of the whole bench, sensors and cameras included.
 
-It is the truth that arm models are judged on, so it shares nothing with them: no code, no formulas.
+It is the independent plant on which arm models are evaluated, so it shares nothing with them: no
+code, no formulas.
 """
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from surgisoft.rig import bench
 from surgisoft.rig.arm import (
     STANDARD_GRAVITY,
     ArmDesign,
-    Specimen,
+    Robot,
     fabricate,
     no_equilibrium,
     plain_loads,
@@ -31,8 +32,8 @@ from surgisoft.rig.collect import (
     samples_in,
 )
 from surgisoft.rig.effects import no_effects
-from surgisoft.rig.hidden import Bench, switch_on
-from surgisoft.rig.interface import Sample
+from surgisoft.rig.hidden import EVENT_WINDOW_S, Setup, switch_on
+from surgisoft.rig.interface import Sample, Truth
 from surgisoft.rig.motion_capture import CameraDesign, build_cameras
 from surgisoft.rig.pneumatics import PumpDesign, build_pumps
 
@@ -41,28 +42,65 @@ MOUNT = (0.42, 0.0, math.sqrt(1.0 - 0.42**2))
 REST_S = 30.0
 """Time that a reset takes: venting and resting [s]."""
 HEAVIEST_G = 20.0
-"""Largest payload that is taken for meant [g]; a hanging arm carries it, an upright one buckles."""
+"""Largest payload that is accepted [g]; a hanging arm carries it, an upright one buckles."""
 CHUNK = 64
-"""Points or frames times ten that are computed between two reports of progress."""
+"""Steady-state points between two reports of progress; ten times as many frames of motion."""
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What no bench can measure, sample by sample beside a recording; for studies only."""
+@dataclass(frozen=True)
+class VirtualRigConfig:
+    """Which robot is on the virtual rig, how it is mounted, and what the rig hides."""
 
-    centres_mm: np.ndarray
-    """(T, n, 3) centres of the key planes, arm base frame [mm]."""
-    noise_free_mm: np.ndarray
-    """(T, n, 3) what the cameras would measure without noise, arm base frame [mm]."""
-    pressures_kPa: np.ndarray
-    """(T, m) pressures in the chambers [kPa]."""
+    seed: int = 0
+    """Seed of the robot: everything in which two fabricated arms differ."""
+    gravity: tuple[float, float, float] = MOUNT
+    """Direction of weight, arm base frame before the roll; any length but zero."""
+    roll_deg: float = 0.0
+    """Turn of the base about its z axis [deg]."""
+    payload_g: float = 0.0
+    """Known mass at the tip [g]."""
+    noise: float = 1.0
+    """Factor on all sensor and camera noise."""
+    take: int = 0
+    """Number of the trial: another one has other noise on the same robot."""
+    hidden: tuple[tuple[str, float], ...] = ()
+    """Hidden effects by name (see hidden.py) and strength."""
+    event_window_s: tuple[float, float] = EVENT_WINDOW_S
+    """Window of time since switching on in which hidden events that occur once fall [s]."""
+    design: ArmDesign = field(default_factory=ArmDesign)
+    """Design of the arm."""
+    pumps: PumpDesign = field(default_factory=PumpDesign)
+    """Design of the pneumatics."""
+    cameras: CameraDesign = field(default_factory=CameraDesign)
+    """Design of the motion capture."""
+
+    def __post_init__(self):
+        hidden = tuple((name, strength) for name, strength in self.hidden)
+        object.__setattr__(self, "hidden", hidden)
+        direction = np.asarray(self.gravity, np.float64)
+        if self.seed < 0:
+            raise InputError(f"seed is {self.seed}, expected a whole number >= 0")
+        if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+            raise InputError(
+                f"gravity is {direction.tolist()}, expected a direction of three numbers"
+            )
+        if not 0.0 <= self.payload_g <= HEAVIEST_G:
+            raise InputError(f"payload is {self.payload_g} g, expected 0 to {HEAVIEST_G:g} g")
+        if not (np.isfinite(self.noise) and self.noise >= 0.0):
+            raise InputError(f"noise scale is {self.noise}, expected a number >= 0")
+        first, last = self.event_window_s
+        if not 0.0 <= first <= last < math.inf:
+            raise InputError(
+                f"event_window_s is {self.event_window_s}, expected two times [s], the first "
+                "not after the second"
+            )
 
 
 class Part(NamedTuple):
     """Consecutive samples of a recording."""
 
     t_s: np.ndarray
-    """(P,) times since the bench was switched on [s]."""
+    """(P,) times since the rig was switched on [s]."""
     commanded: np.ndarray
     """(P, m) [kPa]."""
     frames: bench.Frames
@@ -70,49 +108,35 @@ class Part(NamedTuple):
 
 
 class VirtualRig:
-    """A simulated bench with one arm; satisfies `Rig`.
-
-    seed: which specimen was cast. gravity: (3,) direction of weight in the base frame; roll_deg:
-    turns the base about its axis. payload_g: known mass at the tip. noise: factor on all sensor
-    and camera noise. take: another number gives other noise on the same arm. hidden: names and
-    strengths of hidden effects, see hidden.py.
-    """
+    """A simulated rig with one arm; satisfies `SimulatedRig`."""
 
     unit = "kPa"
 
-    def __init__(
-        self,
-        seed: int = 0,
-        *,
-        gravity=MOUNT,
-        roll_deg: float = 0.0,
-        payload_g: float = 0.0,
-        noise: float = 1.0,
-        take: int = 0,
-        hidden: Iterable[tuple[str, float]] = (),
-        design: ArmDesign | None = None,
-        pumps: PumpDesign | None = None,
-        cameras: CameraDesign | None = None,
-    ) -> None:
-        design = design or ArmDesign()
-        check_options(seed, gravity, payload_g, noise)
-        specimen = _cast(design, seed)
+    def __init__(self, config: VirtualRigConfig | int = 0, **fields) -> None:
+        """config: the configuration, or the robot's seed; fields: others of `VirtualRigConfig`."""
+        plain = config if isinstance(config, VirtualRigConfig) else VirtualRigConfig(config)
+        config = self.config = replace(plain, **fields)
+        design, seed, noise = config.design, config.seed, config.noise
+        robot = _fabricated(design, seed)
         self.chambers, self.key_planes = design.chambers, design.key_planes
         self.limits = np.tile([design.low_kPa, design.high_kPa], (design.chambers, 1))
         self.arm = ArmInfo(design.length_mm, design.diameter_mm)
-        self.gravity = _rolled(gravity, roll_deg)
-        self.payload_g = float(payload_g) if payload_g else None
-        loads = plain_loads(self.gravity)._replace(payload=payload_g * 1e-3 * STANDARD_GRAVITY)
-        rod = specimen.rod
+        self.gravity = _rolled(config.gravity, config.roll_deg)
+        self.payload_g = float(config.payload_g) if config.payload_g else None
+        weight_N = config.payload_g * 1e-3 * STANDARD_GRAVITY
+        loads = plain_loads(self.gravity)._replace(payload=weight_N)
+        rod = robot.rod
         stiffness = rod.wall.modulus * rod.wall.area / design.friction_lines
-        secret = switch_on(Bench(no_effects(design.chambers, stiffness), loads, rod), hidden, seed)
-        volumes = specimen.rod.wall.areas * design.soft_mm
+        effects = no_effects(design.chambers, stiffness)
+        setup = Setup(effects, loads, rod, config.event_window_s)
+        setup = switch_on(setup, config.hidden, seed)
+        volumes = rod.wall.areas * design.soft_mm
         self._plant = bench.Plant(
-            specimen=specimen,
-            loads=secret.loads,
-            pumps=build_pumps(pumps or PumpDesign(), volumes, noise, seed),
+            robot=robot,
+            loads=setup.loads,
+            pumps=build_pumps(config.pumps, volumes, noise, seed),
             cameras=build_cameras(
-                cameras or CameraDesign(),
+                config.cameras,
                 design.diameter_mm,
                 design.chambers,
                 design.key_planes,
@@ -120,26 +144,31 @@ class VirtualRig:
                 noise,
                 seed,
             ),
-            effects=secret.effects,
+            effects=setup.effects,
         )
-        self._thermometer = secret.effects.warmth != 0.0
+        self._thermometer = setup.effects.warmth != 0.0
         self.period_s = self._plant.cameras.period
-        self._rng = np.random.default_rng([seed, take, 0x5EED])
+        self._rng = np.random.default_rng([seed, config.take, 0x5EED])
         self._state = bench.new_state(self._plant)
         self._steps = bench.steps_in(self._plant, self.period_s)
 
     @property
     def time_s(self) -> float:
-        """Time since the bench was switched on [s]."""
+        """Time since the rig was switched on [s]."""
         return float(self._state.steps[0] * self._plant.pumps.step)
 
+    @property
+    def plane_frames(self) -> np.ndarray:
+        """(n, 3, 3) true axes of the key planes at the last sample, as columns, arm base frame."""
+        return self._state.shape.frames.copy()
+
     def reset(self) -> None:
-        """Vent the arm and let it rest until it has forgotten: the start of a run."""
+        """Vent the arm and let it rest until it has no memory of before: the start of a run."""
         bench.rest(self._plant, self._state)
         self._state.steps[0] += bench.steps_in(self._plant, REST_S)
 
     def command(self, pressures: np.ndarray) -> None:
-        """Tell the controllers the pressures (m,) [kPa gauge] to reach from now on."""
+        """Set the pressures (m,) [kPa gauge] that the controllers reach for from now on."""
         pressures = np.asarray(pressures, np.float64)
         if pressures.shape != (self.chambers,) or not np.isfinite(pressures).all():
             raise InputError(
@@ -156,15 +185,15 @@ class VirtualRig:
 
     def wait(self, seconds: float) -> None:
         """Let time [s] pass without reading."""
-        self._play(self._state.target[None].copy(), bench.steps_in(self._plant, seconds), 0)
+        self._run(self._state.target[None].copy(), bench.steps_in(self._plant, seconds), 0)
 
     def read(self) -> Sample:
         """Let one period pass and read sensors and cameras."""
         return self.read_beside_truth()[0]
 
     def read_beside_truth(self) -> tuple[Sample, Truth]:
-        """`read`, and what no bench can measure at that instant (T = 1); for studies only."""
-        frame = self._play(self._state.target[None].copy(), 0, 1)
+        """Do what `read` does, and return the true state of that instant (T = 1) with it."""
+        frame = self._run(self._state.target[None].copy(), 0, 1)
         sample = Sample(
             t_s=self.time_s,
             measured=frame.measured[0],
@@ -177,7 +206,7 @@ class VirtualRig:
     def record(
         self, protocol: Protocol, progress: Callable[[int, int], None] | None = None
     ) -> tuple[Recording, Truth]:
-        """The recording that `collect` makes, sample by sample the same, at full speed.
+        """Take a recording in compiled code, sample by sample equal to what `collect` takes.
 
         progress: called with the number of samples done and to do.
         """
@@ -211,13 +240,15 @@ class VirtualRig:
         )
         return recording, truth
 
-    def _play(self, commands: np.ndarray, pause: int, count: int) -> bench.Frames:
-        """Frames (P * count) of `count` samples after each command (P, m) and pause."""
+    def _run(self, commands: np.ndarray, pause: int, count: int) -> bench.Frames:
+        """Frames (P * count): `count` samples after each command (P, m) and a pause."""
         plant = self._plant
         need = bench.tape_of_pause(plant, pause) + count * bench.tape_of_sample(plant)
         tape = self._rng.standard_normal(len(commands) * need)
         frames = bench.new_frames(plant, len(commands) * count)
-        found = bench.play(plant, self._state, commands, pause, self._steps, count, tape, frames)
+        found = bench.run_commands(
+            plant, self._state, commands, pause, self._steps, count, tape, frames
+        )
         if not found:
             raise no_equilibrium()
         return frames
@@ -229,29 +260,16 @@ class VirtualRig:
         count = samples_in(protocol.average_s, self.period_s) if settled else 1
         first = self._state.steps[0] + (pause + count * self._steps) * np.arange(len(commands))
         steps = first[:, None] + pause + self._steps * np.arange(1, count + 1)
-        frames = self._play(commands, pause, count)
+        frames = self._run(commands, pause, count)
         shaped = (a.reshape(len(commands), count, *a.shape[1:]) for a in frames)
         mean = bench.Frames(*(average(a) for a in shaped))
         return Part(average(steps * self._plant.pumps.step), commands, mean)
 
 
 @lru_cache(maxsize=64)
-def _cast(design: ArmDesign, seed: int) -> Specimen:
-    """The specimen of a seed, calibrated in the default mount; nothing changes it later."""
+def _fabricated(design: ArmDesign, seed: int) -> Robot:
+    """The robot of a seed, calibrated in the default mount; nothing changes it later."""
     return fabricate(design, seed, np.array(MOUNT))
-
-
-def check_options(seed: int, gravity, payload_g: float, noise: float) -> None:
-    """One line for an option that makes no sense."""
-    direction = np.asarray(gravity, np.float64)
-    if seed < 0:
-        raise InputError(f"seed is {seed}, expected a whole number >= 0")
-    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
-        raise InputError(f"gravity is {direction.tolist()}, expected a direction of three numbers")
-    if not 0.0 <= payload_g <= HEAVIEST_G:
-        raise InputError(f"payload is {payload_g} g, expected 0 to {HEAVIEST_G:g} g")
-    if not (np.isfinite(noise) and noise >= 0.0):
-        raise InputError(f"noise scale is {noise}, expected a number >= 0")
 
 
 def _rolled(gravity, roll_deg: float) -> np.ndarray:

@@ -1,8 +1,6 @@
 """Make a scene from mesh files: read, repair, place the lesion, find mounts, write the folder."""
 
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import new_folder
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
@@ -375,19 +374,7 @@ def check_target(folder: Path, force: bool) -> None:
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:
     """Write meshes and scene.toml: first into a folder beside, then moved there as a whole."""
     check_target(folder, force)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with new_folder(folder) as fresh:
         for body, entry in zip(scene.bodies, scene.spec.bodies, strict=True):
             write_ply(body.mesh, fresh / entry.mesh)
         save_spec(scene.spec, fresh / FILE)
-        os.chmod(fresh, 0o755)
-        if folder.exists():
-            for item in fresh.iterdir():
-                os.replace(item, folder / item.name)
-            fresh.rmdir()
-        else:
-            os.replace(fresh, folder)
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise

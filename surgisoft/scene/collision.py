@@ -203,6 +203,10 @@ class Referee:
             for body in bodies
         ]
 
+    def __reduce__(self):
+        """Pickle the bodies: FCL's objects cannot be pickled, so a copy builds its own."""
+        return type(self), (self.bodies, self.horizon_mm)
+
     def inside(self, body: int, points_mm: np.ndarray) -> np.ndarray:
         """(N,) bool: world points (N, 3) mm inside body number `body`; never in an open mesh."""
         mesh = self.bodies[body].mesh

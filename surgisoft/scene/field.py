@@ -12,7 +12,6 @@ import contextlib
 import hashlib
 import math
 import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.scene.bvh import TriangleTree, build_tree, point_surface, triangle
 from surgisoft.scene.kernels import point_triangle
 from surgisoft.scene.mesh import Mesh
@@ -252,13 +252,5 @@ def _read(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
 
 def _write(path: Path, values: np.ndarray) -> None:
     """Store values behind their sha256, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     content = values.astype("<f4").tobytes()
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        try:
-            file.write(hashlib.sha256(content).digest() + content)
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+    write_atomically(path, hashlib.sha256(content).digest() + content)

@@ -1,7 +1,7 @@
 """Rigid poses and rotations, for numpy arrays and torch tensors alike.
 
 A pose is a (..., 4, 4) matrix that maps points of its own frame into its parent's frame:
-`p_parent = pose @ p_own`. World frame: z up, millimetres. Quaternions are (w, x, y, z), unit norm.
+`p_parent = pose @ p_own`. World frame: z up, millimetres.
 Every function returns the kind it was given (numpy stays numpy, torch keeps dtype and device).
 """
 
@@ -138,67 +138,18 @@ def look_at(eye_mm, target_mm, up=(0.0, 0.0, 1.0)):
 
 
 def rotation_from_axis_angle(axis, angle_rad):
-    """Rotation (..., 3, 3) by angle_rad (...) about axis (..., 3) (Rodrigues 1840)."""
-    axis, angle_rad = _as_arrays(axis, angle_rad)
-    half = angle_rad / 2.0
-    lib = _library(axis)
-    vector = normalise(axis) * lib.sin(half)[..., None]
-    scalar = lib.cos(half)[..., None] * lib.ones_like(vector[..., :1])
-    return rotation_from_quaternion(lib.concatenate((scalar, vector), -1))
+    """Rotation (..., 3, 3) by angle_rad (...) about axis (..., 3) (Rodrigues 1840).
 
-
-def rotation_from_quaternion(quaternion):
-    """Rotation (..., 3, 3) of quaternions (..., 4) as (w, x, y, z); they are normalised first."""
-    (quaternion,) = _as_arrays(quaternion)
-    lib = _library(quaternion)
-    q = _unit_quaternion(quaternion)
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    rows = (
-        lib.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
-        lib.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
-        lib.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
-    )
-    return lib.stack(rows, -2)
-
-
-def _unit_quaternion(quaternion):
-    """Quaternions (..., 4) scaled to unit norm."""
-    return quaternion / _library(quaternion).sqrt((quaternion * quaternion).sum(-1))[..., None]
-
-
-def quaternion_from_rotation(rotation):
-    """Quaternions (..., 4) as (w, x, y, z), w >= 0, of rotations (..., 3, 3).
-
-    Each of the four columns of 4 q q^T is a multiple of q; the longest is taken (Shepperd 1978).
+    For batches in torch; `scipy.spatial.transform` does the same for numpy alone.
     """
-    (r,) = _as_arrays(rotation)
-    lib = _library(r)
-    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    a, b, c = (
-        r[..., 2, 1] - r[..., 1, 2],
-        r[..., 0, 2] - r[..., 2, 0],
-        r[..., 1, 0] - r[..., 0, 1],
-    )
-    xy, xz, yz = (
-        r[..., 0, 1] + r[..., 1, 0],
-        r[..., 0, 2] + r[..., 2, 0],
-        r[..., 1, 2] + r[..., 2, 1],
-    )
-    diagonal = [1 + trace] + [1 + 2 * r[..., i, i] - trace for i in range(3)]
-    rows = (
-        lib.stack((diagonal[0], a, b, c), -1),
-        lib.stack((a, diagonal[1], xy, xz), -1),
-        lib.stack((b, xy, diagonal[2], yz), -1),
-        lib.stack((c, xz, yz, diagonal[3]), -1),
-    )
-    candidates = lib.stack(rows, -2)
-    best = lib.stack(diagonal, -1).argmax(-1)[..., None, None]
-    if lib is torch:
-        row = torch.take_along_dim(candidates, best.expand(*candidates.shape[:-2], 1, 4), -2)
-    else:
-        row = np.take_along_axis(candidates, best, -2)
-    q = _unit_quaternion(row[..., 0, :])
-    return lib.where(q[..., :1] < 0, -q, q)
+    axis, angle_rad = _as_arrays(axis, angle_rad)
+    lib = _library(axis)
+    u = normalise(axis)
+    c, s = lib.cos(angle_rad)[..., None, None], lib.sin(angle_rad)[..., None, None]
+    rows = lib.zeros_like(u[..., None] * u[..., None, :])
+    rows[..., 0, 0] = rows[..., 1, 1] = rows[..., 2, 2] = 1.0
+    turned = lib.swapaxes(cross(u[..., None, :], rows), -1, -2)
+    return c * rows + s * turned + (1.0 - c) * u[..., None] * u[..., None, :]
 
 
 def angle_between(a, b):

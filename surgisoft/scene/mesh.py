@@ -68,12 +68,6 @@ class Mesh:
         return _frozen(frames.normalise(self._area_vectors))
 
     @cached_property
-    def vertex_areas_mm2(self) -> np.ndarray:
-        """(V,) float64, mm^2: a third of each face's area to each of its corners."""
-        share = np.repeat(self.face_areas_mm2 / 3.0, 3)
-        return _frozen(np.bincount(self.faces.ravel(), share, minlength=len(self.vertices_mm)))
-
-    @cached_property
     def corner_angles_rad(self) -> np.ndarray:
         """(F, 3) float64, rad: the face's angle at each of its corners."""
         corners = self.triangles_mm
@@ -89,22 +83,10 @@ class Mesh:
         np.add.at(total, self.faces.ravel(), weighted.reshape(-1, 3))
         return _frozen(frames.normalise(total))
 
-    @cached_property
-    def edge_normals(self) -> np.ndarray:
-        """(F, 3, 3) float64 unit normals of edges 01, 12, 20: mean of the faces beside each."""
-        edges, inverse = np.unique(self._undirected_edges, axis=0, return_inverse=True)
-        total = np.zeros((len(edges), 3))
-        np.add.at(total, inverse.ravel(), np.repeat(self.face_normals, 3, axis=0))
-        return _frozen(frames.normalise(total)[inverse.ravel()].reshape(-1, 3, 3))
-
     @property
     def _directed_edges(self) -> np.ndarray:
         """(3 F, 2) edges 01, 12, 20 of each face in turn."""
         return np.stack((self.faces, np.roll(self.faces, -1, axis=1)), axis=-1).reshape(-1, 2)
-
-    @property
-    def _undirected_edges(self) -> np.ndarray:
-        return np.sort(self._directed_edges, axis=1)
 
     @cached_property
     def bounds_mm(self) -> np.ndarray:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.scene.index import used_indices
 from surgisoft.scene.mesh import Mesh
 

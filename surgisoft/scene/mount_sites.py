@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
@@ -161,7 +162,8 @@ def _best_first(judge, poses, ring: Ring, enough, report: Report, note: str) -> 
         spread = NEAR_RAD / (number + 1)
         for i in range(TRIES):
             pose = sites[i % min(8, len(sites))].arm.pose.copy()
-            turn = frames.rotation_from_axis_angle(rng.normal(size=3), spread * rng.normal())
+            axis = frames.normalise(rng.normal(size=3))
+            turn = Rotation.from_rotvec(spread * rng.normal() * axis).as_matrix()
             away = frames.normalise(pose[:3, 3] - ring.centre_mm)
             pose[:3, :3] = turn @ pose[:3, :3]
             pose[:3, 3] = ring.centre_mm + turn @ (pose[:3, 3] - ring.centre_mm)

@@ -51,8 +51,6 @@ class Pair:
     """The laser's."""
     look: LookSite
     """The endoscope's."""
-    apart_mm: float
-    """Least distance between the two arms' skins at work (mm)."""
     view: float
     """Least fraction of the ring in view while the laser goes round."""
     score: float
@@ -132,7 +130,7 @@ def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
                 continue
             score = laser.score + look.score + min(apart, COMFORT_MM) / COMFORT_MM
             score += 3.0 * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
-            pairs.append(Pair(laser, look, apart, float(look.visible.mean()), score))
+            pairs.append(Pair(laser, look, float(look.visible.mean()), score))
     pairs.sort(key=lambda pair: -pair.score)
     seen_pairs = []
     for pair in pairs:

@@ -89,6 +89,11 @@ class EmbreeSurface:
         self._middle = mesh.bounds_mm.mean(axis=0)
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, (mesh.vertices_mm - self._middle).astype(np.float32), mesh.faces)
+        self._mesh = mesh
+
+    def __reduce__(self):
+        """Pickle the mesh: Embree's scene cannot be pickled, so a copy builds its own."""
+        return type(self), (self._mesh,)
 
     def first_hit(self, origins_mm, directions, range_mm) -> tuple[np.ndarray, np.ndarray]:
         """Distances (N,) mm and faces (N,) of unit rays (N, 3) float64; the range and -1 to miss.

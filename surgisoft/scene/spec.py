@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
 from surgisoft.errors import InputError
@@ -83,8 +84,8 @@ class BodySpec:
 
     def pose(self) -> np.ndarray:
         """Mesh frame to world frame, (4, 4) homogeneous, mm."""
-        turns = frames.rotation_from_axis_angle(np.eye(3), np.radians(self.rotation_deg))
-        return frames.pose_from(turns[2] @ turns[1] @ turns[0], self.position_mm)
+        turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
+        return frames.pose_from(turn.as_matrix(), self.position_mm)
 
 
 @dataclass(frozen=True)

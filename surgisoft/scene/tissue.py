@@ -19,26 +19,6 @@ WATER_VAPORISATION_J_PER_G = 2257.0
 """Latent heat of water at 100 degrees C (CRC Handbook of Chemistry and Physics)."""
 BODY_C = 37.0
 """Temperature of the tissue before (degrees C)."""
-WATER_ABSORPTION_PER_MM = {
-    1940.0: 12.4,  # 4 pi k / lambda with k = 1.909e-3 at 1941 nm, Segelstein 1981; Tm fibre
-    2010.0: 6.19,  # k = 9.904e-4 at 2009 nm, Segelstein 1981; Tm:YAG
-    2120.0: 2.48,  # k = 4.176e-4 at 2118 nm, Segelstein 1981; Ho:YAG
-    2940.0: 1200.0,  # k = 0.2804 at 2938 nm, Segelstein 1981; Er:YAG
-    10600.0: 84.1,  # k = 0.07092 at 10593 nm, Segelstein 1981; CO2
-}
-"""Absorption of liquid water at the lines of surgical lasers, nm: 1/mm."""
-
-
-def tissue_absorption_per_mm(wavelength_nm: float, water: float = LIVER_WATER) -> float:
-    """Absorption (1/mm) of soft tissue in the infrared: its water's (Vogel & Venugopalan 2003)."""
-    line = min(WATER_ABSORPTION_PER_MM, key=lambda known: abs(known - wavelength_nm))
-    if abs(line - wavelength_nm) > 0.01 * line:
-        known = ", ".join(f"{nm:g}" for nm in WATER_ABSORPTION_PER_MM)
-        raise InputError(
-            f"no absorption is kept for {wavelength_nm:g} nm: known lines are {known} nm; "
-            "give the absorption itself"
-        )
-    return water * WATER_ABSORPTION_PER_MM[line]
 
 
 def vaporisation_j_per_mm3() -> float:

@@ -2,8 +2,7 @@
 
 import json
 import os
-import shutil
-import tempfile
+from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -13,8 +12,9 @@ from safetensors.torch import load_file, save_file
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.effects import make_effect, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
 from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
 from surgisoft.surrogate.known_error import KnownError
@@ -70,8 +70,10 @@ def save_model(
 ) -> None:
     """Write the model whole or not at all.
 
-    `report` (JSON-able) and `known`, where the model is known to be off, are kept beside it.
+    `report` (JSON-able) and the training residuals are kept beside it: `known`, or without that
+    those of the model itself.
     """
+    known = model.training_residuals if known is None else known
     folder = claim_folder(folder, force)
     config = {
         "format": FORMAT,
@@ -82,9 +84,7 @@ def save_model(
         "effect_files": files_of(model.effects),
         "validation": model.validation,
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         save_file(weights, fresh / "weights.safetensors")
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
@@ -92,21 +92,6 @@ def save_model(
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
         if known is not None:
             known.save(fresh)
-        fresh.chmod(0o755)
-        if folder.exists():
-            for kept in folder.iterdir():
-                if kept.name not in OWN_FILES:
-                    copy = shutil.copytree if kept.is_dir() else shutil.copy2
-                    copy(kept, fresh / kept.name)
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-            os.replace(folder, old / "old")
-            os.replace(fresh, folder)
-            shutil.rmtree(old)
-        else:
-            os.replace(fresh, folder)
-    except BaseException:
-        shutil.rmtree(fresh, ignore_errors=True)
-        raise
 
 
 def _place(folder: str | Path) -> Path:
@@ -115,11 +100,22 @@ def _place(folder: str | Path) -> Path:
     return DEFAULT_FOLDER if str(folder) == DEFAULT and not folder.exists() else folder
 
 
-def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmModel:
+def load_model(
+    folder: str | Path | ArmModel,
+    device: str | torch.device = "cpu",
+    effect_files: Iterable[str | Path] = (),
+) -> ArmModel:
     """The model in a folder, ready to evaluate; bit-equal to what was saved.
 
-    `default`, where there is no such folder, is the arm that comes with the package.
+    `default`, where there is no such folder, is the arm that comes with the package. A model that
+    is open already is returned as it is.
+
+    effect_files: files of user-defined effects that the model may hold. They are run, so name only
+    files that you trust.
     """
+    register_effect_files(effect_files)
+    if isinstance(folder, ArmModel):
+        return folder.to(device)
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
@@ -165,11 +161,12 @@ def load_model(folder: str | Path, device: str | torch.device = "cpu") -> ArmMod
         raise InputError(
             f"{folder}: damaged model ({type(error).__name__}: {str(error)[:120]}); fit it again"
         ) from error
+    model.training_residuals = load_known_error(folder)
     return model.to(device).eval().requires_grad_(False)
 
 
 def load_known_error(folder: str | Path) -> KnownError | None:
-    """Where the model in a folder is known to be off; None where that was not kept."""
+    """The training residuals in a model's folder; None where they were not kept."""
     try:
         return KnownError.load(_place(folder))
     except Exception as error:

@@ -296,6 +296,7 @@ def fit(
             result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
     result.known = KnownError.of(result.model, [train] if valid is None else [train, valid])
+    result.model.training_residuals = result.known
     result.seconds = time.perf_counter() - start
     return result
 

@@ -1,6 +1,7 @@
 """The arm model: line effects -> material effects -> network -> body effects -> sensor effects."""
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,9 @@ from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+
+if TYPE_CHECKING:
+    from surgisoft.surrogate.known_error import KnownError
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
@@ -38,6 +42,9 @@ class ArmModel(nn.Module):
 
     Both are built from the same `advance`, `scan` and `apply` of each part and agree.
     """
+
+    training_residuals: "KnownError | None" = None
+    """Residuals of the model on rows of its own fit; None where they are not known."""
 
     def __init__(
         self,

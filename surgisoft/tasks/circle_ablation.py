@@ -1,10 +1,12 @@
-"""Two arms cut around a lesion: the endoscope looks, then the laser goes round (Chen et al. 2025).
+"""Two arms cut a ring around a lesion: one carries the endoscope, one the laser (Chen et al. 2025).
 
-The ring is cut while the endoscope sees enough of it; success is judged on the dose map.
+The beam is on only while the endoscope sees enough of the ring. The dose map decides about success.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,138 +14,271 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.inverse_kinematics import Aim, body_part
-from surgisoft.tasks.trajectories import along, fresh_cut, further
+from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks.observations import (
+    TIME,
+    Block,
+    ObservationBlocks,
+    body_blocks,
+    joined,
+    numbered,
+)
+from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut, point_on_closed
+from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 
-FAR_MM = 10.0
-"""Scale of the reward terms that reach far, mm."""
+BEAM_ERROR = Block(
+    "beam_error",
+    "perpendicular offset of the target from the measured beam",
+    "mm",
+    "asinh(x / 1 mm)",
+)
+RING_PLACE = Block("ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)")
+RING_DIRECTION = Block("ring_direction", "direction of travel along the ring, +1 or -1", "-", "x")
+VIEW_ERROR = Block(
+    "view_error",
+    "perpendicular offset of the lesion's centre from the measured axis of the camera",
+    "mm",
+    "asinh(x / 1 mm)",
+)
+VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x")
+FIRED = Block("fired", "1 if the beam was on in the last step, else 0", "-", "x")
+APART = Block("apart", "measured tip of the laser arm minus that of the endoscope", "mm", "x / 50")
+
+
+@dataclass(frozen=True)
+class LaserWeights:
+    """Weights of the laser's reward terms; e is the distance of the beam from its target, mm.
+
+    exp(-e / scale) is flat tens of mm away, where an episode begins; `far` is not.
+    """
+
+    far: float = 1.0
+    """1 / (1 + e / far_mm)."""
+    aim: float = 1.0
+    """exp(-e / 1 mm)."""
+    fine: float = 1.0
+    """exp(-e / fine_mm)."""
+    cut: float = 1.0
+    """1 while the beam is on, else 0."""
+    contact: float = -1.0
+    """1 while the clearance of any arm is below the scene's limit, else 0."""
+
+
+@dataclass(frozen=True)
+class EndoscopeWeights:
+    """Weights of the endoscope's reward terms; e is the camera axis' distance from the ring's
+    centre, mm."""
+
+    look: float = 1.0
+    """1 / (1 + e / far_mm)."""
+    view: float = 1.0
+    """Share of the ring that the endoscope sees."""
+    cut: float = 1.0
+    """1 while the beam is on, else 0."""
+    contact: float = -1.0
+    """1 while the clearance of any arm is below the scene's limit, else 0."""
+
+
+@dataclass(frozen=True)
+class CircleAblationWeights:
+    """Weights of the reward terms of both agents."""
+
+    laser: LaserWeights = field(default_factory=LaserWeights)
+    """The laser's."""
+    endoscope: EndoscopeWeights = field(default_factory=EndoscopeWeights)
+    """The endoscope's."""
 
 
 @dataclass(frozen=True)
 class CircleAblationConfig:
-    """What is cut, how fast, and what it is worth; times and limits are the scene's own."""
+    """The scene, the speed of the cut, the observation and the reward.
+
+    Time and safety limits come from the scene's file.
+    """
 
     scene: str | Path = PHANTOM
     """Folder of the scene."""
     arm: str | Path | None = None
-    """Arm model of both arms, `default` or a model's folder; None: those that the scene names."""
+    """Arm model of both arms: `default`, or a folder; None: the models that the scene names."""
     cut_s: float = 45.0
     """Time for once around with the beam on, s."""
     fire_mm: float = 0.5
-    """The beam is on while its axis passes the target within this, mm."""
+    """Distance of the beam from its target within which the beam is switched on, mm."""
     fine_mm: float = 0.1
-    """Scale of the laser's second reward term, mm."""
+    """Scale of the reward term `fine`, mm."""
+    far_mm: float = 10.0
+    """Scale of the reward terms `far` and `look`, mm."""
+    weights: CircleAblationWeights = field(default_factory=CircleAblationWeights)
+    """Weights of the reward terms."""
     preview: int = 2
-    """Coming targets that the laser arm knows, one a step."""
+    """Future targets in the laser's observation, one per step (a count)."""
     world: WorldConfig = field(default_factory=WorldConfig)
-    """The world and its randomisation."""
+    """The simulator and its domain randomization."""
 
     def __post_init__(self):
-        for name in ("cut_s", "fire_mm", "fine_mm", "preview"):
+        for name in ("cut_s", "fire_mm", "fine_mm", "far_mm", "preview"):
             if not getattr(self, name) > 0:
                 raise InputError(f"circle_ablation: {name} is {getattr(self, name)}, expected > 0")
+        check_weights("circle_ablation: laser", self.weights.laser)
+        check_weights("circle_ablation: endoscope", self.weights.endoscope)
 
 
 class CircleAblation:
-    """Agents `laser` and `endoscope` of a scene."""
+    """The two arms of a scene: agents `laser` and `endoscope`."""
 
     name, agents = "circle_ablation", ("laser", "endoscope")
 
-    def __init__(self, config: CircleAblationConfig | None = None, device="cpu"):
+    def __init__(
+        self, config: CircleAblationConfig | None = None, device: str | torch.device = "cpu"
+    ):
         self.config = config or CircleAblationConfig()
         self.world = scene_world(self.config.scene, self.config.world, device, arm=self.config.arm)
-        self.surroundings, dt_s = self.world.surroundings, self.world.config.dt_s
-        self.spec = self.surroundings.spec
-        self.steps = round(self.spec.limits.time_s / dt_s)
-        self.round = round(self.config.cut_s / dt_s)
-        self.aims = {name: Aim(arm, dt_s) for name, arm in self.world.arms.items()}
-        self.goal = fresh_cut
+        self.scene, self.dt_s = self.world.scene, self.world.config.dt_s
+        self.spec = self.scene.spec
+        self.steps = round(self.spec.limits.time_s / self.dt_s)
+        self.round = round(self.config.cut_s / self.dt_s)
+        weights = self.config.weights
+        self.weights = {"laser": weights.laser, "endoscope": weights.endoscope}
 
-    def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
-        """(B, 3) mm: where the beam should meet the ring, `ahead` steps further on."""
+    @property
+    def pointing(self) -> dict[str, Pointing]:
+        """Inverse kinematics of each arm's axis, by the arm's name."""
+        return {name: Pointing(arm, self.dt_s) for name, arm in self.world.arms.items()}
+
+    def goal(self, stream: Stream) -> tuple[Stream, RingCut]:
+        return draw_cut(stream)
+
+    def target_mm(self, state: TaskState[RingCut], ahead: int = 0) -> Tensor:
+        """(B, 3) mm: the reference point on the ring `ahead` steps further on."""
         share = state.goal.share(self.round, ahead)
-        return along(self.surroundings.paths_mm, state.world.scenery.lesion, share)
+        return point_on_closed(self.scene.paths_mm, state.world.scene.lesion, share)
 
-    def centre_mm(self, state: TaskState) -> Tensor:
-        """(B, 3) mm: the middle of the lesion."""
-        return self.surroundings.centres_mm[state.world.scenery.lesion]
+    def centre_mm(self, state: TaskState[RingCut]) -> Tensor:
+        """(B, 3) mm: the lesion's centre."""
+        return self.scene.centres_mm[state.world.scene.lesion]
 
-    def beam_error_mm(self, state: TaskState) -> Tensor:
-        """(B,) mm: how far the beam's axis passes from its target."""
+    def beam_error_mm(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) mm: perpendicular distance of the beam's axis from its target."""
         laser = state.world.arms["laser"]
-        return self.aims["laser"].miss(laser.points_mm, self.target_mm(state)).norm(dim=1)
+        offset = self.pointing["laser"].offset_mm(laser.points_mm, self.target_mm(state))
+        return offset.norm(dim=1)
 
-    def fires(self, state: TaskState) -> Tensor:
-        """(B,) bool: the endoscope sees the ring, the axis passes the target, tissue is hit."""
-        scenery = state.world.scenery
-        seen = scenery.view.fraction >= self.spec.limits.view_fraction
+    def fires(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
+        scene = state.world.scene
+        seen = scene.view.fraction >= self.spec.limits.view_fraction
         near = self.beam_error_mm(state) <= self.config.fire_mm
-        return seen & near & scenery.hit.on_organ
+        return seen & near & scene.hit.on_organ
 
-    def advance(self, state: TaskState, actions, in_place: bool, fired=None) -> TaskState:
-        """The beam is on, and its target goes on, where `fired` (B,) bool says; None: `fires`."""
-        fired = self.fires(state) if fired is None else fired
-        world = self.world.step(state.world, actions, fired * self.spec.laser.power_w, in_place)
-        return TaskState(world, further(state.goal, fired))
-
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Each arm's body and the other's tip; misses of the beam and of the camera's axis."""
-        arms, scenery, cut = state.world.arms, state.world.scenery, state.goal
-        laser, eye, aim = arms["laser"], arms["endoscope"], self.aims["laser"]
-        ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
-        misses = [aim.miss(laser.seen_mm, target).asinh() for target in ahead]
-        look = self.aims["endoscope"].miss(eye.seen_mm, self.centre_mm(state)).asinh()
-        apart = (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0
-        time = state.world.steps[:, None] / self.steps
-        shared = [scenery.view.fraction[:, None], cut.fired[:, None].float(), time, apart]
-        bodies = {name: body_part(self.world.arms[name], part) for name, part in arms.items()}
-        own = {"laser": (*misses, *cut.seen(self.round)), "endoscope": (look,)}
-        return {name: torch.cat((*bodies[name], *own[name], *shared), 1) for name in self.agents}
-
-    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
-        """Aim and look; cut: the beam is on; contact: too close to anything.
-
-        exp(-e / scale) is flat tens of mm off, where an episode begins; 1 / (1 + e / FAR_MM) not.
+    def advance(
+        self,
+        state: TaskState[RingCut],
+        actions: Mapping[str, Tensor],
+        fired: Tensor | None = None,
+    ) -> TaskState[RingCut]:
+        """Advance arms and tissue; where `fired` (B,) bool is set the beam burns for the step and
+        the reference moves on. None: where `fires` holds.
         """
-        error, view = self.beam_error_mm(state), state.world.scenery.view
-        cut = state.goal.fired.float()
-        close = -(state.world.scenery.clearance.least_mm < self.spec.limits.clearance_mm).float()
-        aim = {
-            "far": 1.0 / (1.0 + error / FAR_MM),
+        fired = self.fires(state) if fired is None else fired
+        world = self.world.step(state.world, actions, fired * self.spec.laser.power_w)
+        return TaskState(world, state.goal.after(fired))
+
+    def blocks(self, state: TaskState[RingCut]) -> dict[str, ObservationBlocks]:
+        """Each arm's own shape and pressures and its pointing error; what both arms share."""
+        arms, scene, cut = state.world.arms, state.world.scene, state.goal
+        laser, eye, pointing = arms["laser"], arms["endoscope"], self.pointing
+        ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
+        offsets = [pointing["laser"].offset_mm(laser.seen_mm, target) for target in ahead]
+        look = pointing["endoscope"].offset_mm(eye.seen_mm, self.centre_mm(state))
+        angle = 2.0 * math.pi * cut.share(self.round)[:, None]
+        own = {
+            "laser": {
+                **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),
+                RING_PLACE: torch.cat((angle.sin(), angle.cos()), 1),
+                RING_DIRECTION: cut.direction[:, None],
+            },
+            "endoscope": {VIEW_ERROR: look.asinh()},
+        }
+        shared = {
+            VIEW: scene.view.fraction[:, None],
+            FIRED: cut.fired[:, None].float(),
+            TIME: state.world.steps[:, None] / self.steps,
+            APART: (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0,
+        }
+        return {
+            name: {**body_blocks(self.world.arms[name], arms[name]), **own[name], **shared}
+            for name in self.agents
+        }
+
+    def observe(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
+        return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
+
+    def rewards(self, state: TaskState[RingCut]) -> dict[str, dict[str, Tensor]]:
+        """See `LaserWeights` and `EndoscopeWeights`."""
+        error, scene = self.beam_error_mm(state), state.world.scene
+        shared = {
+            "cut": state.goal.fired.float(),
+            "contact": (scene.clearance.least_mm < self.spec.limits.clearance_mm).float(),
+        }
+        laser = {
+            "far": 1.0 / (1.0 + error / self.config.far_mm),
             "aim": (-error).exp(),
             "fine": (-error / self.config.fine_mm).exp(),
         }
-        look = {"look": 1.0 / (1.0 + view.axis_error_mm / FAR_MM), "view": view.fraction}
-        both = {"cut": cut, "contact": close}
-        return {"laser": {**aim, **both}, "endoscope": {**look, **both}}
+        endoscope = {
+            "look": 1.0 / (1.0 + scene.view.axis_error_mm / self.config.far_mm),
+            "view": scene.view.fraction,
+        }
+        return {
+            "laser": weighted(laser | shared, self.weights["laser"]),
+            "endoscope": weighted(endoscope | shared, self.weights["endoscope"]),
+        }
 
-    def ended(self, state: TaskState) -> Tensor:
-        """The ring is cut, or something is hit."""
-        done = self.surroundings.ablation.report(state.world.scenery.dose).completion >= 1.0
-        return done | state.world.scenery.clearance.collides
+    def ended(self, state: TaskState[RingCut]) -> Tensor:
+        """When the ring is cut all around, or an arm touches a body, the other arm or itself."""
+        done = self.scene.ablation.report(state.world.scene.dose).completion >= 1.0
+        return done | state.world.scene.clearance.collides
 
-    def measures(self, state: TaskState) -> dict[str, Tensor]:
-        scenery = state.world.scenery
-        ring, hit = self.surroundings.ablation.report(scenery.dose), scenery.clearance.collides
+    def measures(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
+        scene = state.world.scene
+        ring, hit = self.scene.ablation.report(scene.dose), scene.clearance.collides
         return {
             "beam_error_mm": self.beam_error_mm(state).where(state.goal.fired, float("nan")),
             "completion": ring.completion,
             "largest_gap_mm": ring.largest_gap_mm,
             "healthy_mm2": ring.healthy_mm2,
-            "view_fraction": scenery.view.fraction,
-            "clearance_mm": scenery.clearance.least_mm,
+            "view_fraction": scene.view.fraction,
+            "clearance_mm": scene.clearance.least_mm,
             "collided": hit.float(),
             "success": ((ring.completion >= 1.0) & ~hit).float(),
         }
 
-    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        """The place on the ring, and where the beam ends."""
-        return self.target_mm(state)[:, None], state.world.scenery.hit.point_mm[:, None]
+    def trace(self, state: TaskState[RingCut]) -> tuple[Tensor, Tensor]:
+        """The reference point on the ring, and where the beam ends."""
+        return self.target_mm(state)[:, None], state.world.scene.hit.point_mm[:, None]
 
-    def script(self, state: TaskState) -> dict[str, Tensor]:
-        """The laser aims at its next target, the endoscope at the lesion's middle."""
-        aims = {"laser": self.target_mm(state, 1), "endoscope": self.centre_mm(state)}
-        return {n: self.aims[n].action(state.world.arms[n], aim) for n, aim in aims.items()}
+    def script(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
+        """Scripted expert: points the laser at its next target, the endoscope at the lesion."""
+        targets = {"laser": self.target_mm(state, 1), "endoscope": self.centre_mm(state)}
+        pointing = self.pointing
+        return {
+            name: pointing[name].action(state.world.arms[name], target)
+            for name, target in targets.items()
+        }
+
+
+CIRCLE_ABLATION = TaskSpec(
+    CircleAblation,
+    CircleAblationConfig(),
+    ("laser", "endoscope"),
+    preset={
+        "rollout": 16,
+        "last_noise": 0.05,
+        "evaluate_every": 50,
+        "evaluation_episodes": 16,
+    },
+    training_steps=1_000_000,
+)

@@ -1,4 +1,7 @@
-"""The scripted solver: damped least squares on the differentiable arm model."""
+"""Inverse kinematics: damped least squares on the differentiable arm model.
+
+The scripted experts of the tasks use it with the true state of the episode (privileged).
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,11 @@ def least_squares(
     damping: float = 1e-3,
     iterations: int = 5,
 ) -> Tensor:
-    """(B, m) within low, high (B, m) that make the residuals (B, r) small; the best one tried.
+    """Minimise residuals (B, r) over (B, m) within low, high (B, m); returns the best point tried.
 
     Steps (J^T J + lambda D)^-1 J^T r with D the mean of J^T J's diagonal (Levenberg 1944; Wampler
-    1986 for arms), held to the box. Where a step does not help, its environment's damping grows
-    tenfold, else it falls tenfold. `residual` maps (B, m) to (B, r), row by row.
+    1986 for arms), clipped to the box. An environment's damping grows tenfold after a step that
+    does not lower its residual, else it falls tenfold. `residual` maps (B, m) to (B, r) by row.
     """
     best = torch.minimum(torch.maximum(start, low), high)
     factor = best.new_full((len(best), 1, 1), damping)
@@ -56,21 +59,27 @@ def _linearised(residual: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tenso
 
 
 STUCK_MM = 1e-3
-"""A solver that leaves more than this tries again (mm)."""
+"""Residual above which the solver tries again from other starting points (mm)."""
 OFFSETS_KPA = (1.0, -1.0)
-"""Where it begins then, beside the present pressures (kPa): beyond every dead band."""
+"""Offsets of those starting points from the present pressures, beyond every dead band (kPa)."""
 
 Error = Callable[[Tensor, Tensor], Tensor]
-"""Key points (B, n, 3) mm and targets (B, ...) to what should vanish, (B, r) mm."""
+"""Residual to be minimised: key points (B, n, 3) mm and targets (B, ...) to (B, r) mm."""
 
 
-def seek(
-    arm: Arm, part: ArmPart, target_mm: Tensor, error: Error, dt_s: float, stuck_mm=STUCK_MM
+def action_towards(
+    arm: Arm,
+    part: ArmPart,
+    target_mm: Tensor,
+    error: Error,
+    dt_s: float,
+    stuck_mm: float = STUCK_MM,
 ) -> Tensor:
-    """(B, m) kPa: the action after which the error is least, by damped least squares.
+    """(B, m) kPa: the action that minimises the predicted error after dt_s seconds.
 
-    The direction of change makes the arm jump where a chamber turns round, so where the solver is
-    stuck it tries again from pressures that turn all chambers one way or the other.
+    The model's shape jumps where a chamber's pressure changes direction, which a gradient does not
+    show. Where more than stuck_mm remains, the solver therefore tries again from pressures at which
+    all chambers rise, and from pressures at which all fall.
     """
     with torch.inference_mode(False):
         part, target = tree_map(torch.clone, part), target_mm.clone()
@@ -85,26 +94,26 @@ def seek(
 
 
 def _solved(arm, part, target, error, dt_s, offset) -> tuple[Tensor, Tensor]:
-    """Pressures (B, m) kPa, sought from `offset` kPa off, and the errors (B,) that they leave."""
+    """Pressures (B, m) kPa found from a start `offset` kPa away, and their residuals (B,) mm."""
     low, high = arm.within_reach(part, dt_s)
 
     def residual(pressure: Tensor) -> Tensor:
-        return error(arm.foresee(part, pressure, dt_s), target)
+        return error(arm.predict(part, pressure, dt_s), target)
 
     pressure = least_squares(residual, part.pressure + offset, low, high)
     return pressure, residual(pressure).norm(dim=1)
 
 
-class Aim:
-    """How far an arm's axis passes from a target, and the scripted aim; holds no state."""
+class Pointing:
+    """Inverse kinematics that points the axis of an arm's tip at a target; holds no state."""
 
     def __init__(self, arm: Arm, dt_s: float):
         self.arm, self.dt_s = arm, dt_s
 
-    def miss(self, points_mm: Tensor, target_mm: Tensor) -> Tensor:
-        """(B, 3) mm from the axis to targets (B, 3) mm, across it, for key points (B, n, 3) mm.
+    def offset_mm(self, points_mm: Tensor, target_mm: Tensor) -> Tensor:
+        """(B, 3) mm: perpendicular offset of targets (B, 3) mm from the tip's axis.
 
-        For a target behind the tip the axis ends at the tip.
+        points_mm: key points (B, n, 3) mm. For a target behind the tip the axis ends at the tip.
         """
         aim = self.arm.backbone.tip_direction(points_mm)
         away = target_mm - points_mm[:, -1]
@@ -112,39 +121,13 @@ class Aim:
         return away - along * aim
 
     def action(self, part: ArmPart, target_mm: Tensor) -> Tensor:
-        """(B, m) kPa: damped least squares for the axis through targets (B, 3) a step from now."""
+        """(B, m) kPa: the action that points the axis at targets (B, 3) mm after one step."""
         with torch.inference_mode(False):
             part, target = tree_map(torch.clone, part), target_mm.clone()
             low, high = self.arm.within_reach(part, self.dt_s)
 
             def residual(pressure: Tensor) -> Tensor:
-                return self.miss(self.arm.foresee(part, pressure, self.dt_s), target)
+                return self.offset_mm(self.arm.predict(part, pressure, self.dt_s), target)
 
             wanted = least_squares(residual, part.pressure, low, high)
             return self.arm.action_for(part, wanted, self.dt_s)
-
-
-def body_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
-    """What an arm knows of itself, each (B, ...): measured shape, commands, pressures, directions.
-
-    The shape is in lengths of 50 mm from the arm's nominal base.
-    """
-    shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
-    return shape, *pressure_part(arm, part)
-
-
-def pressure_part(arm: Arm, part: ArmPart) -> tuple[Tensor, ...]:
-    """Commands, pressures, directions of change and ways back, each (B, m).
-
-    Commands and measured pressures are -1..1 over the range. A way back is how far a pressure has
-    come from where its chamber last moved on, in dead bands: beyond -1 or 1 the direction of change
-    turns over, and the arm jumps.
-    """
-    half = 0.5 * (arm.high - arm.low)
-    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
-    return (
-        (part.command - arm.low) / half - 1.0,
-        (part.seen_kPa - arm.low) / half - 1.0,
-        part.arm.direction,
-        back.clamp(-1.5, 1.5),
-    )

@@ -1,6 +1,6 @@
-"""One arm reaches past a slotted plate: into one slot after the other, its whole body clear of it.
+"""One arm reaches through a slotted plate into one slot after another without touching the plate.
 
-Between two slots stands the plate, so that the way from one to the next leads back to the middle.
+The plate stands between the slots, so the route from one to the next leads back to the centre.
 """
 
 from __future__ import annotations
@@ -13,45 +13,80 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.inverse_kinematics import body_part, seek
-from surgisoft.tasks.trajectories import Tour, fresh_tour, place, progress, way_mm
-from surgisoft.tasks.world.plate import SlottedPlate, clear_ways, plate_world
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.inverse_kinematics import action_towards
+from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
+from surgisoft.tasks.trajectories.waypoints import (
+    WaypointSequence,
+    draw_sequence,
+    point_at,
+    progress,
+    route_mm,
+)
+from surgisoft.tasks.world.arm import Arm
+from surgisoft.tasks.world.plate import SlottedPlate, clear_routes, plate_world
+from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.world import WorldConfig
+
+TARGET = Block("target", "target minus measured tip", "mm", "asinh(x / 1 mm)")
+ONWARD = Block(
+    "onward", "point of the route one stride ahead minus measured tip", "mm", "asinh(x / 1 mm)"
+)
+CLEARANCE = Block("clearance", "least distance of the arm from the plate", "mm", "x / 10")
+VISITS = Block("visits", "share of the targets reached", "-", "x")
+
+
+@dataclass(frozen=True)
+class KeyholeWeights:
+    """Weights of the reward terms; r is the remaining length of the route to the target, mm.
+
+    A visit is worth more than `way` and `near` together, which fall when the next route begins.
+    """
+
+    way: float = 1.0
+    """exp(-r / far_mm)."""
+    near: float = 1.0
+    """exp(-r / reach_mm)."""
+    visits: float = 3.0
+    """Number of targets reached."""
+    contact: float = -1.0
+    """1 while the clearance is below limit_mm, else 0."""
 
 
 @dataclass(frozen=True)
 class KeyholeConfig:
-    """The plate, what is to be reached beyond it, and what that is worth."""
+    """The plate, the targets beyond it, and the reward."""
 
     arm: str | Path = "default"
     """Arm model: `default`, or the folder of a fitted model."""
     plate: SlottedPlate = field(default_factory=SlottedPlate)
     """The plate."""
     height_mm: float = 46.0
-    """From the arm's base to the plate's lower side, mm."""
+    """Distance from the arm's base to the plate's lower side, mm."""
     deep_mm: float = 25.0
-    """Least distance of a target from the tip at rest, across the arm, mm."""
+    """Least distance of a target from the tip at rest, perpendicular to the arm, mm."""
     clear_mm: float = 2.0
-    """Least clearance of the shapes on the way to a target, mm: what makes it reachable."""
+    """Least clearance of the shapes along a route, mm; targets without such a route are unused."""
     limit_mm: float = 0.5
-    """The arm is too close to the plate where its clearance is less, mm."""
+    """Clearance below which the arm counts as too close to the plate, mm."""
     visits: int = 3
-    """Targets of an episode, each in another slot than the one before."""
+    """Targets of an episode (a count), each in another slot than the one before."""
     reach_mm: float = 1.0
-    """A target is reached when the tip is this near, mm."""
+    """Distance of the tip at which a target is reached, mm."""
     time_s: float = 30.0
     """Time for all targets, s."""
     far_mm: float = 20.0
-    """Scale of the reward for the way that is left, mm."""
+    """Scale of the reward term `way`, mm."""
+    weights: KeyholeWeights = field(default_factory=KeyholeWeights)
+    """Weights of the reward terms."""
     world: WorldConfig = field(default_factory=WorldConfig)
-    """The world and its randomisation."""
+    """The simulator and its domain randomization."""
 
     def __post_init__(self):
         for name in ("deep_mm", "clear_mm", "visits", "reach_mm", "time_s", "far_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"keyhole: {name} is {getattr(self, name)}, expected above 0")
+        check_weights("keyhole", self.weights)
 
 
 class Keyhole:
@@ -62,81 +97,96 @@ class Keyhole:
     def __init__(self, config: KeyholeConfig | None = None, device: str | torch.device = "cpu"):
         c = self.config = config or KeyholeConfig()
         self.world = plate_world(c.plate, c.height_mm, c.limit_mm, c.arm, c.world, device)
-        self.arm, self.dt_s = self.world.arms["arm"], c.world.dt_s
+        self.dt_s, self.weights = c.world.dt_s, {"arm": c.weights}
         self.steps = round(c.time_s / self.dt_s)
-        self.ways = clear_ways(self.world, c.plate, c.deep_mm, c.clear_mm)
-        # In a step the tip goes no farther than this.
+        self.routes = clear_routes(self.world, c.plate, c.deep_mm, c.clear_mm)
+        # Upper bound of the tip's movement in a step.
         self._stride_mm = 4.0 * self.arm.pneumatics.step_kPa / 3.0
 
-    def goal(self, stream: Stream) -> tuple[Stream, Tour]:
-        return fresh_tour(stream, self.ways, self.config.visits)
+    @property
+    def arm(self) -> Arm:
+        """The only arm."""
+        return self.world.arms["arm"]
 
-    def way_mm(self, state: TaskState) -> Tensor:
-        """(B, N, 3) mm: from the last target back to the middle, and on to the next one."""
-        return way_mm(self.ways, state.goal)
+    def goal(self, stream: Stream) -> tuple[Stream, WaypointSequence]:
+        return draw_sequence(stream, self.routes, self.config.visits)
 
-    def error_mm(self, state: TaskState) -> Tensor:
-        """(B,) mm: from the true tip to its target."""
-        return (state.world.arms["arm"].tip_mm - self.way_mm(state)[:, -1]).norm(dim=1)
+    def route_mm(self, state: TaskState[WaypointSequence]) -> Tensor:
+        """(B, N, 3) mm: from the last target back to the centre, and on to the next target."""
+        return route_mm(self.routes, state.goal)
 
-    def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
-        """One step; a target that the tip has come to is followed by the next."""
-        state = replace(state, world=self.world.step(state.world, actions, in_place=in_place))
+    def error_mm(self, state: TaskState[WaypointSequence]) -> Tensor:
+        """(B,) mm: distance of the true tip from its target."""
+        return (state.world.arms["arm"].tip_mm - self.route_mm(state)[:, -1]).norm(dim=1)
+
+    def advance(
+        self, state: TaskState[WaypointSequence], actions: Mapping[str, Tensor]
+    ) -> TaskState[WaypointSequence]:
+        """Advance the arm; when the tip reaches a target, the next one takes its place."""
+        state = replace(state, world=self.world.step(state.world, actions))
         near = (self.error_mm(state) <= self.config.reach_mm) & ~self.ended(state)
         reached = (state.goal.reached + near).clamp(max=self.config.visits)
         return replace(state, goal=replace(state.goal, reached=reached))
 
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Body; tip to target, and to the way a stride on (asinh of mm); clearance; visits."""
-        part, way = state.world.arms["arm"], self.way_mm(state)
+    def blocks(self, state: TaskState[WaypointSequence]) -> dict[str, ObservationBlocks]:
+        """The arm's shape and pressures, the target, the next stride, clearance, visits, time."""
+        part, route = state.world.arms["arm"], self.route_mm(state)
         tip = part.seen_mm[:, -1]
-        onward = place(way, progress(way, tip).along_mm + self._stride_mm)
-        clear = state.world.scenery.clearance.least_mm[:, None] / 10.0
-        visits = state.goal.reached[:, None] / self.config.visits
-        time = state.world.steps[:, None] / self.steps
-        errors = (way[:, -1] - tip).asinh(), (onward - tip).asinh()
-        return {"arm": torch.cat((*body_part(self.arm, part), *errors, clear, visits, time), 1)}
+        onward = point_at(route, progress(route, tip).along_mm + self._stride_mm)
+        return {
+            "arm": {
+                **body_blocks(self.arm, part),
+                TARGET: (route[:, -1] - tip).asinh(),
+                ONWARD: (onward - tip).asinh(),
+                CLEARANCE: state.world.scene.clearance.least_mm[:, None] / 10.0,
+                VISITS: state.goal.reached[:, None] / self.config.visits,
+                TIME: state.world.steps[:, None] / self.steps,
+            }
+        }
 
-    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
-        """Way and near: what is left of the way; visits: targets reached; contact: too close.
+    def observe(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
+        return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
-        A visit is worth more than the other terms together, which fall when the next one begins.
-        """
-        clear, tip = state.world.scenery.clearance.least_mm, state.world.arms["arm"].tip_mm
-        left = progress(self.way_mm(state), tip).left_mm
+    def rewards(self, state: TaskState[WaypointSequence]) -> dict[str, dict[str, Tensor]]:
+        """See `KeyholeWeights`."""
+        clear, tip = state.world.scene.clearance.least_mm, state.world.arms["arm"].tip_mm
+        left = progress(self.route_mm(state), tip).remaining_mm
         terms = {
             "way": (-left / self.config.far_mm).exp(),
             "near": (-left / self.config.reach_mm).exp(),
-            "visits": 3.0 * state.goal.reached,
-            "contact": -(clear < self.config.limit_mm).float(),
+            "visits": state.goal.reached,
+            "contact": (clear < self.config.limit_mm).float(),
         }
-        return {"arm": terms}
+        return {"arm": weighted(terms, self.config.weights)}
 
-    def ended(self, state: TaskState) -> Tensor:
-        """The arm touches the plate or itself."""
-        return state.world.scenery.clearance.collides
+    def ended(self, state: TaskState[WaypointSequence]) -> Tensor:
+        """When the arm touches the plate or itself."""
+        return state.world.scene.clearance.collides
 
-    def measures(self, state: TaskState) -> dict[str, Tensor]:
-        clearance, tour = state.world.scenery.clearance, state.goal
-        done, hit = tour.reached >= self.config.visits, clearance.collides
-        way = progress(self.way_mm(state), state.world.arms["arm"].tip_mm)
+    def measures(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
+        clearance, goal = state.world.scene.clearance, state.goal
+        done, hit = goal.reached >= self.config.visits, clearance.collides
+        route = progress(self.route_mm(state), state.world.arms["arm"].tip_mm)
         return {
-            "left_mm": way.left_mm,
-            "visited": tour.reached / self.config.visits,
+            "left_mm": route.remaining_mm,
+            "visited": goal.reached / self.config.visits,
             "clearance_mm": clearance.least_mm,
             "collided": hit.float(),
             "success": (done & ~hit).float(),
         }
 
-    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        return self.way_mm(state)[:, -1:], state.world.arms["arm"].tip_mm[:, None]
+    def trace(self, state: TaskState[WaypointSequence]) -> tuple[Tensor, Tensor]:
+        return self.route_mm(state)[:, -1:], state.world.arms["arm"].tip_mm[:, None]
 
-    def script(self, state: TaskState) -> dict[str, Tensor]:
-        """Damped least squares for the tip a stride on along the way."""
-        part, way = state.world.arms["arm"], self.way_mm(state)
-        onward = place(way, progress(way, part.tip_mm).along_mm + self._stride_mm)
-        return {"arm": seek(self.arm, part, onward, _tip_error, self.dt_s)}
+    def script(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
+        """Scripted expert: inverse kinematics for the tip one stride ahead on the route."""
+        part, route = state.world.arms["arm"], self.route_mm(state)
+        onward = point_at(route, progress(route, part.tip_mm).along_mm + self._stride_mm)
+        return {"arm": action_towards(self.arm, part, onward, _tip_error, self.dt_s)}
 
 
 def _tip_error(points_mm: Tensor, target_mm: Tensor) -> Tensor:
     return points_mm[:, -1] - target_mm
+
+
+KEYHOLE = TaskSpec(Keyhole, KeyholeConfig(), ("arm",))

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.path_following import Follow, FollowConfig
+from surgisoft.tasks.base import TaskSpec
+from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.track import level_world, points_at_start
+from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.world import WorldConfig
 
 LEAST_SLOPE = 0.1
-"""A beam flatter to the plane than this sine (6 degrees) is taken to end before it."""
+"""Sine of the smallest angle (6 degrees) at which a beam is taken to meet the plane."""
 
 
 @dataclass(frozen=True)
@@ -20,36 +23,55 @@ class LaserPlaneConfig:
     """A path for the beam on a level plane beyond the tip."""
 
     follow: FollowConfig = field(default_factory=FollowConfig)
-    """The path and how it is walked."""
+    """The path, the observation and the reward."""
     distance_mm: float = 40.0
-    """From the tip at the start to the plane, mm; the middle of the scene's laser's standoff."""
+    """Distance from the tip at the start to the plane, mm: the middle of the working distances of
+    the laser in the phantom scene."""
     mean_kPa: float = 20.0
-    """Pressure of all chambers with which the beam meets the path's middle, kPa."""
+    """Pressure of all chambers that puts the beam's spot at the path's centre, kPa."""
     world: WorldConfig = field(default_factory=WorldConfig)
-    """The world and its randomisation."""
+    """The simulator and its domain randomization."""
 
     def __post_init__(self):
         if not self.distance_mm > 0.0:
             raise InputError(f"laser_plane: distance_mm is {self.distance_mm}, expected above 0")
 
 
-def laser_plane(config: LaserPlaneConfig | None = None, device: str = "cpu") -> Follow:
-    """A circle of 20 mm diameter on a plane 40 mm beyond the tip."""
+def laser_plane(
+    config: LaserPlaneConfig | None = None, device: str | torch.device = "cpu"
+) -> Follow:
+    """The beam of one arm follows a circle of 20 mm diameter on a plane 40 mm beyond the tip."""
     config = config or LaserPlaneConfig()
     world = level_world(config.world, config.mean_kPa, config.follow.arm, device)
-    start, backbone = points_at_start(world), world.arms["arm"].backbone
+    start = points_at_start(world)
     height = start[0, -1, 2] + config.distance_mm
-
-    def spot(points_mm: Tensor) -> Tensor:
-        return on_plane(points_mm[:, -1], backbone.tip_direction(points_mm), height)
-
+    spot = BeamSpot(world.arms["arm"], height)
     return Follow("laser_plane", world, config.follow, spot, spot(start)[0], directions=2)
 
 
-def on_plane(origin_mm: Tensor, direction: Tensor, height_mm: Tensor | float) -> Tensor:
-    """(B, 3) mm: where rays (B, 3) along (B, 3) meet the plane z = height_mm.
+LASER_PLANE = TaskSpec(laser_plane, LaserPlaneConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
 
-    A ray that runs flatter than LEAST_SLOPE, or away, ends before the plane: always finite.
+
+@dataclass(frozen=True, eq=False)
+class BeamSpot:
+    """Where a beam along the axis of an arm's tip meets a level plane."""
+
+    arm: Arm
+    """The arm that carries the laser."""
+    height_mm: Tensor
+    """() mm: z of the plane, world frame."""
+
+    def __call__(self, points_mm: Tensor) -> Tensor:
+        """(B, 3) mm, world frame, for key points (B, n, 3) mm."""
+        return on_plane(
+            points_mm[:, -1], self.arm.backbone.tip_direction(points_mm), self.height_mm
+        )
+
+
+def on_plane(origin_mm: Tensor, direction: Tensor, height_mm: Tensor | float) -> Tensor:
+    """(B, 3) mm: where rays from (B, 3) mm along unit vectors (B, 3) meet the plane z = height_mm.
+
+    Rays flatter than LEAST_SLOPE, or away from the plane, are cut short, so the result is finite.
     """
     far = (height_mm - origin_mm[:, 2]) / direction[:, 2].clamp(min=LEAST_SLOPE)
     return origin_mm + far[:, None] * direction

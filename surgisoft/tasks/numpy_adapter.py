@@ -1,4 +1,4 @@
-"""A task as numpy sees it: what both adapters share."""
+"""A task's episodes as NumPy arrays: the common part of the PettingZoo and Gymnasium adapters."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes, Outcome, Task, TaskState
-from surgisoft.tasks.world.random import joined, streams
+from surgisoft.tasks.world.random_streams import joined, streams
 
 Bounds = tuple[Any, Any, tuple[int, ...], Any]
-"""Lowest, highest, shape and type: the arguments of a Box."""
+"""Lowest value, highest value, shape and dtype: the arguments of a Gymnasium Box."""
 
 
-def unseeded() -> int:
-    """A seed from the operating system's entropy."""
+def entropy_seed() -> int:
+    """A seed from the operating system's entropy, for a reset without one."""
     return int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
 
 
-class Port:
-    """Episodes in and out of numpy; holds no state. Arrays have the batch in front."""
+class NumpyAdapter:
+    """Runs episodes of a task with NumPy actions and observations; holds no state.
+
+    Arrays have the batch in front. A state passed to `step` or `restart` is invalid afterwards.
+    """
 
     def __init__(self, task: Task):
-        self.task, self.episodes = task, Episodes(task)
-        self._width = {
-            agent: seen.shape[1] for agent, seen in self.observations(self.seeded([0])).items()
-        }
+        self.task, self.episodes = task, Episodes(task, donate=True)
+        first = self.observations(self.seeded([0]))
+        self._width = {agent: seen.shape[1] for agent, seen in first.items()}
 
-    def observed(self, agent: str) -> Bounds:
+    def observation_bounds(self, agent: str) -> Bounds:
         """Bounds of one agent's observation in one environment."""
         return -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (self._width[agent],), np.float32
 
-    def acted(self, agent: str) -> Bounds:
+    def action_bounds(self, agent: str) -> Bounds:
         """Bounds of one agent's action in one environment, kPa."""
         arm = self.task.world.arms[agent]
         limit = arm.pneumatics.step_kPa
@@ -42,21 +44,21 @@ class Port:
 
     @torch.inference_mode()
     def seeded(self, seeds: Sequence[int]) -> TaskState:
-        """Fresh episodes, one for each seed."""
+        """Start episodes, one for each seed."""
         parts = [streams(int(seed), 1, 0, self.task.world.device) for seed in seeds]
         return self.episodes.start(joined(parts))
 
     @torch.inference_mode()
-    def again(self, state: TaskState, mask: torch.Tensor | None = None) -> TaskState:
-        """Fresh episodes where mask (B,) is set (None: everywhere), each from its own stream."""
+    def restart(self, state: TaskState, mask: torch.Tensor | None = None) -> TaskState:
+        """Start new episodes where mask (B,) is set (None: everywhere), from their own streams."""
         mask = torch.ones_like(state.world.failed) if mask is None else mask
-        return self.episodes.reset(state, mask, in_place=True)
+        return self.episodes.reset(state, mask)
 
     @torch.inference_mode()
     def step(
         self, state: TaskState, actions: Mapping[str, np.ndarray]
     ) -> tuple[TaskState, Outcome]:
-        """One step with actions (B, m), kPa; the state given is given up."""
+        """Advance one step; actions: agent -> (B, m), kPa."""
         count, held = len(state.world.steps), {}
         for agent in self.task.agents:
             expected = (count, self.task.world.arms[agent].chambers)
@@ -67,9 +69,9 @@ class Port:
             held[agent] = torch.tensor(
                 np.asarray(actions[agent]), dtype=torch.float32, device=self.task.world.device
             )
-        return self.episodes.step(state, held, in_place=True)
+        return self.episodes.step(state, held)
 
     @torch.inference_mode()
     def observations(self, state: TaskState) -> dict[str, np.ndarray]:
-        """agent -> (B, D) float32; fresh arrays."""
+        """agent -> (B, D) float32, arrays of their own."""
         return {agent: seen.cpu().numpy() for agent, seen in self.episodes.observe(state).items()}

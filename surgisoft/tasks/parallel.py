@@ -1,8 +1,9 @@
-"""PettingZoo's ParallelEnv over a batch of one; it translates and nothing else."""
+"""Tasks as PettingZoo ParallelEnv: an adapter over a batch of one environment."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,25 +12,26 @@ from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import Port, unseeded
-from surgisoft.tasks.registry import config_of, make_task, with_fields
+from surgisoft.tasks.numpy_adapter import NumpyAdapter, entropy_seed
+from surgisoft.tasks.registry import make_with
 
 
 class SurgicalEnv(ParallelEnv):
-    """Any task; agents are arms by name.
+    """A task as a PettingZoo environment; agents are arms by name.
 
-    Actions: (m,) float32 changes of pressure, kPa. Observations: (D,) float32, see the task. The
-    infos hold each agent's reward terms and the task's measures where they apply.
+    Actions are changes of the commanded pressure (m,) float32, kPa. Observations are (D,) float32;
+    `surgisoft.tasks.describe` lists their entries. Each agent's info holds its weighted reward
+    terms, and the task's measures where they apply.
     """
 
     def __init__(self, task: Task):
         self.metadata = {"name": task.name, "render_modes": [], "is_parallelizable": True}
         self.render_mode = None
-        self.task, self._port, self._state = task, Port(task), None
+        self.task, self._adapter, self._state = task, NumpyAdapter(task), None
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
-        self._observed = {a: Box(*self._port.observed(a)) for a in task.agents}
-        self._acted = {a: Box(*self._port.acted(a)) for a in task.agents}
+        self._observed = {a: Box(*self._adapter.observation_bounds(a)) for a in task.agents}
+        self._acted = {a: Box(*self._adapter.action_bounds(a)) for a in task.agents}
         low = np.concatenate([self._observed[a].low for a in task.agents])
         self.state_space = Box(low, -low)
 
@@ -40,11 +42,11 @@ class SurgicalEnv(ParallelEnv):
         return self._acted[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None):
-        """A fresh episode; without a seed the last one's random stream goes on."""
+        """Start an episode; without a seed the random number stream of the last one continues."""
         if seed is None and self._state is not None:
-            self._state = self._port.again(self._state)
+            self._state = self._adapter.restart(self._state)
         else:
-            self._state = self._port.seeded([unseeded() if seed is None else seed])
+            self._state = self._adapter.seeded([entropy_seed() if seed is None else seed])
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}
 
@@ -57,7 +59,7 @@ class SurgicalEnv(ParallelEnv):
         if absent:
             raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
         held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}
-        self._state, outcome = self._port.step(self._state, held)
+        self._state, outcome = self._adapter.step(self._state, held)
         measures = {
             name: value.item() for name, value in outcome.measures.items() if value.isfinite().all()
         }
@@ -75,8 +77,8 @@ class SurgicalEnv(ParallelEnv):
         return observations, rewards, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
-        """(sum of D,) what all agents observe, one after the other."""
-        seen = self._port.observations(self._state)
+        """(sum of D,) the observations of all agents, one after the other, for central critics."""
+        seen = self._adapter.observations(self._state)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
     def render(self) -> None:
@@ -86,26 +88,23 @@ class SurgicalEnv(ParallelEnv):
         """Nothing is held open."""
 
     def _observations(self) -> dict[str, np.ndarray]:
-        seen = self._port.observations(self._state)
+        seen = self._adapter.observations(self._state)
         return {agent: seen[agent][0] for agent in self.agents}
 
 
 def parallel_env(
     task: str,
-    config=None,
+    config: Any = None,
     device: str | torch.device = "cpu",
     scene: str | Path | None = None,
     arm: str | Path | None = None,
     geometry: str = "fcl",
 ) -> SurgicalEnv:
-    """The named task as a PettingZoo ParallelEnv; `config` is the task's own.
+    """The named task as a PettingZoo ParallelEnv.
 
-    scene: a scene's folder; arm: an arm model's folder or `default`; both change the config, None
-    leaves it as it is. geometry: `fcl`, the referee, decides about contact and the beam's hit, or
-    `batched`, the faster engine of training, which agrees with it to 0.1 mm near contact.
+    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
+    model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
+    exact collision checker, or `batched`, the faster engine of training, for contact and for the
+    beam's hit; near contact the two agree to 0.1 mm.
     """
-    config = config_of(task) if config is None else config
-    changes = {"scene": scene, "arm": arm}
-    config = with_fields(config, **{n: v for n, v in changes.items() if v is not None})
-    config = with_fields(config, geometry=geometry)
-    return SurgicalEnv(make_task(task, config, device))
+    return SurgicalEnv(make_with(task, config, device, scene, arm, geometry))

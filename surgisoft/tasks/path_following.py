@@ -1,57 +1,104 @@
-"""What an arm recalls of its last steps: how its pressures changed, and where that brought it.
-
-An arm with hysteresis answers a change of pressure more or less, by how far its chambers have come
-since they last turned round, and before. What the last steps did tells how it answers now.
-"""
+"""A point of one arm follows a closed path: the common part of the path-following tasks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.inverse_kinematics import pressure_part, seek
-from surgisoft.tasks.trajectories import PATHS, Round, fresh_round
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.base import TaskState, check_weights, weighted
+from surgisoft.tasks.inverse_kinematics import action_towards
+from surgisoft.tasks.observations import (
+    Block,
+    ObservationBlocks,
+    joined,
+    numbered,
+    pressure_blocks,
+)
+from surgisoft.tasks.trajectories.closed_path import PATHS, Traversal, draw_traversal
+from surgisoft.tasks.world.arm import Arm
+from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.world import ArmPart, World
+
+FOLLOW_PRESET = {
+    "envs": 1024,
+    "batches": 16,
+    "gamma": 0.6,
+    "desired_kl": 0.03,
+    "evaluate_every": 25,
+}
+"""Fields of the `fast` training preset for path following. Each action shows its effect in the next
+step, hence the small discount. Many minibatches, because the number of gradient steps decides the
+final error."""
+FOLLOW_STEPS = 4_000_000
+"""Environment steps of a training run of path following with the `fast` preset."""
+
+SHAPE = Block("shape", "measured key points relative to their rest positions", "mm", "x / 10")
+ERROR = Block("error", "target minus measured point", "mm", "asinh(x / 1 mm)")
+FINE = Block("fine_error", "target minus measured point", "mm", "asinh(x / fine_mm)")
+PREDICTED = Block(
+    "predicted_error",
+    "target minus the model's one-step prediction of the point with the commands held",
+    "mm",
+    "asinh(x / fine_mm)",
+)
+PRESSURE_HISTORY = Block(
+    "pressure_history", "changes of the measured pressures, newest first", "kPa", "x / 1 kPa"
+)
+POINT_HISTORY = Block(
+    "point_history", "movements of the measured point, newest first", "mm", "x / 1 mm"
+)
+TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1")
 
 
 @dataclass(frozen=True, eq=False)
-class Recall:
-    """The last R steps of a batch of episodes, newest first; zero before an episode began."""
+class ObservationHistory:
+    """What the last R steps of B episodes did, newest first; zero before an episode began.
+
+    An arm with hysteresis responds more or less to a change of pressure, depending on its past. The
+    effect of the last steps tells a policy how the arm responds now.
+    """
 
     kPa: Tensor
     """(B, R, m) kPa: change of the measured pressures in each step."""
     mm: Tensor
-    """(B, R, 3) mm: movement of the point that follows, as measured, world frame."""
+    """(B, R, 3) mm: movement of the measured point in each step, world frame."""
 
-    def after(self, kPa: Tensor, mm: Tensor) -> Recall:
-        """A step later, which changed pressures by (B, m) kPa and moved the point by (B, 3) mm."""
-        return Recall(_pushed(self.kPa, kPa), _pushed(self.mm, mm))
+    @classmethod
+    def empty(
+        cls, count: int, steps: int, chambers: int, device: torch.device
+    ) -> ObservationHistory:
+        """Histories of R = `steps` steps for B = `count` episodes that have just begun."""
+        zeros = torch.zeros(count, steps, chambers + 3, device=device)
+        return cls(zeros[..., :chambers], zeros[..., chambers:])
 
-    def seen(self) -> tuple[Tensor, ...]:
-        """As observed: (B, R m) and (B, R 3), of the order of 1 while a path is followed."""
-        return self.kPa.flatten(1), self.mm.flatten(1)
-
-
-def nothing(count: int, steps: int, chambers: int, device: torch.device) -> Recall:
-    """B = `count` episodes that have just begun, which will recall R = `steps` steps."""
-    zeros = torch.zeros(count, steps, chambers + 3, device=device)
-    return Recall(zeros[..., :chambers], zeros[..., chambers:])
+    def after(self, kPa: Tensor, mm: Tensor) -> ObservationHistory:
+        """Append a step that changed pressures by (B, m) kPa and moved the point by (B, 3) mm."""
+        return ObservationHistory(_appended(self.kPa, kPa), _appended(self.mm, mm))
 
 
-def _pushed(last: Tensor, new: Tensor) -> Tensor:
+def _appended(last: Tensor, new: Tensor) -> Tensor:
     return torch.cat((new[:, None], last), 1)[:, : last.shape[1]]
 
 
 @dataclass(frozen=True)
+class FollowWeights:
+    """Weights of the reward terms; e is the distance of the true point from its target, mm."""
+
+    track: float = 1.0
+    """exp(-e / 1 mm) (Chen et al. 2025, sec. IV-A)."""
+    fine: float = 1.0
+    """exp(-e / fine_mm); with weight 0 the reward is the paper's."""
+
+
+@dataclass(frozen=True)
 class FollowConfig:
-    """A path, how it is walked, and what following it is worth."""
+    """A closed path, how the reference moves along it, the observation and the reward."""
 
     path: str = "circle"
     """`circle` or `square`."""
@@ -60,25 +107,30 @@ class FollowConfig:
     loop_s: float = 20.0
     """Time for once around, s."""
     loops: int = 1
-    """Times around."""
+    """Times around (a count)."""
     approach_s: float = 3.0
-    """Time at the beginning in which the target waits where the path begins, s."""
+    """Time at the beginning during which the reference waits at its start, s."""
     any_start: bool = True
-    """Whether an episode begins anywhere on the path and runs either way round."""
+    """Whether the start on the path and the direction are drawn for each episode."""
     preview: int = 2
-    """Coming targets that the arm knows, one a step."""
-    recall: int = 2
-    """Last steps of which the arm knows how they changed its pressures and moved the point; 0: of
-    none."""
-    foresight: bool = True
-    """Whether the arm knows where its model, which follows its pressures as the scripted solver's
-    does, expects the point a step from now if the commands are held."""
+    """Future targets in the observation, one per step (a count)."""
+    history_steps: int = 2
+    """Last steps in the observation: changes of pressure, movements of the point. 0: none."""
+    one_step_prediction: bool = True
+    """Whether the observation holds the model's prediction of the error after the next step, with
+    the commands held. The model runs beside the arm and is fed with its pressures."""
     fine_mm: float = 0.1
-    """Scale of the second reward term, mm."""
-    fine_weight: float = 1.0
-    """Weight of the second reward term; 0: the paper's reward."""
+    """Scale of the reward term `fine` and of the fine errors observed, mm."""
+    weights: FollowWeights = field(default_factory=FollowWeights)
+    """Weights of the reward terms."""
     arm: str | Path = "default"
     """Arm model: `default`, or the folder of a fitted model."""
+
+    FORMER_NAMES: ClassVar[dict[str, str]] = {
+        "recall": "history_steps",
+        "foresight": "one_step_prediction",
+        "fine_weight": "weights.fine",
+    }
 
     def __post_init__(self):
         if self.path not in PATHS:
@@ -86,22 +138,23 @@ class FollowConfig:
         for name in ("size_mm", "loop_s", "loops", "preview", "fine_mm"):
             if not getattr(self, name) > 0:
                 raise InputError(f"task: {name} is {getattr(self, name)}, expected more than 0")
-        if self.recall < 0:
-            raise InputError(f"task: recall is {self.recall}, expected 0 or more")
+        if self.history_steps < 0:
+            raise InputError(f"task: history_steps is {self.history_steps}, expected 0 or more")
+        check_weights("task", self.weights)
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """Where a batch of episodes goes, and what was of it."""
+class FollowGoal:
+    """The reference of B episodes, and what the last steps did."""
 
-    round: Round
-    """How it goes round."""
-    recall: Recall
+    traversal: Traversal
+    """Where the reference starts, and in which direction it moves."""
+    history: ObservationHistory
     """The last steps."""
 
 
 class Follow:
-    """One arm in empty space, one of whose points follows a path."""
+    """One arm in empty space, one of whose points follows a closed path."""
 
     agents = ("arm",)
 
@@ -114,104 +167,117 @@ class Follow:
         centre_mm: Tensor,
         directions: int,
     ):
-        """marker: key points (B, n, 3) mm to the point that follows (B, 3) mm, world frame.
+        """marker: key points (B, n, 3) mm to the point (B, 3) mm that follows, world frame.
 
-        The path lies about centre_mm (3,), level; the solver holds the first `directions`
-        coordinates of the point (2 where the third is fixed).
+        The path is level, its centre at centre_mm (3,). The expert controls the first `directions`
+        coordinates of the point: 2 where the third is constant.
         """
         self.name, self.world, self.config = name, world, config
-        self.arm, self.marker, self.centre = world.arms["arm"], marker, centre_mm
+        self.marker, self.centre = marker, centre_mm
         self.dt_s = world.config.dt_s
         self.approach = round(config.approach_s / self.dt_s)
         self.loop = round(config.loop_s / self.dt_s)
         self.steps = self.approach + self.loop * config.loops
+        self.weights = {"arm": config.weights}
         self._directions = directions
         self._rest = self.arm.model.rest_mm.to(centre_mm)
 
-    def goal(self, stream: Stream) -> tuple[Stream, Course]:
-        stream, way = fresh_round(stream, self.config.any_start)
-        size = len(stream.key), self.config.recall, self.arm.chambers
-        return stream, Course(way, nothing(*size, self.world.device))
+    @property
+    def arm(self) -> Arm:
+        """The only arm."""
+        return self.world.arms["arm"]
 
-    def target_mm(self, state: TaskState, ahead: int = 0) -> Tensor:
-        """(B, 3) mm, world frame: where the point should be `ahead` steps from now."""
-        share = state.goal.round.share(state.world.steps + ahead, self.approach, self.loop)
+    def goal(self, stream: Stream) -> tuple[Stream, FollowGoal]:
+        stream, traversal = draw_traversal(stream, self.config.any_start)
+        size = len(stream.key), self.config.history_steps, self.arm.chambers
+        return stream, FollowGoal(traversal, ObservationHistory.empty(*size, self.world.device))
+
+    def target_mm(self, state: TaskState[FollowGoal], ahead: int = 0) -> Tensor:
+        """(B, 3) mm, world frame: the reference `ahead` steps from now."""
+        traversal = state.goal.traversal
+        share = traversal.share(state.world.steps + ahead, self.approach, self.loop)
         flat = self.config.size_mm * PATHS[self.config.path](share)
         return self.centre + torch.nn.functional.pad(flat, (0, 1))
 
-    def error_mm(self, state: TaskState) -> Tensor:
+    def error_mm(self, state: TaskState[FollowGoal]) -> Tensor:
         """(B,) mm: distance of the true point from its target."""
         point = self.marker(state.world.arms["arm"].points_mm)
         return (point - self.target_mm(state)).norm(dim=1)
 
-    def advance(self, state: TaskState, actions: Mapping[str, Tensor], in_place: bool) -> TaskState:
+    def advance(
+        self, state: TaskState[FollowGoal], actions: Mapping[str, Tensor]
+    ) -> TaskState[FollowGoal]:
+        """Advance the arm, and append the step to the history."""
         before = state.world.arms["arm"]
-        world = self.world.step(state.world, actions, in_place=in_place)
+        world = self.world.step(state.world, actions)
         after = world.arms["arm"]
         moved = self.marker(after.seen_mm) - self.marker(before.seen_mm)
-        recall = state.goal.recall.after(after.seen_kPa - before.seen_kPa, moved)
-        return TaskState(world, replace(state.goal, recall=recall))
+        history = state.goal.history.after(after.seen_kPa - before.seen_kPa, moved)
+        return TaskState(world, replace(state.goal, history=history))
 
-    def observe(self, state: TaskState) -> dict[str, Tensor]:
-        """Body, errors now and ahead, pressures, direction of change, last steps, time.
+    def blocks(self, state: TaskState[FollowGoal]) -> dict[str, ObservationBlocks]:
+        """The arm's shape and pressures, errors now and ahead, the last steps, the time.
 
-        Errors through asinh, in mm and the first two in `fine_mm` as well: as they are within that
-        length, by their logarithm beyond. So is the error that the model expects a step from now
-        if the commands are held.
+        Errors are scaled by asinh: linear within the length named, logarithmic beyond. The first
+        two and the predicted one are also scaled with `fine_mm`.
         """
-        part = state.world.arms["arm"]
+        part, history = state.world.arms["arm"], state.goal.history
         point = self.marker(part.seen_mm)
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
-        fine = errors[:2]
-        if self.config.foresight:
-            fine.append(self.target_mm(state, 1) - self.marker(self._held(part)))
-        parts = [
-            (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
-            *(error.asinh() for error in errors),
-            *((error / self.config.fine_mm).asinh() for error in fine),
-            *pressure_part(self.arm, part),
-            *state.goal.recall.seen(),
-            2.0 * state.world.steps[:, None] / self.steps - 1.0,
-        ]
-        return {"arm": torch.cat(parts, 1)}
+        blocks = {
+            SHAPE: (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+            **numbered(ERROR, [error.asinh() for error in errors]),
+            **numbered(FINE, [(error / self.config.fine_mm).asinh() for error in errors[:2]]),
+        }
+        if self.config.one_step_prediction:
+            predicted = self.target_mm(state, 1) - self.marker(self._held(part))
+            blocks[PREDICTED] = (predicted / self.config.fine_mm).asinh()
+        blocks |= pressure_blocks(self.arm, part)
+        blocks[PRESSURE_HISTORY] = history.kPa.flatten(1)
+        blocks[POINT_HISTORY] = history.mm.flatten(1)
+        blocks[TIME] = 2.0 * state.world.steps[:, None] / self.steps - 1.0
+        return {"arm": blocks}
+
+    def observe(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
+        return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     def _held(self, part: ArmPart) -> Tensor:
-        """(B, n, 3) mm: where the arm's model expects the key points if the commands are held."""
+        """(B, n, 3) mm: key points that the model predicts for the next step, commands held."""
         pressure = self.arm.pneumatics.follow(part.pressure, part.command, self.dt_s)
-        held = self.arm.foresee(part, pressure, self.dt_s)
+        held = self.arm.predict(part, pressure, self.dt_s)
         if self.arm.vary.noise_mm == 0.0:
             return held
-        # The model knows where the arm truly is: of what it expects only the movement is told.
-        return part.seen_mm + held - self.arm.foresee(part, part.pressure, self.dt_s)
+        # The model starts from the arm's true shape. Adding only the predicted movement to the
+        # measured shape keeps the sensors' noise in the observation.
+        return part.seen_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
 
-    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
-        """track: exp(-e), e in mm (Chen et al. 2025, sec. IV-A); fine: the same, finer scale."""
-        error, config = self.error_mm(state), self.config
-        terms = {"track": (-error).exp()}
-        if config.fine_weight:
-            terms["fine"] = config.fine_weight * (-error / config.fine_mm).exp()
-        return {"arm": terms}
+    def rewards(self, state: TaskState[FollowGoal]) -> dict[str, dict[str, Tensor]]:
+        """See `FollowWeights`."""
+        error = self.error_mm(state)
+        terms = {"track": (-error).exp(), "fine": (-error / self.config.fine_mm).exp()}
+        return {"arm": weighted(terms, self.config.weights)}
 
-    def ended(self, state: TaskState) -> Tensor:
+    def ended(self, state: TaskState[FollowGoal]) -> Tensor:
+        """Never: an episode lasts its full time."""
         return torch.zeros_like(state.world.failed)
 
-    def measures(self, state: TaskState) -> dict[str, Tensor]:
-        """The error on the path; nan while the target waits."""
+    def measures(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
+        """The error on the path; nan while the reference waits."""
         return {
             "error_mm": self.error_mm(state).masked_fill(
                 state.world.steps <= self.approach, float("nan")
             )
         }
 
-    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
+    def trace(self, state: TaskState[FollowGoal]) -> tuple[Tensor, Tensor]:
         point = self.marker(state.world.arms["arm"].points_mm)
         return self.target_mm(state)[:, None], point[:, None]
 
-    def script(self, state: TaskState) -> dict[str, Tensor]:
-        """Damped least squares for the pressures that put the point on the next target."""
+    def script(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
+        """Scripted expert: inverse kinematics for the point on the next target."""
 
         def error(points: Tensor, target: Tensor) -> Tensor:
             return (self.marker(points) - target)[:, : self._directions]
 
         part, target = state.world.arms["arm"], self.target_mm(state, 1)
-        return {"arm": seek(self.arm, part, target, error, self.dt_s)}
+        return {"arm": action_towards(self.arm, part, target, error, self.dt_s)}

@@ -1,9 +1,12 @@
-"""Every task's configuration by name, as a value, as a plain table and from a TOML file."""
+"""The list of tasks, and their configurations as values, plain tables and TOML files.
+
+A new task is one file and one line in `TASKS`. Gymnasium ids, training presets, the promises in
+`tests/tasks/test_tasks.py` and the reference in the docs follow from that line.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +14,59 @@ import torch
 
 from surgisoft.config import Where, from_table, read_toml
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.base import Task
-from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
-from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane
-from surgisoft.tasks.track import SQUARE, TrackConfig, track_circle, track_square
-from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
+from surgisoft.tasks.base import Task, TaskSpec
+from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
+from surgisoft.tasks.keyhole import KEYHOLE
+from surgisoft.tasks.laser_plane import LASER_PLANE
+from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
+from surgisoft.tasks.track_body import TRACK_BODY
 
-CONFIGS: dict[str, Any] = {
-    "track_circle": TrackConfig(),
-    "track_square": SQUARE,
-    "track_body": TrackBodyConfig(),
-    "laser_plane": LaserPlaneConfig(),
-    "keyhole": KeyholeConfig(),
-    "circle_ablation": CircleAblationConfig(),
+TASKS: dict[str, TaskSpec] = {
+    "track_circle": TRACK_CIRCLE,
+    "track_square": TRACK_SQUARE,
+    "track_body": TRACK_BODY,
+    "laser_plane": LASER_PLANE,
+    "keyhole": KEYHOLE,
+    "circle_ablation": CIRCLE_ABLATION,
 }
-"""Name -> the configuration that the task has without one."""
+"""Every task by name."""
+
+
+def spec_of(task: str) -> TaskSpec:
+    """The named task's entry; an unknown name raises an InputError that lists the known ones."""
+    if task not in TASKS:
+        raise unknown_name("task", task, TASKS)
+    return TASKS[task]
+
+
+def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> Task:
+    """Build the named task; without a config with its default one."""
+    spec = spec_of(name)
+    return spec.build(spec.config if config is None else config, device)
+
+
+def make_with(
+    name: str,
+    config: Any = None,
+    device: str | torch.device = "cpu",
+    scene: str | Path | None = None,
+    arm: str | Path | None = None,
+    geometry: str | None = None,
+) -> Task:
+    """Build the named task with fields of its config changed; None leaves one as it is.
+
+    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
+    model's folder or `default`. geometry: `fcl` or `batched`, see `world.scene.GEOMETRIES`.
+    """
+    config = config_of(name) if config is None else config
+    changes = {"scene": scene, "arm": arm, "geometry": geometry}
+    given = {field: value for field, value in changes.items() if value is not None}
+    return make_task(name, with_fields(config, **given), device)
 
 
 def config_of(task: str) -> Any:
-    """The named task's own configuration; an unknown name answers with the known ones."""
-    if task not in CONFIGS:
-        raise unknown_name("task", task, CONFIGS)
-    return CONFIGS[task]
+    """The named task's default configuration."""
+    return spec_of(task).config
 
 
 def config_table(config: Any) -> Any:
@@ -46,9 +79,12 @@ def config_table(config: Any) -> Any:
 
 
 def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
-    """The named task's configuration with the fields of a table changed; `file` is for errors."""
+    """The named task's configuration with the fields of a table changed; `file` is for errors.
+
+    Names that a field had in earlier versions are accepted, see `with_present_names`.
+    """
     own = config_of(task)
-    whole = _merged(config_table(own), table)
+    whole = _merged(config_table(own), with_present_names(own, table))
     try:
         return from_table(type(own), whole, Where(file, text))
     except InputError as error:
@@ -63,9 +99,9 @@ def read_config(task: str, file: Path) -> Any:
 
 
 def with_fields(config: Any, **values: Any) -> Any:
-    """The configuration with each named field changed, at whatever depth it is.
+    """The configuration with each named field changed, at any depth.
 
-    A name that no part of it has is an error.
+    A name that no part of it has raises an InputError.
     """
     changed, found = _with_fields(config, values)
     absent = set(values) - found
@@ -74,6 +110,33 @@ def with_fields(config: Any, **values: Any) -> Any:
             f"this task has no {', '.join(sorted(absent))}: leave '{sorted(absent)[0]}' out"
         )
     return changed
+
+
+def with_present_names(config: Any, table: Any) -> Any:
+    """A table for `config`, with the field names of earlier versions replaced by the present ones.
+
+    A config class lists them in `FORMER_NAMES`: former name -> present name, with dots where the
+    field has moved into a part (`fine_weight` -> `weights.fine`). The present name wins where a
+    table has both.
+    """
+    if not isinstance(table, dict):
+        return table
+    former, moved, result = getattr(config, "FORMER_NAMES", {}), {}, {}
+    for name, value in table.items():
+        if name in former:
+            for part in reversed(former[name].split(".")):
+                value = {part: value}
+            moved = _merged(moved, value)
+        else:
+            result[name] = value
+    result = _merged(moved, result)
+    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    return {
+        name: with_present_names(known[name], value)
+        if dataclasses.is_dataclass(known.get(name))
+        else value
+        for name, value in result.items()
+    }
 
 
 def _with_fields(config: Any, values: dict[str, Any]) -> tuple[Any, set[str]]:
@@ -93,21 +156,3 @@ def _merged(base: Any, changes: Any) -> Any:
     if not (isinstance(base, dict) and isinstance(changes, dict)):
         return changes
     return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
-
-
-TASKS: dict[str, Callable[..., Task]] = {
-    "track_circle": track_circle,
-    "track_square": track_square,
-    "track_body": TrackBody,
-    "laser_plane": laser_plane,
-    "keyhole": Keyhole,
-    "circle_ablation": CircleAblation,
-}
-"""Name -> builder(config=None, device="cpu"); without a config the task's own."""
-
-
-def make_task(name: str, config=None, device: str | torch.device = "cpu") -> Task:
-    """The named task; an unknown name answers with the known ones."""
-    if name not in TASKS:
-        raise unknown_name("task", name, TASKS)
-    return TASKS[name](config, device)

@@ -1,10 +1,13 @@
-"""Gymnasium's Env and VectorEnv for tasks of one agent; they translate and nothing else.
+"""Tasks of one agent as Gymnasium Env and VectorEnv: adapters over a batch.
 
-Importing this registers `surgisoft/NAME-v0`; `gymnasium.make("surgisoft.tasks.single:surgisoft/
-track_circle-v0")` imports it by itself, and `gymnasium.make_vec` takes the batched one.
+Importing this module registers `surgisoft/NAME-v0` for `gymnasium.make` and `gymnasium.make_vec`.
+The id `surgisoft.tasks.single:surgisoft/NAME-v0` imports the module by itself.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -15,49 +18,72 @@ from gymnasium.vector.utils import batch_space
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import Port, unseeded
-from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.numpy_adapter import NumpyAdapter, entropy_seed
+from surgisoft.tasks.registry import TASKS, make_with
 
-ONE_ARM = ("track_circle", "track_square", "track_body", "laser_plane", "keyhole")
-"""Tasks of one agent."""
+ONE_ARM = tuple(name for name, spec in TASKS.items() if len(spec.agents) == 1)
+"""Names of the tasks of one agent."""
 
 
-def _port(task: str | Task, config, device) -> tuple[Port, str]:
-    task = make_task(task, config, device) if isinstance(task, str) else task
+def _adapter(
+    task: str | Task,
+    config: Any,
+    device: str | torch.device,
+    scene: str | Path | None,
+    arm: str | Path | None,
+    geometry: str | None,
+) -> tuple[NumpyAdapter, str]:
+    """The adapter of a task of one agent, and that agent; arguments as for `registry.make_with`."""
+    if isinstance(task, str):
+        task = make_with(task, config, device, scene, arm, geometry)
     if len(task.agents) != 1:
         raise InputError(
             f"task '{task.name}' has agents {', '.join(task.agents)}, expected one; use "
             "surgisoft.parallel_env"
         )
-    return Port(task), task.agents[0]
+    return NumpyAdapter(task), task.agents[0]
 
 
 class SingleEnv(gymnasium.Env):
-    """One environment. Actions (m,) kPa, observations (D,), both float32."""
+    """One environment of a task. Actions (m,) kPa and observations (D,) are float32.
+
+    The info of a step holds the weighted reward terms and the measures that apply.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
 
-    def __init__(self, task: str | Task, config=None, device: str | torch.device = "cpu"):
-        self._port, self._agent = _port(task, config, device)
+    def __init__(
+        self,
+        task: str | Task,
+        config: Any = None,
+        device: str | torch.device = "cpu",
+        scene: str | Path | None = None,
+        arm: str | Path | None = None,
+        geometry: str | None = None,
+    ):
+        """The task's name, and changes to its config as for `registry.make_with`; or a task."""
+        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry)
         self._state = None
-        self.observation_space = Box(*self._port.observed(self._agent))
-        self.action_space = Box(*self._port.acted(self._agent))
+        self.observation_space = Box(*self._adapter.observation_bounds(self._agent))
+        self.action_space = Box(*self._adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**63))
-        self._state = self._port.seeded([seed])
-        return self._port.observations(self._state)[self._agent][0], {}
+        self._state = self._adapter.seeded([seed])
+        return self._adapter.observations(self._state)[self._agent][0], {}
 
     def step(self, action):
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self._port.step(self._state, {self._agent: np.asarray(action)[None]})
+        self._state, outcome = self._adapter.step(
+            self._state, {self._agent: np.asarray(action)[None]}
+        )
         info = {name: value.item() for name, value in outcome.terms[self._agent].items()}
         info |= {n: v.item() for n, v in outcome.measures.items() if v.isfinite().all()}
         return (
-            self._port.observations(self._state)[self._agent][0],
+            self._adapter.observations(self._state)[self._agent][0],
             outcome.rewards[self._agent].item(),
             bool(outcome.terminated),
             bool(outcome.truncated),
@@ -66,40 +92,55 @@ class SingleEnv(gymnasium.Env):
 
 
 class BatchedEnv(VectorEnv):
-    """Many environments in one batch; a finished one begins anew in the same step."""
+    """Many environments of a task in one batch; a finished one is reset in the same step."""
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
-    def __init__(self, task: str | Task, num_envs=1, config=None, device="cpu", **_unused):
-        self._port, self._agent = _port(task, config, device)
+    def __init__(
+        self,
+        task: str | Task,
+        num_envs: int = 1,
+        config: Any = None,
+        device: str | torch.device = "cpu",
+        scene: str | Path | None = None,
+        arm: str | Path | None = None,
+        geometry: str | None = None,
+    ):
+        """The task's name, and changes to its config as for `registry.make_with`; or a task."""
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}, expected 1 or more")
+        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry)
         self._state, self.num_envs = None, num_envs
-        self.single_observation_space = Box(*self._port.observed(self._agent))
-        self.single_action_space = Box(*self._port.acted(self._agent))
+        self.single_observation_space = Box(*self._adapter.observation_bounds(self._agent))
+        self.single_action_space = Box(*self._adapter.action_bounds(self._agent))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Environment i is that of `SingleEnv` with seed + i; without a seed the streams go on."""
+        """Start episodes; environment i has seed + i, as in `SingleEnv`.
+
+        Without a seed the random number streams of the last episodes continue.
+        """
         if seed is None and self._state is not None:
-            self._state = self._port.again(self._state)
+            self._state = self._adapter.restart(self._state)
         else:
-            first = unseeded() if seed is None else seed
-            self._state = self._port.seeded(range(first, first + self.num_envs))
-        return self._port.observations(self._state)[self._agent], {}
+            first = entropy_seed() if seed is None else seed
+            self._state = self._adapter.seeded(range(first, first + self.num_envs))
+        return self._adapter.observations(self._state)[self._agent], {}
 
     def step(self, actions):
         if self._state is None:
             raise InputError("step before reset: call reset() first")
-        self._state, outcome = self._port.step(self._state, {self._agent: np.asarray(actions)})
+        self._state, outcome = self._adapter.step(self._state, {self._agent: np.asarray(actions)})
         done, info = outcome.done.cpu().numpy(), {}
         for name, value in {**outcome.terms[self._agent], **outcome.measures}.items():
             info[name], info[f"_{name}"] = value.cpu().numpy(), value.isfinite().cpu().numpy()
         if done.any():
-            last = self._port.observations(self._state)[self._agent]
+            last = self._adapter.observations(self._state)[self._agent]
             info["final_obs"], info["_final_obs"] = last, done
-            self._state = self._port.again(self._state, outcome.done)
+            self._state = self._adapter.restart(self._state, outcome.done)
         return (
-            self._port.observations(self._state)[self._agent],
+            self._adapter.observations(self._state)[self._agent],
             outcome.rewards[self._agent].cpu().numpy(),
             outcome.terminated.cpu().numpy(),
             outcome.truncated.cpu().numpy(),

@@ -8,40 +8,45 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.path_following import Follow, FollowConfig
+from surgisoft.tasks.base import TaskSpec
+from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.random import streams
-from surgisoft.tasks.world.world import World, WorldConfig, lone_arm, named_arm
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
 
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """A path for the tip, level above the base."""
+    """A level path for the tip, above the base."""
 
     follow: FollowConfig = field(default_factory=FollowConfig)
-    """The path and how it is walked."""
+    """The path, the observation and the reward."""
     mean_kPa: float = 20.0
-    """Pressure of all chambers with which the tip is at the path's middle, kPa."""
+    """Pressure of all chambers that puts the tip at the path's centre, kPa."""
     world: WorldConfig = field(default_factory=WorldConfig)
-    """The world and its randomisation."""
+    """The simulator and its domain randomization."""
 
 
 SQUARE = TrackConfig(FollowConfig(path="square", size_mm=15.0))
-"""The square's configuration unless told otherwise."""
+"""Default configuration of `track_square`."""
 
 
 def track_circle(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
-    """A circle of 20 mm diameter."""
+    """The tip of one arm follows a circle of 20 mm diameter."""
     return _track("track_circle", config or TrackConfig(), device)
 
 
 def track_square(config: TrackConfig | None = None, device: str | torch.device = "cpu") -> Follow:
-    """A square of 15 mm edge."""
+    """The tip of one arm follows a square of 15 mm edge."""
     return _track("track_square", config or SQUARE, device)
 
 
+TRACK_CIRCLE = TaskSpec(track_circle, TrackConfig(), ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
+TRACK_SQUARE = TaskSpec(track_square, SQUARE, ("arm",), FOLLOW_PRESET, FOLLOW_STEPS)
+
+
 def tip(points_mm: Tensor) -> Tensor:
-    """(B, 3) mm: the last of the key points (B, n, 3) mm."""
+    """(B, 3) mm: the tip, which is the last of the key points (B, n, 3) mm."""
     return points_mm[:, -1]
 
 
@@ -52,16 +57,16 @@ def _track(name: str, config: TrackConfig, device) -> Follow:
 
 
 def level_world(config: WorldConfig, mean_kPa: float, arm: str | Path, device) -> World:
-    """The named arm model alone, with mean_kPa in every chamber at the start."""
+    """A world of the named arm model alone, which starts with mean_kPa in every chamber."""
     model = named_arm(arm, device)
-    return lone_arm(config, model, (mean_kPa,) * model.spec.chambers, device)
+    return single_arm_world(config, model, (mean_kPa,) * model.spec.chambers, device)
 
 
 def points_at_start(world: World) -> Tensor:
-    """(1, n, 3) mm: key points of the world's only arm at the start, with nothing randomised."""
+    """(1, n, 3) mm: key points of the world's only arm at the start, without randomization."""
     plain = Randomisation(history=0, start_kPa=0.0)
     arm = world.arms["arm"]
     config = replace(world.config, randomisation=plain)
     start = tuple(arm.first.tolist())
-    still = lone_arm(config, arm.model, start, world.device)
+    still = single_arm_world(config, arm.model, start, world.device)
     return still.start(streams(0, 1, device=world.device)).arms["arm"].points_mm

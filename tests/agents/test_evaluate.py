@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from surgisoft.agents.evaluate import bootstrap, episode_table, summary, wilson
+from surgisoft.agents.evaluate import bootstrap, episode_table, summary
 from surgisoft.agents.referee import Contact, Verdict
 from surgisoft.agents.rollout import Rollout
 from surgisoft.cli import run
@@ -18,19 +18,13 @@ NAN = float("nan")
 
 
 @pytest.mark.parametrize(
-    ("share", "count", "low", "high"),
-    [(0.0, 10, 0.0, 0.2775), (0.5, 10, 0.2366, 0.7634), (0.99, 100, 0.9455, 0.9982)],
+    ("hits", "count", "low", "high"),
+    [(0, 10, 0.0, 0.2775), (5, 10, 0.2366, 0.7634), (99, 100, 0.9455, 0.9982)],
 )
-def test_wilson_interval_as_in_tables(share, count, low, high):
-    """Newcombe 1998, table I (method 3), and scipy.stats.binomtest(...).proportion_ci('wilson')."""
-    assert wilson(share, count) == pytest.approx((low, high), abs=1e-4)
-
-
-def test_wilson_agrees_with_scipy():
-    stats = pytest.importorskip("scipy.stats")
-    for hits, count in ((1, 3), (7, 20), (199, 200)):
-        interval = stats.binomtest(hits, count).proportion_ci(method="wilson")
-        assert wilson(hits / count, count) == pytest.approx((interval.low, interval.high))
+def test_interval_of_a_rate_as_in_tables(hits, count, low, high):
+    """Newcombe 1998, table I (method 3): Wilson's interval."""
+    found = summary(np.repeat([1.0, 0.0], [hits, count - hits]), rate=True)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-4)
 
 
 def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():

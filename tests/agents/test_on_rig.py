@@ -1,19 +1,22 @@
-"""Tasks on the virtual rig: what is seen, what is true, and what feedback is worth."""
+"""Tasks on the virtual rig: measurements, the truth beside them, and what feedback is worth."""
 
+import gc
+import weakref
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.on_rig import RigConfig, on_rig, virtual_rig
 from surgisoft.agents.policies import Random, Scripted
 from surgisoft.agents.rollout import rollout
 from surgisoft.errors import InputError
+from surgisoft.rig import VirtualRig
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig, track_circle
+from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
 
 SHORT = TrackConfig(FollowConfig(loop_s=5.0, approach_s=2.0, size_mm=5.0))
@@ -25,7 +28,7 @@ def task():
 
 
 def test_cameras_hold_the_arm_to_its_path(task):
-    """Specimen 1 is not the one that the model was fitted to."""
+    """Robot 1 is not the one that the model was fitted to."""
     errors = {}
     for cameras in (True, False):
         played = rollout(on_rig(task, RigConfig(seed=1, cameras=cameras)), Scripted(), 2, seed=0)
@@ -34,37 +37,96 @@ def test_cameras_hold_the_arm_to_its_path(task):
     assert errors[False] > 3 * errors[True]
 
 
-def test_the_models_own_specimen_is_followed_closely(task):
+def test_the_robot_that_the_model_was_fitted_to_is_followed_closely(task):
     played = rollout(on_rig(task), Scripted(), 2, seed=0)
     assert played.mean("error_mm").max() < 0.12
     assert played.mean("error_mm").min() > 0.005, "the rig is no copy of the model"
 
 
-def test_what_is_seen_is_measured_and_what_is_judged_is_not(task):
-    moved = on_rig(task, RigConfig(settle_s=0.5))
-    play = Episodes(moved)
+class Watched(VirtualRig):
+    """A virtual rig that keeps the last truth that it gave."""
+
+    def read_beside_truth(self):
+        sample, self.truth = super().read_beside_truth()
+        return sample, self.truth
+
+
+def watched(config, trial):
+    return Watched(config.seed, hidden=config.hidden, noise=config.noise, take=trial)
+
+
+def test_policies_see_measurements_and_errors_are_those_of_the_true_body(task):
+    play = Episodes(on_rig(task, RigConfig(settle_s=0.5), watched))
     state = play.seeded(3, 1)
-    (bench,) = moved.world.arms["arm"]._benches.values()
-    told, time_s = bench.told_kPa.copy(), bench.rig.time_s
+    plant = state.world.arms["arm"].plant
+    (rig,) = plant.rigs.things
+    before, time_s = plant.target_kPa, rig.time_s
     state, _ = play.step(state, {"arm": torch.tensor([[1.0, -9.0, 0.5]])})
     part, limit = state.world.arms["arm"], task.arm.pneumatics.step_kPa
-    assert bench.rig.time_s - time_s == pytest.approx(task.dt_s)
-    np.testing.assert_allclose(bench.told_kPa - told, [1.0, -limit, 0.5], atol=1e-5)
-    chamber = torch.tensor(bench.rig._state.chamber, dtype=torch.float32)
+    assert part.plant.rigs.things == (rig,)
+    assert rig.time_s - time_s == pytest.approx(task.dt_s)
+    change = part.plant.target_kPa - before
+    torch.testing.assert_close(change, torch.tensor([[1.0, -limit, 0.5]]), atol=1e-5, rtol=0)
+    chamber = torch.tensor(rig.truth.pressures_kPa[0], dtype=torch.float32)
     assert 0.0 < (part.seen_kPa[0] - chamber).abs().max() < 0.15
     noise = part.seen_mm - part.points_mm
     assert 0.0 < noise.norm(dim=2).mean() < 0.2
-    centres = torch.tensor(bench.rig._state.shape.centres, dtype=torch.float32)
+    centres = torch.tensor(rig.truth.centres_mm[0], dtype=torch.float32)
     assert (part.points_mm[0] - centres).norm(dim=1).max() < 0.5
+
+
+def test_memory_is_constant_over_episodes():
+    """200 episodes two by two: no rig of an earlier batch lives on, none of a reset episode."""
+    alive, most = weakref.WeakSet(), 0
+
+    def counted(config, trial):
+        nonlocal most
+        rig = virtual_rig(config, trial)
+        alive.add(rig)
+        most = max(most, len(alive))
+        return rig
+
+    brief = track_circle(TrackConfig(FollowConfig(loop_s=0.1, approach_s=0.1)))
+    moved = on_rig(brief, RigConfig(settle_s=0.05), counted)
+    rollout(moved, Random(), 160, seed=0, batch=2)
+    play = Episodes(moved)
+    state = play.seeded(1, 2)
+    for _ in range(40):
+        state = play.reset(state, torch.tensor([True, False]))
+    kept = state.world.arms["arm"].plant.rigs.things
+    gc.collect()
+    assert set(alive) == set(kept)
+    assert most <= 5
+
+
+def test_a_reset_and_a_choice_of_rows_keep_each_episodes_rig():
+    brief = track_circle(TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.1)))
+    play = Episodes(on_rig(brief, RigConfig(settle_s=0.05)))
+    state = play.seeded(1, 3)
+    first = state.world.arms["arm"].plant.rigs.things
+    state = play.reset(state, torch.tensor([False, True, False]))
+    second = state.world.arms["arm"].plant.rigs.things
+    assert (second[0], second[2]) == (first[0], first[2])
+    assert second[1] is not first[1]
+    chosen = rows(state, torch.tensor([2, 0])).world.arms["arm"]
+    assert chosen.plant.rigs.things == (first[2], first[0])
+
+
+def test_task_and_world_have_the_same_arm(task):
+    moved = on_rig(task, RigConfig(settle_s=0.2))
+    assert moved.arm is moved.world.arms["arm"]
+    assert task.arm is task.world.arms["arm"] is not moved.arm
+    cut = on_rig(CircleAblation(), RigConfig(settle_s=0.2))
+    assert {name: each.arm for name, each in cut.pointing.items()} == cut.world.arms
 
 
 def test_without_noise_cameras_see_the_truth(task):
     state = Episodes(on_rig(task, RigConfig(noise=0.0, settle_s=0.5))).seeded(0, 2)
     part = state.world.arms["arm"]
     torch.testing.assert_close(part.seen_mm, part.points_mm)
-    # What is foreseen for the present pressure is what is seen: the offset takes the model there.
-    foreseen = task.arm.foresee(part, part.pressure, 1e-3)
-    torch.testing.assert_close(foreseen, part.seen_mm, atol=2e-2, rtol=0.0)
+    # The prediction for the present pressure is the estimate: the offset takes the model there.
+    predicted = task.arm.predict(part, part.pressure, 1e-3)
+    torch.testing.assert_close(predicted, part.seen_mm, atol=2e-2, rtol=0.0)
 
 
 def test_the_same_seed_is_the_same_episode_in_any_batch(task):
@@ -83,16 +145,16 @@ def test_the_same_seed_is_the_same_episode_in_any_batch(task):
     assert (other.mean("error_mm") - whole.mean("error_mm")).abs().min() > 0.01
 
 
-def test_each_arm_of_a_task_has_a_bench_of_its_own():
+def test_each_arm_of_a_task_is_on_a_rig_of_its_own():
     task = CircleAblation()
     moved = on_rig(task, RigConfig(settle_s=0.2))
     state = Episodes(moved).seeded(0, 1)
     drawn = Random().act(moved, state, {})
     for _ in range(3):
         state, outcome = Episodes(moved).step(state, drawn)
-    benches = [next(iter(arm._benches.values())) for arm in moved.world.arms.values()]
-    assert benches[0].rig is not benches[1].rig
-    assert not np.allclose(benches[0].told_kPa, benches[1].told_kPa)
+    laser, endoscope = (state.world.arms[name].plant for name in ("laser", "endoscope"))
+    assert laser.rigs.things[0] is not endoscope.rigs.things[0]
+    assert not torch.allclose(laser.target_kPa, endoscope.target_kPa)
     assert outcome.measures["clearance_mm"].isfinite().all()
     laser = state.world.arms["laser"]
     base = task.world.arms["laser"].pose[:3, 3]
@@ -104,5 +166,5 @@ def test_a_step_that_the_rig_cannot_keep_is_one_line():
     task = track_circle(TrackConfig(world=WorldConfig(dt_s=0.08)))
     with pytest.raises(InputError, match=r"0\.08 s; on the rig expected a multiple of its 0\.05"):
         on_rig(task)
-    with pytest.raises(InputError, match="trust is 2"):
-        RigConfig(trust=2.0)
+    with pytest.raises(InputError, match="observer_gain is 2"):
+        RigConfig(observer_gain=2.0)

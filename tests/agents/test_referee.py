@@ -54,7 +54,7 @@ def test_an_arm_driven_into_the_organ_is_found_with_time_and_place(task):
 
 def test_two_straight_arms_are_as_far_apart_as_their_axes_less_radii(task):
     state = Episodes(task).seeded(0, 1)
-    radii = task.world.surroundings.geometry.radii_mm
+    radii = task.world.scene.geometry.radii_mm
     far = torch.tensor([0.0, 0.0, 400.0])
     along = torch.linspace(0.0, 50.0, 21)[:, None] * torch.tensor([1.0, 0.0, 0.0])
     apart = torch.tensor([0.0, 20.0, 0.0])

@@ -152,8 +152,8 @@ def test_a_run_opens_from_its_folder_alone(ablation, tmp_path):
     run = RunFolder(moved)
     again = run.task()
     assert str(again.config.scene).startswith(str(moved))
-    assert again.config.world.scenery.view_points == 5
-    assert again.surroundings.spec.lesion == ablation.surroundings.spec.lesion
+    assert again.config.world.scene_engine.view_points == 5
+    assert again.scene.spec.lesion == ablation.scene.spec.lesion
     for name, arm in ablation.world.arms.items():
         own = again.world.arms[name].model.state_dict()
         for key, value in arm.model.state_dict().items():

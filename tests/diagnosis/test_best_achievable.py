@@ -10,7 +10,7 @@ from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.diagnosis.selection import best_achievable
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_known_error, load_model
+from surgisoft.surrogate.checkpoint import load_model
 from tests.diagnosis.synthetic import (
     NOISE_MM,
     backlash,
@@ -62,9 +62,9 @@ def test_compare_and_diagnose_give_one_floor_and_one_best_achievable_error(hidde
     """On the same rows; no error of the ranking, and none with the named effects, is below it."""
     rig = VirtualRig(0, take=3, hidden=((hidden, 1.5),))
     made, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=3))
-    model, known = load_model("default"), load_known_error("default")
-    found = diagnose(model, [made], reference=known)
-    result, _ = compare(model, [made], part="training", reference=known)
+    model = load_model("default")
+    found = diagnose(model, [made])
+    result, _ = compare(model, [made], part="training")
     assert result.floor.rmse_mm == found.error_mm.floor
     assert result.ceiling.rmse_mm == found.error_mm.ceiling
     assert result.rmse_mm == pytest.approx(found.error_mm.before, rel=0.01)

@@ -12,6 +12,7 @@ from surgisoft.diagnosis.design.isolability import isolability
 from surgisoft.diagnosis.design.next_experiment import (
     likely_rivals,
     make_plans,
+    next_experiment,
     pose_question,
     propose,
     recommend,
@@ -276,7 +277,7 @@ def test_after_a_change_by_hand_the_new_recording_is_diagnosed_alone(tmp_path, l
     model = str(files("surgisoft") / "assets" / "default_arm")
     data, out = tmp_path / "r.parquet", tmp_path / "s.csv"
     save_recording(lagging, data)
-    answer = recommend(problem_of(default_arm(), [lagging]), ["line_lag", "rate_dependence"])
+    answer = next_experiment(default_arm(), [lagging], ["line_lag", "rate_dependence"])
     arguments = ["next-experiment", model, str(data), "-o", str(out)]
     assert run([*arguments, "--between", "line_lag", "rate_dependence"]) == 0
     printed = capsys.readouterr().out

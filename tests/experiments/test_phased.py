@@ -47,14 +47,14 @@ def cutting(spec, base):
 
 def _with(state, fraction=None, clearance=None):
     """The state with what is seen (0..1) and the clearance (mm) of both episodes."""
-    scenery = state.world.scenery
-    ones = torch.ones_like(scenery.view.fraction)
+    scene = state.world.scene
+    ones = torch.ones_like(scene.view.fraction)
     if fraction is not None:
-        scenery = replace(scenery, view=replace(scenery.view, fraction=fraction * ones))
+        scene = replace(scene, view=replace(scene.view, fraction=fraction * ones))
     if clearance is not None:
         room = SimpleNamespace(least_mm=clearance * ones, collides=clearance * ones < 0.0)
-        scenery = replace(scenery, clearance=room)
-    return replace(state, world=replace(state.world, scenery=scenery))
+        scene = replace(scene, clearance=room)
+    return replace(state, world=replace(state.world, scene=scene))
 
 
 def test_the_interlock_lets_the_beam_on_only_when_all_is_well(cutting):
@@ -178,7 +178,9 @@ def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, 
         state, _ = play.step(state, actions)
     command = state.world.arms["endoscope"].command
     assert torch.allclose(command, torch.tensor([5.0, 0.0, 0.0]).expand(2, 3), atol=1e-4)
-    miss = task.base.aims["laser"].miss(state.world.arms["laser"].points_mm, point.expand(2, 3))
+    miss = task.base.pointing["laser"].offset_mm(
+        state.world.arms["laser"].points_mm, point.expand(2, 3)
+    )
     assert (miss.norm(dim=1) < 8.0).all()
     with pytest.raises(InputError, match="expected 2 in kPa"):
         Schedule(file, 2)

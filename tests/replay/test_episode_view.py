@@ -39,12 +39,12 @@ def recorded(name: str, steps: int, seed: int = 4):
     """The first steps of a scripted episode."""
     task = make_task(name)
     with torch.inference_mode():
-        play = Episodes(task)
+        play = Episodes(task, donate=True)
         state = play.seeded(seed, 1)
         recorder = EpisodeRecorder(task, state, driver="scripted", seed=seed)
         for _ in range(steps):
             actions = task.script(state)
-            state, outcome = play.step(state, actions, in_place=True)
+            state, outcome = play.step(state, actions)
             recorder.step(state, outcome, actions)
     return recorder.log()
 

@@ -163,7 +163,7 @@ def test_twist_turns_the_markers_but_not_the_straight_centreline():
         r.command([40.0, 40, 40])
         r.wait(4.0)
         r.read()
-        frame = r._state.shape.frames[-1]
+        frame = r.plane_frames[-1]
         turns.append(np.degrees(np.arctan2(frame[1, 0], frame[0, 0])))
     assert 3 < abs(turns[1] - turns[0]) < 40
 
@@ -223,6 +223,17 @@ def test_a_knock_turns_the_base_once_and_for_all():
     assert 30.0 < 6.0 * late + 30.0 < 115.0
     np.testing.assert_allclose(shift[late:], shift[-1], rtol=0.05)
     assert shift[-1] == pytest.approx(np.radians(1.2) * 60, rel=0.4)
+
+
+def test_an_event_that_occurs_once_falls_into_the_window_of_the_configuration():
+    """Times since switching on; the recording begins after a reset of 30 s."""
+    still = Protocol("p", "continuous", [[20.0, 20, 40]] * 2, [0, 0], [0.0, 25.0])
+    plain = truth_of(still).noise_free_mm
+    for window in ((32.0, 36.0), (44.0, 48.0)):
+        moved = truth_of(still, hidden=[("knock", 1.0)], event_window_s=window).noise_free_mm
+        shift = np.linalg.norm(moved[:, -1] - plain[:, -1], axis=1)
+        moment = 30.0 + 0.05 * np.argmax(shift > 0.1)
+        assert window[0] - 0.1 <= moment <= window[1] + 0.1
 
 
 def test_a_fibre_breaks_once_and_no_rest_mends_it():

@@ -10,7 +10,6 @@ import torch
 import trimesh
 
 from surgisoft.cli import run
-from surgisoft.cli.arms import reaches_of
 from surgisoft.errors import InputError
 from surgisoft.scene.author import check_target
 from surgisoft.scene.capsules import ArmShape
@@ -21,8 +20,9 @@ from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
-from surgisoft.tasks.world.random import streams
-from surgisoft.tasks.world.world import WorldConfig, lone_arm
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.reach import reaches_of
+from surgisoft.tasks.world.world import WorldConfig, single_arm_world
 from tests.scene.shapes import ball, box, lumpy
 
 
@@ -187,7 +187,7 @@ def test_the_tables_shapes_are_those_that_the_tasks_bend(made):
         pneumatics=Pneumatics(step_kPa=100.0, tau_s=0.0),
         randomisation=Randomisation(history=0, start_kPa=0.0),
     )
-    world = lone_arm(free)
+    world = single_arm_world(free)
     state = world.start(streams(0, 5))
     which = np.linspace(0, len(reach.commands) - 1, 5).astype(int)
     action = torch.tensor(reach.commands[which], dtype=torch.float32)

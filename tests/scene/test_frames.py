@@ -21,21 +21,6 @@ def random_rotations(count, seed=0):
     return Rotation.random(count, random_state=np.random.default_rng(seed))
 
 
-def test_quaternions_agree_with_scipy_both_ways():
-    truth = random_rotations(500)
-    q = truth.as_quat(canonical=True, scalar_first=True)
-    np.testing.assert_allclose(frames.rotation_from_quaternion(q), truth.as_matrix(), atol=1e-14)
-    np.testing.assert_allclose(frames.quaternion_from_rotation(truth.as_matrix()), q, atol=1e-14)
-
-
-@pytest.mark.parametrize("axis", np.eye(3))
-def test_half_turns_have_exact_quaternions(axis):
-    half_turn = 2 * np.outer(axis, axis) - np.eye(3)
-    np.testing.assert_allclose(
-        abs(frames.quaternion_from_rotation(half_turn)), [0.0, *axis], atol=1e-15
-    )
-
-
 @given(vector, angle)
 def test_axis_angle_agrees_with_scipy(axis, turn):
     unit = np.asarray(axis) / np.linalg.norm(axis)
@@ -105,12 +90,11 @@ def test_torch_and_numpy_agree_and_keep_their_kind():
     for function in (frames.apply, frames.rotate):
         there = function(tensor, torch.as_tensor(points)).numpy()
         np.testing.assert_allclose(there, function(pose, points), atol=1e-14)
-    single = torch.as_tensor(truth, dtype=torch.float32)
-    assert frames.quaternion_from_rotation(single).dtype == torch.float32
+    axes, turns = torch.as_tensor(position), torch.as_tensor(points[:, 1, 0])
+    turned = frames.rotation_from_axis_angle(axes.float(), turns.float())
+    assert turned.dtype == torch.float32
     np.testing.assert_allclose(
-        frames.quaternion_from_rotation(single).numpy(),
-        frames.quaternion_from_rotation(truth),
-        atol=1e-6,
+        turned.numpy(), frames.rotation_from_axis_angle(position, points[:, 1, 0]), atol=1e-6
     )
 
 
@@ -126,10 +110,7 @@ def test_mesh_measures_match_hand_computed_numbers():
     assert mesh.volume_mm3 == pytest.approx(1 / 6)
     np.testing.assert_allclose(mesh.face_areas_mm2, [0.5, 0.5, 0.5, math.sqrt(3) / 2])
     np.testing.assert_allclose(mesh.face_normals[3], np.ones(3) / math.sqrt(3))
-    np.testing.assert_allclose(mesh.vertex_areas_mm2[0], 0.5)
-    assert mesh.vertex_areas_mm2.sum() == pytest.approx(mesh.face_areas_mm2.sum())
     np.testing.assert_allclose(mesh.vertex_normals[0], -np.ones(3) / math.sqrt(3))
-    np.testing.assert_allclose(mesh.edge_normals[0, 2], [0, -1, -1] / np.sqrt(2))
     np.testing.assert_allclose(mesh.bounds_mm, [[0, 0, 0], [1, 1, 1]])
 
 

@@ -1,5 +1,7 @@
 """PettingZoo's and Gymnasium's own checkers, and what they do not check."""
 
+import copy
+import pickle
 import warnings
 
 import gymnasium
@@ -64,24 +66,24 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
 def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     """Every clearance and hit of an episode is an answer of that engine, and of no other."""
     env = surgisoft.parallel_env("circle_ablation", geometry=geometry)
-    around, asked = env.task.surroundings, []
+    around, asked = env.task.scene, []
     referee = Referee(around.geometry.bodies)
-    assert isinstance(around.judge, RefereedScene if geometry == "fcl" else BatchedScene)
+    assert isinstance(around.collision, RefereedScene if geometry == "fcl" else BatchedScene)
     for name in ("clearance", "cast"):
-        ask = getattr(around.judge, name)
+        ask = getattr(around.collision, name)
         monkeypatch.setattr(
-            around.judge,
+            around.collision,
             name,
             lambda *a, ask=ask, name=name, **k: asked.append(name) or ask(*a, **k),
         )
     env.reset(seed=3)
     env.step({agent: np.full(3, 2.0, np.float32) for agent in env.agents})
     assert asked.count("clearance") == 2
-    arms, scenery = env._state.world.arms, env._state.world.scenery
+    arms, scene = env._state.world.arms, env._state.world.scene
     shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
     exact = referee.clearance(shapes).least_mm
     near = {"fcl": 1e-4, "batched": 0.5}[geometry]
-    assert scenery.clearance.least_mm.item() == pytest.approx(exact, abs=near)
+    assert scene.clearance.least_mm.item() == pytest.approx(exact, abs=near)
 
 
 def test_scene_and_arm_are_named_in_one_call(tmp_path):
@@ -194,3 +196,39 @@ def test_wrong_use_is_one_line():
         env.step({"arm": np.zeros(2)})
     with pytest.raises(InputError, match="step before reset"):
         SingleEnv("track_circle").step(np.zeros(3))
+
+
+@every_task
+@pytest.mark.parametrize("geometry", ["fcl", "batched"])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copied_environment_goes_on_as_the_original(name, geometry, copied):
+    """In the middle of an episode; SuperSuit and AsyncVectorEnv copy environments."""
+    env = parallel_env(name, geometry=geometry)
+    env.reset(seed=5)
+    push = {agent: np.full(3, 1.5, np.float32) for agent in env.agents}
+    for _ in range(3):
+        env.step(push)
+    other = copied(env)
+    for _ in range(3):
+        for one, two in zip(env.step(push), other.step(push), strict=True):
+            for agent in push:
+                np.testing.assert_array_equal(one[agent], two[agent])
+
+
+def test_gymnasium_takes_the_arm_and_refuses_what_it_does_not_know(tmp_path):
+    env = gymnasium.make("surgisoft/track_circle-v0", arm="default", geometry="batched")
+    plain = gymnasium.make("surgisoft/track_circle-v0")
+    np.testing.assert_array_equal(env.reset(seed=4)[0], plain.reset(seed=4)[0])
+    many = gymnasium.make_vec("surgisoft/keyhole-v0", num_envs=2, geometry="fcl")
+    assert isinstance(many.unwrapped._adapter.task.world.scene.collision, RefereedScene)
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(InputError, match="no arm model there"):
+            make("surgisoft/track_circle-v0", arm=tmp_path / "none")
+        with pytest.raises(InputError, match="this task has no scene"):
+            make("surgisoft/track_circle-v0", scene=tmp_path)
+        with pytest.raises(TypeError, match="arms"):
+            make("surgisoft/track_circle-v0", arms="default")
+    with pytest.raises(TypeError, match="num_env"):
+        BatchedEnv("track_circle", num_env=3)
+    with pytest.raises(InputError, match="num_envs is 0"):
+        BatchedEnv("track_circle", 0)

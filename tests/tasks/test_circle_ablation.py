@@ -55,12 +55,12 @@ def test_the_script_cuts_the_whole_ring(cut):
 def test_the_dose_lies_on_the_ring(quick, cut):
     """Distance of the cut samples from the ring's circle, on the dose map itself."""
     states, _ = cut
-    ablation = quick.surroundings.ablation
-    deep = states[-1].world.scenery.dose.dose[0].numpy() >= ablation.cut_dose
+    ablation = quick.scene.ablation
+    deep = states[-1].world.scene.dose.dose[0].numpy() >= ablation.cut_dose
     offset = np.abs(ablation.patch.offset_mm[deep])
     assert deep.sum() > 100
     assert np.quantile(offset, 0.99) < 0.6
-    energy = states[-1].world.scenery.dose.delivered_j
+    energy = states[-1].world.scene.dose.delivered_j
     fired = torch.stack([state.goal.fired for state in states[1:]]).sum(0)
     assert (energy <= 20.0 * 0.1 * fired + 1e-3).all()
     assert (energy >= 20.0 * 0.1 * (fired - 1)).all()
@@ -69,9 +69,9 @@ def test_the_dose_lies_on_the_ring(quick, cut):
 def test_the_beam_waits_until_the_ring_is_seen(cut):
     states, _ = cut
     for before, after in pairwise(states):
-        seen = before.world.scenery.view.fraction >= 0.95
+        seen = before.world.scene.view.fraction >= 0.95
         assert (after.goal.fired <= seen).all()
-        assert torch.equal(after.goal.walked, before.goal.walked + after.goal.fired)
+        assert torch.equal(after.goal.done, before.goal.done + after.goal.fired)
     assert not states[1].goal.fired.any(), "at rest the endoscope looks elsewhere"
     assert states[60].goal.fired.all()
 
@@ -81,30 +81,30 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
     """A state in which the beam fires, changed in one respect."""
     state = rows(cut[0][80], torch.tensor([0]))
     still = {name: torch.zeros(1, 3) for name in quick.agents}
-    assert quick.advance(state, still, False).goal.fired.all()
-    scenery, goal = state.world.scenery, state.goal
+    assert quick.advance(state, still).goal.fired.all()
+    scene, goal = state.world.scene, state.goal
     if what == "view":
-        low = replace(scenery.view, fraction=torch.tensor([0.94]))
-        scenery = replace(scenery, view=low)
+        low = replace(scene.view, fraction=torch.tensor([0.94]))
+        scene = replace(scene, view=low)
     elif what == "blocked":
-        scenery = replace(scenery, hit=replace(scenery.hit, struck=torch.tensor([4])))
+        scene = replace(scene, hit=replace(scene.hit, struck=torch.tensor([4])))
     else:
-        goal = replace(goal, walked=goal.walked + 3)
-    changed = replace(state, goal=goal, world=replace(state.world, scenery=scenery))
-    after = quick.advance(changed, still, False)
+        goal = replace(goal, done=goal.done + 3)
+    changed = replace(state, goal=goal, world=replace(state.world, scene=scene))
+    after = quick.advance(changed, still)
     assert not after.goal.fired.any()
-    assert torch.equal(after.goal.walked, goal.walked)
+    assert torch.equal(after.goal.done, goal.done)
 
 
 def test_the_target_runs_along_the_scenes_ring(quick):
     """Against a closed polygon walked in numpy, both ways round and over the seam."""
     state = Episodes(quick).seeded(3, 1)
     goal = state.goal
-    path = quick.surroundings.path_mm.double().numpy()
+    path = quick.scene.path_mm.double().numpy()
     closed = np.vstack((path, path[:1]))
     for way in (1.0, -1.0):
         for walked in (0, 1, 37, 149):
-            cut = replace(goal, walked=torch.tensor([walked]), way=torch.tensor([way]))
+            cut = replace(goal, done=torch.tensor([walked]), direction=torch.tensor([way]))
             share = (goal.start.item() + way * walked / 150) % 1.0
             expected = [np.interp(share * 360, np.arange(361), axis) for axis in closed.T]
             now = replace(state, goal=cut)
@@ -112,24 +112,24 @@ def test_the_target_runs_along_the_scenes_ring(quick):
 
 
 def test_the_miss_is_the_distance_from_the_axis(quick):
-    aim = quick.aims["laser"]
+    aim = quick.pointing["laser"]
     points = Episodes(quick).seeded(0, 1).world.arms["laser"].points_mm
     tip, along = points[:, -1], aim.arm.backbone.tip_direction(points)
     side = torch.linalg.cross(along, torch.tensor([[0.0, 0.0, 1.0]]))
     side = side / side.norm()
-    miss = aim.miss(points, tip + 30.0 * along + 2.5 * side)
+    miss = aim.offset_mm(points, tip + 30.0 * along + 2.5 * side)
     torch.testing.assert_close(miss, 2.5 * side, rtol=0, atol=1e-4)
-    behind = aim.miss(points, tip - 3.0 * along + 4.0 * side)
+    behind = aim.offset_mm(points, tip - 3.0 * along + 4.0 * side)
     assert behind.norm().item() == pytest.approx(5.0, abs=1e-4)
 
 
 def test_a_collision_ends_the_episode_and_is_no_success(quick):
     state = Episodes(quick).seeded(0, 2)
-    scenery = state.world.scenery
-    bodies = scenery.clearance.bodies_mm.clone()
+    scene = state.world.scene
+    bodies = scene.clearance.bodies_mm.clone()
     bodies[1, 0, 0] = -0.5
-    hit = replace(scenery, clearance=replace(scenery.clearance, bodies_mm=bodies))
-    state = replace(state, world=replace(state.world, scenery=hit))
+    hit = replace(scene, clearance=replace(scene.clearance, bodies_mm=bodies))
+    state = replace(state, world=replace(state.world, scene=hit))
     assert quick.ended(state).tolist() == [False, True]
     assert quick.measures(state)["success"].tolist() == [0.0, 0.0]
     for terms in quick.rewards(state).values():
@@ -151,7 +151,7 @@ def varied():
 
 
 def test_lesions_differ_in_place_and_size_and_lie_on_the_organ(varied):
-    around = varied.surroundings
+    around = varied.scene
     own = np.array(varied.spec.lesion.centre_mm)
     centres, paths = around.centres_mm.numpy(), around.paths_mm.numpy()
     away = np.linalg.norm(centres - own, axis=1)
@@ -166,7 +166,7 @@ def test_lesions_differ_in_place_and_size_and_lie_on_the_organ(varied):
             trimesh.Trimesh(organ.vertices_mm, organ.faces, process=False), path[::30]
         )
         assert distance.max() < 1e-3
-    drawn = Episodes(varied).seeded(0, 300).world.scenery.lesion
+    drawn = Episodes(varied).seeded(0, 300).world.scene.lesion
     assert torch.bincount(drawn, minlength=3).min() > 70
 
 
@@ -174,22 +174,22 @@ def test_each_episodes_own_ring_is_cut_and_judged(varied):
     """Scripted to the end; each environment's burnt samples lie on its own path and no other."""
     episodes, steps = Episodes(varied), 260
     state = episodes.seeded(1, 3)
-    lesion = state.world.scenery.lesion
+    lesion = state.world.scene.lesion
     assert len(lesion.unique()) >= 2
     over, measures = torch.zeros(3, dtype=torch.bool), None
     with torch.inference_mode():
         for _ in range(steps):
-            state, outcome = episodes.step(state, varied.script(state), in_place=True)
+            state, outcome = episodes.step(state, varied.script(state))
             over |= outcome.done
             if over.all():
                 break
     measures = outcome.measures
     assert measures["success"].tolist() == [1.0] * 3
-    assert torch.equal(state.world.scenery.lesion, lesion)
-    ablation, paths = varied.surroundings.ablation, varied.surroundings.paths_mm.numpy()
+    assert torch.equal(state.world.scene.lesion, lesion)
+    ablation, paths = varied.scene.ablation, varied.scene.paths_mm.numpy()
     points = ablation.patch.points_mm
     for i in range(3):
-        burnt = points[state.world.scenery.dose.dose[i].numpy() >= ablation.cut_dose]
+        burnt = points[state.world.scene.dose.dose[i].numpy() >= ablation.cut_dose]
         apart = [np.linalg.norm(burnt[:, None] - path[None], axis=2).min(1).max() for path in paths]
         assert int(np.argmin(apart)) == lesion[i]
         assert apart[lesion[i]] < 1.0
@@ -198,13 +198,13 @@ def test_each_episodes_own_ring_is_cut_and_judged(varied):
 def test_a_reset_draws_another_lesion_and_fresh_tissue(varied):
     episodes = Episodes(varied)
     state = episodes.seeded(5, 40)
-    before = state.world.scenery.lesion
+    before = state.world.scene.lesion
     mask = torch.arange(40) % 2 == 0
     state = episodes.reset(state, mask)
-    after = state.world.scenery.lesion
+    after = state.world.scene.lesion
     assert torch.equal(after[~mask], before[~mask])
     assert not torch.equal(after[mask], before[mask])
-    assert torch.equal(state.world.scenery.dose.ring, after)
+    assert torch.equal(state.world.scene.dose.ring, after)
 
 
 def test_impossible_lesions_are_one_line():

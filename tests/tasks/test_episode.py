@@ -26,15 +26,15 @@ def cut():
     """A batch of two cuts of which the second is recorded, and copies of all that it went by."""
     task = make_task("circle_ablation")
     with torch.inference_mode():
-        play = Episodes(task)
+        play = Episodes(task, donate=True)
         state = play.seeded(5, 2)
         recorder = EpisodeRecorder(task, state, 1, driver="scripted", seed=5)
         kept = [(state.world.arms["laser"].tip_mm[1].clone(), None, None)]
         for _ in range(STEPS):
             actions = task.script(state)
-            state, outcome = play.step(state, actions, in_place=True)
+            state, outcome = play.step(state, actions)
             recorder.step(state, outcome, actions)
-            dose = state.world.scenery.dose.dose[1].clone()
+            dose = state.world.scene.dose.dose[1].clone()
             kept.append((state.world.arms["laser"].tip_mm[1].clone(), dose, outcome))
     return recorder.log(), kept
 

@@ -11,9 +11,9 @@ from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.inverse_kinematics import seek
+from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
-from surgisoft.tasks.trajectories import place, progress
+from surgisoft.tasks.trajectories.waypoints import point_at, progress
 
 
 @pytest.fixture(scope="module")
@@ -50,23 +50,23 @@ def test_the_script_visits_every_slot_without_contact(done):
 
 def test_fcl_says_so_too(task, done):
     """The referee on every fifth body of the episodes: no contact, the same clearances."""
-    referee = Referee(task.world.surroundings.geometry.bodies)
+    referee = Referee(task.world.scene.geometry.bodies)
     for state in done[0][::5]:
         for i, line in enumerate(state.world.arms["arm"].line_mm.numpy()):
             shape = {"arm": ArmShape(line, 7.5)}
             assert not referee.collisions(shape)
-            said = state.world.scenery.clearance.least_mm[i].item()
+            said = state.world.scene.clearance.least_mm[i].item()
             assert referee.clearance(shape).least_mm == pytest.approx(said, abs=0.1)
 
 
-def test_the_straight_way_to_the_next_slot_hits_the_plate(task):
-    """The same solver sent straight to the targets: the plate is in the way."""
+def test_the_straight_line_to_the_next_slot_hits_the_plate(task):
+    """The same inverse kinematics without the route: the plate is in the way."""
 
     def straight(state):
-        part, target = state.world.arms["arm"], task.way_mm(state)[:, -1]
+        part, target = state.world.arms["arm"], task.route_mm(state)[:, -1]
         tip = part.tip_mm
         step = (target - tip) * (4.0 / (target - tip).norm(dim=1, keepdim=True).clamp(min=4.0))
-        action = seek(task.arm, part, tip + step, lambda p, t: p[:, -1] - t, task.dt_s)
+        action = action_towards(task.arm, part, tip + step, lambda p, t: p[:, -1] - t, task.dt_s)
         return {"arm": action}
 
     _, outcomes = walked(task, straight, 6, 150)
@@ -75,14 +75,14 @@ def test_the_straight_way_to_the_next_slot_hits_the_plate(task):
 
 
 def test_targets_lie_deep_in_slots_that_differ(task):
-    tour = Episodes(task).seeded(5, 200).goal
-    tips = task.ways.points_mm[:, -1]
-    home = task.ways.points_mm[0, 0]
+    goal = Episodes(task).seeded(5, 200).goal
+    tips = task.routes.points_mm[:, -1]
+    home = task.routes.points_mm[0, 0]
     aside = (tips - home)[:, :2]
     assert (aside.norm(dim=1) >= 25.0 - 1e-3).all()
     angle = torch.atan2(aside[:, 1], aside[:, 0])
     slot = (angle / (2.0 * math.pi / 3.0)).round().remainder(3).long()
-    visited = slot[tour.ways]
+    visited = slot[goal.order]
     assert (visited[:, 1:] != visited[:, :-1]).all()
     assert torch.bincount(visited[:, 0], minlength=3).min() > 40
     assert tips[:, 2].min() > 50.0, "beyond the plate"
@@ -90,7 +90,7 @@ def test_targets_lie_deep_in_slots_that_differ(task):
 
 def test_a_target_is_counted_when_the_tip_is_near(task):
     state = Episodes(task).seeded(0, 2)
-    arm, target = state.world.arms["arm"], task.way_mm(state)[:, -1]
+    arm, target = state.world.arms["arm"], task.route_mm(state)[:, -1]
     points = arm.points_mm.clone()
     points[:, -1] = target + torch.tensor([[0.0, 0.3, 0.4], [0.0, 3.0, 4.0]])
     near = replace(state, world=replace(state.world, arms={"arm": replace(arm, points_mm=points)}))
@@ -103,25 +103,25 @@ def test_a_target_is_counted_when_the_tip_is_near(task):
 
 def test_contact_ends_the_episode_and_is_no_success(task):
     state = Episodes(task).seeded(0, 2)
-    clearance = state.world.scenery.clearance
+    clearance = state.world.scene.clearance
     low = clearance.bodies_mm.clone()
     low[0] = -0.1
-    scenery = replace(state.world.scenery, clearance=replace(clearance, bodies_mm=low))
+    scene = replace(state.world.scene, clearance=replace(clearance, bodies_mm=low))
     goal = replace(state.goal, reached=torch.tensor([3, 3]))
-    hit = replace(state, goal=goal, world=replace(state.world, scenery=scenery))
+    hit = replace(state, goal=goal, world=replace(state.world, scene=scene))
     assert task.ended(hit).tolist() == [True, False]
     assert task.measures(hit)["success"].tolist() == [0.0, 1.0]
     assert task.rewards(hit)["arm"]["contact"].tolist() == [-1.0, 0.0]
 
 
 def test_progress_along_a_bend_by_hand():
-    """A way of 10 mm along x, then 5 mm along y; its first corner stands twice."""
-    way = torch.tensor([[[0.0, 0, 0], [0, 0, 0], [10, 0, 0], [10, 5, 0]]]).expand(4, -1, -1)
+    """A polyline of 10 mm along x, then 5 mm along y; its first corner stands twice."""
+    line = torch.tensor([[[0.0, 0, 0], [0, 0, 0], [10, 0, 0], [10, 5, 0]]]).expand(4, -1, -1)
     points = torch.tensor([[0.0, 0, 0], [4, -2, 0], [12, 3, 0], [10, 9, 0]])
-    found = progress(way, points)
+    found = progress(line, points)
     np.testing.assert_allclose(found.along_mm, [0.0, 4.0, 13.0, 15.0], atol=1e-5)
-    np.testing.assert_allclose(found.left_mm, [15.0, 13.0, 4.0, 4.0], atol=1e-5)
-    there = place(way, torch.tensor([0.0, 4.0, 13.0, 99.0]))
+    np.testing.assert_allclose(found.remaining_mm, [15.0, 13.0, 4.0, 4.0], atol=1e-5)
+    there = point_at(line, torch.tensor([0.0, 4.0, 13.0, 99.0]))
     expected = [[0, 0, 0], [4, 0, 0], [10, 3, 0], [10, 5, 0]]
     np.testing.assert_allclose(there, expected, atol=1e-5)
 

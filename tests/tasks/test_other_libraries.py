@@ -37,6 +37,21 @@ def test_supersuit_makes_a_vector_environment_of_one_arm():
     assert not truncated[0]
 
 
+@pytest.mark.parametrize("name", ["circle_ablation", "keyhole"])
+def test_supersuit_joins_copies_of_an_environment(name):
+    """Two copies in one process; the agents' observations are padded to one length."""
+    supersuit = pytest.importorskip("supersuit", reason="SuperSuit is not installed")
+    env = supersuit.pad_observations_v0(surgisoft.parallel_env(name))
+    env = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    many = supersuit.concat_vec_envs_v1(env, 2, num_cpus=0, base_class="gymnasium")
+    agents = surgisoft.parallel_env(name).possible_agents
+    seen, _ = many.reset(seed=1)
+    assert len(seen) == 2 * len(agents)
+    seen, rewards, *_ = many.step(np.zeros((len(seen), 3), np.float32))
+    assert np.isfinite(seen).all()
+    assert np.isfinite(rewards).all()
+
+
 def test_torchrl_rolls_both_arms_out():
     """Its own spec check, and the same rewards as the environment alone."""
     wrappers = pytest.importorskip("torchrl.envs.libs.pettingzoo", reason="TorchRL not installed")

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,14 +18,21 @@ from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.inverse_kinematics import least_squares
 from surgisoft.tasks.laser_plane import LaserPlaneConfig, laser_plane, on_plane
-from surgisoft.tasks.path_following import FollowConfig
-from surgisoft.tasks.registry import TASKS, make_task
+from surgisoft.tasks.path_following import FollowConfig, FollowWeights
+from surgisoft.tasks.registry import (
+    TASKS,
+    config_from,
+    config_of,
+    config_table,
+    make_task,
+    read_config,
+)
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
-from surgisoft.tasks.trajectories import circle, square
+from surgisoft.tasks.trajectories.closed_path import circle, square
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.pytree import rows, tree_map
-from surgisoft.tasks.world.random import streams
+from surgisoft.tasks.world.pytree import Objects, rows, tree_map, with_rows
+from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import WorldConfig
 
 
@@ -186,7 +194,7 @@ def test_reward_by_hand():
     terms = task.rewards(replace(state, world=world))["arm"]
     assert terms["track"].item() == pytest.approx(math.exp(-0.3), rel=1e-4)
     assert terms["fine"].item() == pytest.approx(math.exp(-3.0), rel=1e-3)
-    paper = track_circle(TrackConfig(FollowConfig(fine_weight=0.0)))
+    paper = track_circle(TrackConfig(FollowConfig(weights=FollowWeights(fine=0.0))))
     assert set(paper.rewards(Episodes(paper).seeded(0, 1))["arm"]) == {"track"}
 
 
@@ -254,18 +262,18 @@ def test_the_plane_is_where_the_config_says():
     assert (far.centre - near.centre)[2].item() == pytest.approx(25.0, abs=1e-4)
 
 
-def test_the_foreseen_error_is_that_of_a_step_without_action():
-    """Played for real: commands held, the pumps still catching up, chambers turning round."""
+def test_the_predicted_error_is_that_of_a_step_without_action():
+    """Simulated: commands held, pumps still catching up, chambers reversing."""
     task = track_circle()
     episodes = Episodes(task)
     state, _, _ = played(episodes, 64, 20)
-    foreseen = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
+    predicted = episodes.observe(state)["arm"][:, 27:30].sinh() * task.config.fine_mm
     after, _ = episodes.step(state, {"arm": torch.zeros(64, 3)})
     tip = after.world.arms["arm"].points_mm[:, -1]
-    torch.testing.assert_close(foreseen, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(predicted, task.target_mm(after) - tip, rtol=1e-4, atol=1e-4)
 
 
-def test_the_last_steps_are_recalled_newest_first():
+def test_the_history_holds_the_last_steps_newest_first():
     """Pressures by the pumps' lag, movements from the key points; nothing before the episode."""
     task = track_circle()
     episodes = Episodes(task)
@@ -278,14 +286,16 @@ def test_the_last_steps_are_recalled_newest_first():
         tips.append(part.points_mm[:, -1])
         state, _ = episodes.step(state, {"arm": torch.full((5, 3), action)})
     tips.append(state.world.arms["arm"].points_mm[:, -1])
-    recalled = episodes.observe(state)["arm"][:, -13:-1]
+    history = episodes.observe(state)["arm"][:, -13:-1]
     by_hand = (changes[2], changes[1], tips[3] - tips[2], tips[2] - tips[1])
-    torch.testing.assert_close(recalled, torch.cat(by_hand, 1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(history, torch.cat(by_hand, 1), rtol=0, atol=1e-4)
     anew = episodes.reset(state, torch.tensor([True] + 4 * [False]))
     kept = episodes.observe(anew)["arm"][:, -13:-1]
     assert not kept[0].any()
-    assert torch.equal(kept[1:], recalled[1:])
-    without = Episodes(track_circle(TrackConfig(FollowConfig(recall=0, foresight=False))))
+    assert torch.equal(kept[1:], history[1:])
+    without = Episodes(
+        track_circle(TrackConfig(FollowConfig(history_steps=0, one_step_prediction=False)))
+    )
     plain, own = (play.observe(play.seeded(2, 5))["arm"] for play in (without, episodes))
     assert torch.equal(plain, torch.cat((own[:, :27], own[:, 30:-13], own[:, -1:]), 1))
 
@@ -304,8 +314,8 @@ def test_noise_is_seen_but_not_scored():
     assert (part.seen_kPa - part.pressure).std().item() == pytest.approx(0.3, rel=0.1)
     error = noisy.observe(a)["arm"][:, 12:15].sinh() - plain.observe(b)["arm"][:, 12:15].sinh()
     assert error.std().item() == pytest.approx(0.5, rel=0.05)
-    foreseen, truly = (e.observe(s)["arm"][:, 27:30].sinh() for e, s in ((noisy, a), (plain, b)))
-    assert (0.1 * (foreseen - truly)).std().item() == pytest.approx(0.5, rel=0.05)
+    predicted, truly = (e.observe(s)["arm"][:, 27:30].sinh() for e, s in ((noisy, a), (plain, b)))
+    assert (0.1 * (predicted - truly)).std().item() == pytest.approx(0.5, rel=0.05)
 
 
 def test_randomised_mounts_and_gains_have_the_asked_spread():
@@ -352,7 +362,7 @@ def test_the_script_is_the_same_for_one_and_for_many():
         (lambda: FollowConfig(path="star"), "star.*circle.*square"),
         (lambda: FollowConfig(size_mm=-1.0), "size_mm is -1.0"),
         (lambda: FollowConfig(loop_s=math.nan), "loop_s is nan"),
-        (lambda: FollowConfig(recall=-1), "recall is -1"),
+        (lambda: FollowConfig(history_steps=-1), "history_steps is -1"),
         (lambda: LaserPlaneConfig(distance_mm=0.0), "distance_mm is 0.0"),
         (lambda: TrackBodyConfig(slow_s=0.0), "slow_s is 0.0"),
     ],
@@ -379,3 +389,87 @@ def test_another_arm_model_takes_the_default_ones_place(name, tmp_path):
         assert task.world.arms[agent].key_points == 6
     with pytest.raises(InputError, match="no arm model there"):
         make_task(name, kind(FollowConfig(arm="no/arm")) if kind else CircleAblationConfig(arm="x"))
+
+
+def reward_terms(name, config=None):
+    """Weighted terms of one random step, agent -> term -> (B,)."""
+    episodes = Episodes(make_task(name, config))
+    state = episodes.seeded(2, 3)
+    _, outcome = episodes.step(state, random_actions(episodes.task, 3, 0))
+    return outcome.terms
+
+
+@every_task
+def test_a_weight_scales_its_reward_term_and_no_other(name):
+    """Each weight trebled in turn; 0 leaves the term out."""
+    usual, own = reward_terms(name), config_table(config_of(name))
+    tables = {"follow": own["follow"]} if "follow" in own else {"": own}
+    ((part, table),) = tables.items()
+    for agent, terms in usual.items():
+        weights = table["weights"].get(agent, table["weights"])
+        term = next(iter(terms))
+        for factor in (3.0, 0.0):
+            change = {term: factor * weights[term]}
+            change = {agent: change} if agent in table["weights"] else change
+            change = {"weights": change}
+            config = config_from(name, {part: change} if part else change, Path("x.toml"))
+            changed = reward_terms(name, config)[agent]
+            assert (term in changed) == (factor != 0.0)
+            for other, value in changed.items():
+                torch.testing.assert_close(
+                    value, terms[other] * (factor if other == term else 1.0), rtol=1e-6, atol=1e-6
+                )
+
+
+def test_rewards_of_the_keyhole_by_hand():
+    """3 for each target reached, -1 for contact, as before the weights had names."""
+    weights = config_of("keyhole").weights
+    assert (weights.way, weights.near, weights.visits, weights.contact) == (1.0, 1.0, 3.0, -1.0)
+
+
+def test_field_names_of_earlier_versions_are_accepted(tmp_path):
+    file = tmp_path / "old.toml"
+    file.write_text(
+        "[follow]\nrecall = 0\nforesight = false\nfine_weight = 0.25\n"
+        "[world.scenery]\ngeometry = 'fcl'\n"
+    )
+    config = read_config("track_square", file)
+    follow = config.follow
+    assert (follow.history_steps, follow.one_step_prediction) == (0, False)
+    assert follow.weights == FollowWeights(track=1.0, fine=0.25)
+    assert config.world.scene_engine.geometry == "fcl"
+    assert follow.path == "square", "the task's own default stays"
+    file.write_text("[follow]\nrecal = 0\n")
+    with pytest.raises(InputError, match=r"old\.toml.*recal"):
+        read_config("track_square", file)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[follow.weights]\nfine = nan\n", "finite"),
+        ("[follow.weights]\nfine = 0.0\ntrack = 0.0\n", "all reward weights are 0"),
+        ("[follow.weights]\nspeed = 1.0\n", "speed"),
+    ],
+)
+def test_wrong_weights_are_one_line(text, says, tmp_path):
+    file = tmp_path / "weights.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=says) as caught:
+        read_config("track_circle", file)
+    assert "\n" not in str(caught.value)
+    assert "weights.toml" in str(caught.value)
+
+
+def test_objects_of_a_state_are_selected_and_replaced_with_its_rows():
+    """An arm on a rig keeps a simulated plant for each environment beside its tensors."""
+    part = track_circle().world.start(streams(0, 3)).arms["arm"]
+    a, b, c, d = (object() for _ in "abcd")
+    part = replace(part, plant=Objects((a, b, c)))
+    index = torch.tensor([2, 0])
+    assert rows(part, index).plant.things == (c, a)
+    fresh = replace(rows(part, torch.tensor([1])), plant=Objects((d,)))
+    changed = with_rows(part, torch.tensor([1]), fresh)
+    assert changed.plant.things == (a, d, c)
+    assert part.plant.things == (a, b, c)
+    assert tree_map(torch.clone, part).plant is part.plant

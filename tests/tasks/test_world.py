@@ -19,8 +19,8 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.pytree import rows, tree_map
-from surgisoft.tasks.world.random import streams
-from surgisoft.tasks.world.world import Mounted, World, WorldConfig, lone_arm, scene_world
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.world import Mounted, World, WorldConfig, scene_world, single_arm_world
 
 STILL = Randomisation(history=0, start_kPa=0.0)
 LIVELY = Randomisation(
@@ -63,7 +63,7 @@ def assert_close(one, other):
 
 def test_pressure_by_hand():
     """Commands +3 (clipped from 5) and -1 kPa from 20 kPa; tau = 0.2 s, dt = 0.1 s."""
-    world = lone_arm(WorldConfig(randomisation=STILL), start_kPa=(20.0, 20.0, 20.0))
+    world = single_arm_world(WorldConfig(randomisation=STILL), start_kPa=(20.0, 20.0, 20.0))
     state = world.start(streams(0, 1))
     state = world.step(state, {"arm": torch.tensor([[5.0, -1.0, 0.0]])})
     share = 1.0 - math.exp(-0.5)
@@ -79,7 +79,7 @@ def test_pressure_by_hand():
 
 
 def test_pressure_stays_within_the_arms_limits():
-    world = lone_arm(WorldConfig(randomisation=STILL))
+    world = single_arm_world(WorldConfig(randomisation=STILL))
     state = world.start(streams(0, 2))
     for _ in range(40):
         state = world.step(state, {"arm": torch.tensor([[3.0] * 3, [-3.0] * 3])})
@@ -116,7 +116,7 @@ def test_the_body_is_the_models_body():
 
 def test_late_actions_come_late():
     vary = replace(STILL, delay=3)
-    world = lone_arm(WorldConfig(randomisation=vary, pneumatics=Pneumatics(tau_s=0.0)))
+    world = single_arm_world(WorldConfig(randomisation=vary, pneumatics=Pneumatics(tau_s=0.0)))
     state = world.start(streams(1, 64))
     delay = state.arms["arm"].delay
     assert sorted(delay.unique().tolist()) == [0, 1, 2, 3]
@@ -147,17 +147,17 @@ def test_geometry_is_the_referees(theatre, phantom):
     state = theatre.start(streams(7, 6))
     for action in actions_of(theatre, 6, 10, seed=2):
         state = theatre.step(state, action)
-    referee, scenery = Referee(phantom.bodies), state.scenery
+    referee, scene = Referee(phantom.bodies), state.scene
     for i in range(6):
         shapes = {name: ArmShape(part.line_mm[i].numpy(), 7.5) for name, part in state.arms.items()}
         least = referee.clearance(shapes).least_mm
-        assert scenery.clearance.least_mm[i].item() == pytest.approx(least, abs=0.3)
+        assert scene.clearance.least_mm[i].item() == pytest.approx(least, abs=0.3)
         laser = state.arms["laser"]
         hit = referee.cast(
             laser.tip_mm[i].numpy(), laser.tip_direction[i].numpy(), 110.0, shapes, own="laser"
         )
-        assert int(hit.struck) == scenery.hit.struck[i].item()
-        np.testing.assert_allclose(hit.point_mm, scenery.hit.point_mm[i].numpy(), atol=1e-3)
+        assert int(hit.struck) == scene.hit.struck[i].item()
+        np.testing.assert_allclose(hit.point_mm, scene.hit.point_mm[i].numpy(), atol=1e-3)
 
 
 def test_the_accelerators_engine_gives_the_same_world(theatre, phantom):
@@ -167,46 +167,44 @@ def test_the_accelerators_engine_gives_the_same_world(theatre, phantom):
     for action in actions_of(theatre, 3, 4, seed=2):
         one, two = theatre.step(one, action, 20.0), other.step(two, action, 20.0)
     for name in ("least_mm", "self_mm"):
-        a, b = (getattr(state.scenery.clearance, name) for state in (one, two))
+        a, b = (getattr(state.scene.clearance, name) for state in (one, two))
         torch.testing.assert_close(a, b, rtol=0, atol=0.3)
-    assert torch.equal(one.scenery.hit.struck, two.scenery.hit.struck)
-    torch.testing.assert_close(
-        one.scenery.hit.point_mm, two.scenery.hit.point_mm, rtol=0, atol=1e-3
-    )
-    assert torch.equal(one.scenery.view.visible, two.scenery.view.visible)
+    assert torch.equal(one.scene.hit.struck, two.scene.hit.struck)
+    torch.testing.assert_close(one.scene.hit.point_mm, two.scene.hit.point_mm, rtol=0, atol=1e-3)
+    assert torch.equal(one.scene.view.visible, two.scene.view.visible)
 
 
 def test_energy_on_the_organ_is_power_times_time(theatre):
     """At both ends of a step on the organ: all of the step's energy; at one end: half of it."""
     state = theatre.start(streams(11, 16))
-    expected, organ = torch.zeros(16), theatre.surroundings.organ
-    on = state.scenery.hit.on_organ & (state.scenery.hit.body == organ)
+    expected, organ = torch.zeros(16), theatre.scene.organ
+    on = state.scene.hit.on_organ & (state.scene.hit.body == organ)
     for action in actions_of(theatre, 16, 15, seed=5):
         state = theatre.step(state, action, 8.0)
-        now = state.scenery.hit.on_organ & (state.scenery.hit.body == organ)
+        now = state.scene.hit.on_organ & (state.scene.hit.body == organ)
         expected += 8.0 * 0.1 * 0.5 * (on.float() + now.float())
         on = now
     assert expected.max() > 1.0
-    torch.testing.assert_close(state.scenery.dose.delivered_j, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(state.scene.dose.delivered_j, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("in_place", [False, True])
-def test_a_masked_reset_leaves_the_others_alone(theatre, in_place):
+@pytest.mark.parametrize("donate", [False, True])
+def test_a_masked_reset_leaves_the_others_alone(theatre, donate):
     actions = actions_of(theatre, 4, 6, seed=3)
     state = theatre.start(streams(2, 4))
     for action in actions:
         state = theatre.step(state, action, 20.0)
     before = tree_map(torch.clone, state)
     mask = torch.tensor([False, True, False, True])
-    after = theatre.reset(state, mask, in_place)
+    after = theatre.reset(state.donated() if donate else state, mask)
     kept, fresh = torch.tensor([0, 2]), torch.tensor([1, 3])
     for a, b in zip(leaves(rows(after, kept)), leaves(rows(before, kept)), strict=True):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
-    if not in_place:
+    if not donate:
         for a, b in zip(leaves(state), leaves(before), strict=True):
             assert torch.equal(a, b), "a reset changed the state it was given"
     assert after.steps.tolist() == [6, 0, 6, 0]
-    assert after.scenery.dose.dose[fresh].abs().max() == 0.0
+    assert after.scene.dose.dose[fresh].abs().max() == 0.0
     again = theatre.start(rows(before.stream, fresh))
     assert_close(rows(after, fresh), again)
     first = theatre.start(streams(2, 4))
@@ -249,23 +247,26 @@ def test_the_same_seed_gives_the_same_run(theatre):
 
 
 def test_states_cross_the_border_of_inference_mode(theatre):
-    """Stepped and reset inside, then outside, with and without giving up the dose."""
+    """Stepped and reset inside, then outside, the buffers donated throughout."""
     action = actions_of(theatre, 2, 1)[0]
     with torch.inference_mode():
-        state = theatre.start(streams(0, 2))
-        state = theatre.step(state, action, 20.0, in_place=True)
-        state = theatre.reset(state, torch.tensor([True, False]), in_place=True)
-    state = theatre.step(state, action, 20.0, in_place=True)
-    state = theatre.reset(state, torch.tensor([False, True]), in_place=True)
+        state = theatre.start(streams(0, 2)).donated()
+        state = theatre.step(state, action, 20.0)
+        state = theatre.reset(state, torch.tensor([True, False]))
+    state = theatre.step(state, action, 20.0)
+    state = theatre.reset(state, torch.tensor([False, True]))
     assert state.steps.tolist() == [1, 0]
 
 
-def test_dose_in_place_is_the_dose(theatre):
-    plain = given = theatre.start(streams(8, 4))
+def test_a_donated_dose_map_is_overwritten_and_gives_the_same_dose(theatre):
+    plain, given = theatre.start(streams(8, 4)), theatre.start(streams(8, 4)).donated()
+    first, kept = given.scene.dose.dose, plain.scene.dose.dose
     for action in actions_of(theatre, 4, 6):
         plain = theatre.step(plain, action, 20.0)
-        given = theatre.step(given, action, 20.0, in_place=True)
-    assert torch.equal(plain.scenery.dose.dose, given.scenery.dose.dose)
+        given = theatre.step(given, action, 20.0)
+    assert torch.equal(plain.scene.dose.dose, given.scene.dose.dose)
+    assert given.scene.dose.dose is first
+    assert not kept.any(), "a step changed the state it was given"
 
 
 def test_an_arm_that_is_not_driven_in_kpa_is_refused():
@@ -283,7 +284,7 @@ def test_an_arm_that_is_not_driven_in_kpa_is_refused():
         (lambda: Pneumatics(step_kPa=-1.0), "step_kPa is -1.0"),
         (lambda: Pneumatics(tau_s=math.nan), "tau_s is nan"),
         (lambda: Randomisation(noise_mm=-0.1), "noise_mm is -0.1"),
-        (lambda: lone_arm(start_kPa=(1.0,)), "1 pressures to start with, expected 3"),
+        (lambda: single_arm_world(start_kPa=(1.0,)), "1 pressures to start with, expected 3"),
     ],
 )
 def test_bad_numbers_are_one_line(make, message):

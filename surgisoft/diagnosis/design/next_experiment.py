@@ -9,7 +9,9 @@ every experimental setup that touches a competing effect.
 
 import copy
 import itertools
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -54,12 +56,22 @@ from surgisoft.diagnosis.design.schedules import (
     words_for,
 )
 from surgisoft.diagnosis.effect_knowledge import gravity_load, knowledge_of
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    identification_problem,
+    on_one_thread,
+    open_inputs,
+)
 from surgisoft.diagnosis.refinement.sharpen import with_fitted
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
+from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import Effect, known_effects, make_effect
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 
 # Competing effects and what is known of them -----------------------------------------------------
@@ -536,6 +548,8 @@ class Recommendation:
     """Options of `surgisoft collect` for the experimental setup on the virtual rig."""
     isolability: Isolability | None = field(default=None, repr=False)
     """What the recordings and the experiment together say about the competing effects."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
 
     @property
     def separates(self) -> tuple[tuple[str, str], ...]:
@@ -584,7 +598,36 @@ class Recommendation:
                 {"effects": list(p.effects), "before": p.before, "after": p.after}
                 for p in self.pairs
             ],
+            "notes": list(self.notes),
         }
+
+
+@on_one_thread
+def next_experiment(
+    model: Model,
+    recordings: Recordings = (),
+    between: Sequence[str] | None = None,
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETUPS),
+    reference: Sequence[Recording] | KnownError | None = None,
+) -> Recommendation:
+    """The experiment that best distinguishes competing effects.
+
+    Model and recordings may be given by their paths. The recordings are looked at as `diagnose`
+    does: the training part, the direction of gravity, the residuals of the model's fit.
+
+    between: the competing effects; without them those that explain the recordings best, and
+    without recordings all known ones.
+    settings: names of the experimental setups that may be asked for.
+    reference: as for `diagnose`.
+    """
+    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not given:
+        return propose(load_model(model), between, minutes, settings)
+    arm, measured, notes = open_inputs(model, given)
+    problem = identification_problem(arm, measured, reference)
+    found = recommend(problem, between or likely_rivals(problem), minutes, settings)
+    return replace(found, notes=notes)
 
 
 def recommend(
@@ -668,7 +711,7 @@ def _check(model: ArmModel, rivals: list[str] | None, minutes: float) -> None:
             make_effect(name, model.facts)
     if rivals is not None and len(rivals) < 2:
         raise InputError(
-            f"competing effects {', '.join(rivals) or 'none'}: expected at least two different ones; "
+            f"effects {', '.join(rivals) or 'none'}: expected at least two different effects; "
             "name them with --between A B"
         )
     if not minutes >= bench_minutes(LEAST_RUNS):

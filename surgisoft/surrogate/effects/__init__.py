@@ -1,5 +1,6 @@
 """The named physical effects; a file's stem is the name that is printed."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from surgisoft.errors import unknown_name
@@ -62,6 +63,8 @@ __all__ = [
     "make_effect",
     "named_effect",
     "register_effect_file",
+    "register_effect_files",
+    "registered_files",
 ]
 
 
@@ -80,6 +83,17 @@ def register_effect_file(path: str | Path) -> str:
     Only for files that the person who calls named: it runs code.
     """
     return own.register_effect_file(path, EFFECTS)
+
+
+def register_effect_files(paths: Iterable[str | Path]) -> None:
+    """Run several files of user-defined effects, as `register_effect_file` runs one."""
+    for path in paths:
+        register_effect_file(path)
+
+
+def registered_files() -> list[str]:
+    """The files of user-defined effects that were registered: a new process has to do the same."""
+    return [file.path for file in own.FILES.values()]
 
 
 def named_effect(given: str) -> str:

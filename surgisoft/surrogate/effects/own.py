@@ -124,7 +124,8 @@ def check_files(wanted: dict[str, dict], label: str) -> None:
         if name not in FILES:
             raise InputError(
                 f"{label}: its effect '{name}' is code in {file['path']}, which opening a model "
-                f"does not run; name the file with --effect if you trust it"
+                f"does not run; if you trust the file, name it: --effect-file {file['path']} "
+                f"(in Python: load_model(folder, effect_files=['{file['path']}']))"
             )
         if FILES[name].sha256 != file["sha256"]:
             raise InputError(

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.config import write_atomically
 from surgisoft.errors import InputError
+from surgisoft.files import write_atomically
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, BodyLog, CameraLog, DoseLog, Event
 

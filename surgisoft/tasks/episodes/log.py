@@ -22,7 +22,7 @@ from surgisoft.tasks.episodes.parts import (
     DoseLog,
     Event,
 )
-from surgisoft.tasks.world.scene import ENDOSCOPE, Surroundings
+from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
 
 NO_DIAMETER_MM = 15.0
 """Outer diameter of an arm of which neither scene nor model says it: the paper's arm (mm)."""
@@ -129,7 +129,7 @@ class EpisodeRecorder:
         self._dose: list[tuple[np.ndarray, np.ndarray]] = []
         self._last_dose: np.ndarray | None = None
         self._mounts = {name: self._of(part.mount) for name, part in state.world.arms.items()}
-        lesion = state.world.scenery.lesion
+        lesion = state.world.scene.lesion
         self._lesion = 0 if lesion is None else int(self._of(lesion))
         self._ending = ""
         self._add(state, task.measures(state), {}, {})
@@ -159,8 +159,8 @@ class EpisodeRecorder:
         """The episode so far."""
         task, config = self.task, self.task.world.config
         scene = getattr(getattr(task, "config", None), "scene", None)
-        around = task.world.surroundings
-        near = around if isinstance(around, Surroundings) else None
+        around = task.world.scene
+        near = around if isinstance(around, SceneEngine) else None
         rows = {name: self._column(name) for name in self._rows[-1]}
         log = EpisodeLog(
             task=task.name,
@@ -178,7 +178,7 @@ class EpisodeRecorder:
             limits={} if near is None else _limits(near),
         )
         if near is not None:
-            log = replace(log, **self._surroundings(near, rows))
+            log = replace(log, **self._scene_fields(near, rows))
         elif around is not None:
             bodies = tuple(_body(body) for body in around.geometry.bodies)
             limits = {"clearance_mm": around.clearance_mm}
@@ -198,7 +198,7 @@ class EpisodeRecorder:
         row |= {f"measures/{name}": value for name, value in measures.items()}
         for agent, parts in terms.items():
             row |= {f"rewards/{agent}/{term}": value for term, value in parts.items()}
-        near = state.world.scenery
+        near = state.world.scene
         if near.clearance is not None:
             row["clearance"] = near.clearance.least_mm
         if near.hit is not None:
@@ -224,8 +224,8 @@ class EpisodeRecorder:
 
     def _arm(self, name: str, rows: Mapping[str, np.ndarray]) -> ArmLog:
         world, arm = self.task.world, self.task.world.arms[name]
-        if world.surroundings is not None:
-            radius = world.surroundings.geometry.radius_mm(name)
+        if world.scene is not None:
+            radius = world.scene.geometry.radius_mm(name)
         else:
             radius = 0.5 * (arm.model.spec.diameter_mm or NO_DIAMETER_MM)
         pressure = rows[f"{name}/pressure"]
@@ -239,7 +239,7 @@ class EpisodeRecorder:
             shaft_mm=float(-arm.shaft[0, 2]) if len(arm.shaft) else 0.0,
         )
 
-    def _surroundings(self, near: Surroundings, rows: Mapping[str, np.ndarray]) -> dict:
+    def _scene_fields(self, near: SceneEngine, rows: Mapping[str, np.ndarray]) -> dict:
         """The log's fields that only a scene has."""
         burnt = np.diff(rows["delivered"], prepend=rows["delivered"][:1])
         beam = BeamLog(burnt / self.task.world.config.dt_s, rows["end"], rows["hits"])
@@ -253,13 +253,13 @@ class EpisodeRecorder:
             "bodies": tuple(_body(body) for body in near.geometry.bodies),
         }
 
-    def _path(self, near: Surroundings | None) -> np.ndarray:
+    def _path(self, near: SceneEngine | None) -> np.ndarray:
         """(M, 3) mm: the ring's path of this episode's lesion."""
         if near is None:
             return np.zeros((0, 3), np.float32)
         return near.paths_mm[self._lesion].detach().cpu().numpy().copy()
 
-    def _dose_log(self, near: Surroundings) -> DoseLog:
+    def _dose_log(self, near: SceneEngine) -> DoseLog:
         ablation, patch = near.ablation, near.ablation.patches[self._lesion]
         counts = np.array([len(sample) for sample, _ in self._dose])
         rows = np.flatnonzero(counts)
@@ -293,7 +293,7 @@ def _below(rows: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]
     return {name[len(prefix) :]: value for name, value in rows.items() if name.startswith(prefix)}
 
 
-def _limits(near: Surroundings) -> dict[str, float]:
+def _limits(near: SceneEngine) -> dict[str, float]:
     limits = near.spec.limits
     return {name: float(getattr(limits, name)) for name in vars(limits)}
 

@@ -1,9 +1,14 @@
-"""Pressures of the chambers: what a command asks for, and how fast the pumps follow."""
+"""One arm of the world: its pumps, what is randomised, its batched state, and how it steps.
+
+`Arm` is the protocol that worlds and tasks use. `ModelArm` implements it with a fitted arm model;
+an arm on the virtual rig implements it with a simulated plant for each environment.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -11,8 +16,9 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.random_streams import Stream
 
 
 @dataclass(frozen=True)
@@ -26,8 +32,9 @@ class Pneumatics:
     step_kPa: float = 3.0
     """Largest change of a command in one step, kPa (Chen et al. 2025, sec. IV-A)."""
     tau_s: float = 0.2
-    """Time constant, s: the virtual rig's pumps have gone 63 % of a 3 kPa step after 0.27 s at
-    0 kPa, 0.19 s at 20 kPa and 0.15 s at 40 kPa. 0: the chamber has the pressure at once."""
+    """Time constant, s. The virtual rig's pumps reach 63 % of a 3 kPa step after 0.27 s at 0 kPa,
+    0.19 s at 20 kPa and 0.15 s at 40 kPa. With 0 the chamber takes the commanded pressure at
+    once."""
 
     def __post_init__(self):
         if not (math.isfinite(self.step_kPa) and self.step_kPa > 0.0):
@@ -36,7 +43,7 @@ class Pneumatics:
             raise InputError(f"pneumatics: tau_s is {self.tau_s}, expected 0 s or more")
 
     def share(self, dt_s: float) -> float:
-        """Share of the way to the command that the chamber goes in dt_s seconds."""
+        """Fraction of the gap between command and pressure that closes in dt_s seconds."""
         return 1.0 if self.tau_s == 0.0 else -math.expm1(-dt_s / self.tau_s)
 
     def command(self, command: Tensor, action: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -49,36 +56,40 @@ class Pneumatics:
         return pressure + self.share(dt_s) * (command - pressure)
 
     def action_for(self, command: Tensor, pressure: Tensor, wanted: Tensor, dt_s: float) -> Tensor:
-        """(B, m) kPa: the action after which the chambers have `wanted` (B, m), were it free."""
+        """(B, m) kPa: the action that brings the chambers to `wanted` (B, m), limits left aside."""
         return pressure + (wanted - pressure) / self.share(dt_s) - command
 
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What differs from episode to episode; all zero: nothing does."""
+    """Domain randomization: what differs between episodes. 0 switches an entry off."""
 
     history: int = 3
-    """Random pressures that an arm goes through before an episode, so that its memory differs."""
+    """Random pressures applied to an arm before an episode, so that its hysteresis memory varies
+    (a count)."""
     start_kPa: float = 2.0
-    """Half width of the even spread of the first pressures, kPa."""
+    """Half width of the uniform distribution of the initial pressures, kPa."""
     mount_mm: float = 0.0
-    """Standard deviation of each coordinate of a mount, mm."""
+    """Standard deviation of each coordinate of a mount's position, mm."""
     mount_rad: float = 0.0
-    """Standard deviation of a mount's turn about each axis of its base, rad."""
+    """Standard deviation of a mount's rotation about each axis of its base, rad."""
     gain: float = 0.0
-    """Standard deviation of the factor between a chamber's pressure and what the model is given."""
+    """Standard deviation of the factor between a chamber's pressure and the model's input, no
+    unit."""
     noise_mm: float = 0.0
-    """Standard deviation of each coordinate of a measured key point, mm."""
+    """Standard deviation of the noise on each coordinate of a measured key point, mm."""
     noise_kPa: float = 0.0
-    """Standard deviation of a measured pressure, kPa."""
+    """Standard deviation of the noise on a measured pressure, kPa."""
     delay: int = 0
-    """Most steps that an action is late; each episode has a whole number of its own."""
+    """Largest action delay, steps; each episode draws a whole number from 0 to this."""
     lesion_mm: float = 0.0
-    """Greatest distance of an episode's lesion from the scene's own, along the surface, mm."""
+    """Largest distance of an episode's lesion from the scene's own, along the organ's surface, mm;
+    for tasks in a scene."""
     lesion_size: float = 0.0
-    """Half width of the even spread of a lesion's diameter, as a share of it; below 1."""
+    """Half width of the uniform distribution of a lesion's relative diameter, below 1; for tasks in
+    a scene."""
     lesions: int = 16
-    """Number of lesions that are laid out for that, once; each episode draws one of them."""
+    """Number of lesions laid out in advance (a count); each episode draws one of them."""
 
     def __post_init__(self):
         if self.lesions < 1:
@@ -90,7 +101,7 @@ class Randomisation:
 
 @dataclass(frozen=True, eq=False)
 class Mounted:
-    """An arm model in its place."""
+    """An arm model with the pose of its base."""
 
     model: ArmModel
     """The arm, driven in kPa."""
@@ -104,7 +115,7 @@ class Mounted:
 
 @dataclass(frozen=True, eq=False)
 class ArmPart:
-    """A batch of one arm at one instant; world frame."""
+    """The state of one arm in B environments; world frame."""
 
     command: Tensor
     """(B, m) kPa: commanded pressure."""
@@ -131,7 +142,10 @@ class ArmPart:
     seen_kPa: Tensor
     """(B, m) kPa: chamber pressure as measured."""
     offset_mm: Tensor
-    """(B, n, 3) mm: what the key points are known to lie off the model; 0 where it is the truth."""
+    """(B, n, 3) mm: known difference of the key points from the model's; 0 in simulation."""
+    plant: Any = None
+    """State of the plants where simulated rigs move the arm, a pytree with `Objects` in it;
+    None where the model moves it. Resets and row selections carry it like any tensor."""
 
     @property
     def tip_mm(self) -> Tensor:
@@ -139,8 +153,63 @@ class ArmPart:
         return self.points_mm[:, -1]
 
 
-class Arm:
-    """How one arm starts, steps and is foreseen; holds no state."""
+class Arm(Protocol):
+    """One arm of a world, batched: states in, states out.
+
+    Every method is a function of its arguments. Tensors have the batch in front; key points, poses
+    and directions are in the world frame, pressures in kPa.
+    """
+
+    name: str
+    """Name in the world."""
+    device: torch.device
+    """Where its tensors live."""
+    vary: Randomisation
+    """What is randomised at the start of an episode, and the sensors' noise."""
+    chambers: int
+    """m, number of chambers."""
+    key_points: int
+    """n, number of key points, base and tip included."""
+    model: ArmModel
+    """The fitted arm model: policies and experts predict with it."""
+    backbone: Backbone
+    """The curve through the key points."""
+    pneumatics: Pneumatics
+    """The pumps."""
+    low: Tensor
+    """(m,) kPa: lowest pressure of each chamber."""
+    high: Tensor
+    """(m,) kPa: highest pressure of each chamber."""
+    first: Tensor
+    """(m,) kPa: mean pressure at the start of an episode."""
+    pose: Tensor
+    """(4, 4) base frame to world frame, mm, nominal mount."""
+    shaft: Tensor
+    """(1, 3) mm, base frame: far end of the rigid shaft behind the base; (0, 3) without one."""
+
+    def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
+        """Draw the parameters of an episode for each stream; the arms at its start."""
+
+    def step(
+        self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
+    ) -> tuple[Stream, ArmPart]:
+        """Advance by dt_s seconds with pressure changes (B, m), kPa."""
+
+    def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """One-step prediction: key points (B, n, 3) mm if the chambers had (B, m) kPa in dt_s."""
+
+    def settled(self, pressure: Tensor) -> Tensor:
+        """Steady-state key points (B, n, 3) mm at pressures (B, m) kPa, nominal mount."""
+
+    def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
+        """Lowest and highest pressures (B, m) kPa that the pumps can reach in dt_s seconds."""
+
+    def action_for(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """(B, m) kPa: the action that brings the chambers to `pressure` (B, m), if in reach."""
+
+
+class ModelArm:
+    """An `Arm` that a fitted arm model moves; holds no state."""
 
     def __init__(
         self,
@@ -175,7 +244,7 @@ class Arm:
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
-        """Arms at the start of an episode, each with the parameters that its stream draws."""
+        """Draw the parameters of an episode for each stream; the arms at its start."""
         vary, m, count = self.vary, self.chambers, len(stream.key)
         stream, share = stream.uniform(0.0, 1.0, vary.history, m)
         stream, spread = stream.uniform(-1.0, 1.0, m)
@@ -210,7 +279,7 @@ class Arm:
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
-        """One step with changes of pressure (B, m), kPa, asked for now."""
+        """Advance by dt_s seconds with changes (B, m) kPa of the commanded pressures."""
         queue, action = self._due(part, action)
         command = self.pneumatics.command(part.command, action, self.low, self.high)
         pressure = self.pneumatics.follow(part.pressure, command, dt_s)
@@ -218,17 +287,19 @@ class Arm:
         part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
         return self._measured(stream, self.posed(part, points))
 
-    def foresee(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
-        """Key points (B, n, 3) mm, world frame, if the chambers had (B, m) kPa a step from now.
+    def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
+        """One-step prediction: key points (B, n, 3) mm, world frame, if the chambers had (B, m) kPa
+        after dt_s seconds.
 
-        Differentiable by the pressure; knows the episode's true gain, mount and memory.
+        It is differentiable by the pressure, and privileged: it uses the episode's true gain, mount
+        and hysteresis memory.
         """
         return self.bent(part, pressure, dt_s)[1] + part.offset_mm
 
     def settled(self, pressure: Tensor) -> Tensor:
-        """Key points (B, n, 3) mm, world frame, nominal mount: (B, m) kPa held since ever.
+        """Steady-state key points (B, n, 3) mm, world frame, nominal mount, at (B, m) kPa.
 
-        What the model gives without any change of pressure before; its memory adds to that.
+        The model's output for constant pressure, without any history of pressure changes.
         """
         state = self.model.initial_state(len(pressure), pressure)
         _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
@@ -240,7 +311,7 @@ class Arm:
         return state, frames.apply(part.mount, points)
 
     def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
-        """The part with its body where the key points (B, n, 3) mm, world frame, are."""
+        """The state with its body moved to key points (B, n, 3) mm, world frame."""
         return replace(
             part,
             points_mm=points_mm,
@@ -249,7 +320,7 @@ class Arm:
         )
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
-        """Lowest and highest pressure (B, m) kPa that the chambers can have a step from now."""
+        """Lowest and highest pressures (B, m) kPa that the pumps can reach in dt_s seconds."""
         pump = self.pneumatics
         ends = [
             pump.follow(
@@ -263,7 +334,7 @@ class Arm:
         return ends[0], ends[1]
 
     def action_for(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
-        """(B, m) kPa: the action after which the chambers have `pressure` (B, m), if in reach."""
+        """(B, m) kPa: the action that brings the chambers to `pressure` (B, m), if in reach."""
         return self.pneumatics.action_for(part.command, part.pressure, pressure, dt_s)
 
     def _due(self, part: ArmPart, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,7 +348,7 @@ class Arm:
         return torch.cat((frames.apply(mount, self.shaft), line), 1) if len(self.shaft) else line
 
     def _moved(self, normal: Tensor) -> Tensor:
-        """(B, 4, 4) mounts moved by (B, 6) standard normals: three shifts, three turns."""
+        """(B, 4, 4) mounts displaced by (B, 6) standard normals: three shifts, three rotations."""
         turn = self.vary.mount_rad * normal[:, 3:]
         rotation = frames.rotation_from_axis_angle(turn, frames.norm(turn))
         return self.pose @ frames.pose_from(rotation, self.vary.mount_mm * normal[:, :3])

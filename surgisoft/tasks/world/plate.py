@@ -1,8 +1,7 @@
-"""One arm through a slotted plate: the world, and ways of the tip on which the body stays clear."""
+"""One arm through a slotted plate: the world, and collision-free routes of the tip."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,40 +10,20 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.plate import SlottedPlate
-from surgisoft.tasks.world.arm import Arm, ArmPart, Mounted
-from surgisoft.tasks.world.random import Stream
-from surgisoft.tasks.world.scene import Scenery, judge_of
-from surgisoft.tasks.world.world import World, WorldConfig, lone_arm, named_arm
+from surgisoft.tasks.world.arm import Arm, Mounted
+from surgisoft.tasks.world.scene import ObstacleEngine
+from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world
 
 GRID = 14
-"""Pressures of each chamber that are tried for targets."""
+"""Pressures of each chamber in the grid search for targets."""
 EDGE = 0.05
-"""Share of a chamber's range at either end that targets leave to the arm's memory."""
-WAY_POINTS = 9
-"""Shapes on the way from the arm at rest to a target's."""
+"""Margin at either end of a chamber's range that targets leave for hysteresis, as a share of it."""
+ROUTE_POINTS = 9
+"""Shapes on the route from the arm at rest to a target."""
 NO_DIAMETER_MM = 15.0
 """Thickness of an arm whose model does not say it (mm): the paper's."""
-
-
-class Walls:
-    """Bodies that an arm keeps clear of, and nothing else; holds no state."""
-
-    def __init__(self, bodies, radii_mm, geometry: str, device, clearance_mm: float = 0.0):
-        """clearance_mm: nearer than this is too close; geometry as in `SceneryConfig`."""
-        self.clearance_mm, self.geometry = clearance_mm, BatchedScene(bodies, radii_mm, device)
-        self.judge = judge_of(geometry, self.geometry)
-
-    def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, Scenery]:
-        """How clear the arms are at the start of an episode."""
-        return stream, self.step(None, parts)
-
-    def step(self, _scenery, parts: Mapping[str, ArmPart], *_beam) -> Scenery:
-        """How clear the moved arms are; there is no beam."""
-        lines = {name: part.line_mm for name, part in parts.items()}
-        return Scenery(self.judge.clearance(lines))
 
 
 def plate_world(
@@ -55,12 +34,13 @@ def plate_world(
     config: WorldConfig,
     device: str | torch.device,
 ) -> World:
-    """The named arm model, upright, and a plate whose middle it passes at rest.
+    """A world with the named arm model, upright, through the middle of a plate.
 
-    height_mm: from the arm's base to the plate's lower side; clearance_mm: nearer is too close.
+    height_mm: from the arm's base to the plate's lower side. clearance_mm: limit below which the
+    arm counts as too close.
     """
     model = named_arm(arm, device)
-    alone = lone_arm(config, model, device=device).arms["arm"]
+    alone = single_arm_world(config, model, device=device).arms["arm"]
     line = alone.backbone.centreline(alone.settled(alone.first[None]))[0].cpu().double().numpy()
     if not 0.0 < height_mm < line[-1, 2] - plate.thickness_mm:
         raise InputError(
@@ -72,26 +52,27 @@ def plate_world(
     pose[2, 3] = height_mm
     radii = {"arm": 0.5 * (model.spec.diameter_mm or NO_DIAMETER_MM)}
     bodies = (Body("plate", "keep-out", plate.mesh(), pose),)
-    walls = Walls(bodies, radii, config.scenery.geometry, device, clearance_mm)
-    return World({"arm": Mounted(model, torch.eye(4))}, config, walls, device)
+    engine = ObstacleEngine(bodies, radii, config.scene_engine.geometry, device, clearance_mm)
+    return World({"arm": Mounted(model, torch.eye(4))}, config, engine, device)
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
-    """T ways of the tip from the arm at rest into the slots, sorted by slot; world frame."""
+class Routes:
+    """T routes of the tip from the arm at rest into the slots, sorted by slot; world frame."""
 
     points_mm: Tensor
-    """(T, WAY_POINTS, 3) mm: from rest to the target."""
+    """(T, ROUTE_POINTS, 3) mm: from rest to the target."""
     first: Tensor
-    """(S + 1,) int64: slot s has the ways from first[s] to first[s + 1] - 1."""
+    """(S + 1,) int64: slot s has the routes from first[s] to first[s + 1] - 1."""
 
 
-def clear_ways(
+def clear_routes(
     world: World, plate: SlottedPlate, deep_mm: float, clear_mm: float, wide_rad: float = 0.3
-) -> Ways:
-    """Ways to shapes whose tip is deep_mm or more from where it rests, along a slot.
+) -> Routes:
+    """Find the routes to shapes whose tip is deep_mm or more from its rest position, along a slot.
 
-    On each, pressures change evenly and no shape comes nearer than clear_mm to the plate.
+    Along a route pressures change linearly, and no shape comes nearer than clear_mm to the plate.
+    wide_rad: largest angle between the tip's displacement and the slot.
     """
     arm = world.arms["arm"]
     room = EDGE * (arm.high - arm.low)
@@ -105,7 +86,7 @@ def clear_ways(
     off = torch.atan2((angle[:, None] - slots).sin(), (angle[:, None] - slots).cos()).abs()
     chosen = (aside.norm(dim=1) >= deep_mm) & (off.amin(1) <= wide_rad)
     pressure, slot = pressure[chosen], off[chosen].argmin(1)
-    points, clear = _walked(world, arm, pressure)
+    points, clear = _along_routes(world, arm, pressure)
     kept = clear >= clear_mm
     slot, order = slot[kept].sort(stable=True)
     counts = torch.bincount(slot, minlength=plate.slots)
@@ -114,16 +95,16 @@ def clear_ways(
             f"keyhole: no shape reaches {deep_mm:g} mm into slot {int(counts.argmin())} with "
             f"{clear_mm:g} mm to spare; expected wider slots, less depth or another arm"
         )
-    return Ways(points[kept][order], torch.cat((counts.new_zeros(1), counts.cumsum(0))))
+    return Routes(points[kept][order], torch.cat((counts.new_zeros(1), counts.cumsum(0))))
 
 
-def _walked(world: World, arm: Arm, pressure: Tensor) -> tuple[Tensor, Tensor]:
-    """Tips (T, WAY_POINTS, 3) mm on the ways to pressures (T, m), and the least clearance (T,)."""
-    share = torch.linspace(0.0, 1.0, WAY_POINTS, device=pressure.device)[:, None]
+def _along_routes(world: World, arm: Arm, pressure: Tensor) -> tuple[Tensor, Tensor]:
+    """Tips (T, ROUTE_POINTS, 3) mm on routes to pressures (T, m); the least clearances (T,) mm."""
+    share = torch.linspace(0.0, 1.0, ROUTE_POINTS, device=pressure.device)[:, None]
     steps = arm.first + share * (pressure[:, None] - arm.first)
     bodies = arm.settled(steps.flatten(0, 1))
     lines = arm.backbone.centreline(bodies)
-    clear = world.surroundings.geometry.clearance({"arm": lines}).least_mm
-    return bodies[:, -1].unflatten(0, (-1, WAY_POINTS)), clear.unflatten(0, (-1, WAY_POINTS)).amin(
-        1
-    )
+    clear = world.scene.geometry.clearance({"arm": lines}).least_mm
+    return bodies[:, -1].unflatten(0, (-1, ROUTE_POINTS)), clear.unflatten(
+        0, (-1, ROUTE_POINTS)
+    ).amin(1)

@@ -1,8 +1,8 @@
-"""What surrounds the arms: bodies to keep clear of, tissue under the beam, a lesion in view."""
+"""The scene around the arms: clearance to bodies, laser hit and dose, the endoscope's view."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,83 +19,89 @@ from surgisoft.scene.camera import View, view
 from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesions import lesions_like
+from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.refereed import RefereedScene
 from surgisoft.scene.tissue import Tissue
 from surgisoft.tasks.world.arm import ArmPart, Randomisation
-from surgisoft.tasks.world.random import Stream
+from surgisoft.tasks.world.pytree import overwritable
+from surgisoft.tasks.world.random_streams import Stream
 
 _PACKAGE = Path(surgisoft.__file__).parent
 _HOME = _PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent
 PHANTOM = _HOME / "scenes" / "phantom_liver"
 """The scene that comes with the project: in the installed package, or beside it in a checkout."""
 GEOMETRIES = ("batched", "fcl")
-"""Who may decide about clearance and the beam's hit."""
+"""Collision engines: `batched` for training, `fcl` exact."""
 LASER, ENDOSCOPE = "laser", "endoscope"
 """Names of the arm that carries the beam and of the one that carries the camera."""
 BEAM_BEYOND_MM = 50.0
-"""The beam is followed so far beyond the greatest distance at which the laser works (mm)."""
+"""The beam is followed this far beyond the laser's largest working distance (mm)."""
 PATH_POINTS = 360
-"""Points of the ring's path as the laser follows it."""
-EVER_THE_SAME = Randomisation()
-"""One lesion: the scene's own."""
+"""Points of the ring's path that the laser follows."""
+NOT_RANDOMISED = Randomisation()
+"""Default: the scene's own lesion only."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scenery:
-    """A batch of surroundings at one instant; what a world does not have is None."""
+class SceneState:
+    """The scene's state in B environments; None for what a world does not have."""
 
     clearance: BatchClearance | None = None
     """Signed clearances of every arm, mm."""
     hit: RayHit | None = None
     """Where the beam ends, (B,)."""
     dose: AblationState | None = None
-    """What the beam has done."""
+    """Dose map of the tissue."""
     view: View | None = None
     """What the endoscope sees of the ring, (B,)."""
     lesion: Tensor | None = None
-    """(B,) int64: which of the surroundings' lesions the organ bears in this episode."""
+    """(B,) int64: number of this episode's lesion among those laid out."""
+    donated: bool = False
+    """Whether the next step or reset may overwrite this state's dose map instead of copying it
+    (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
 
 
 @dataclass(frozen=True)
-class SceneryConfig:
-    """What of the surroundings is computed, and how finely."""
+class SceneEngineConfig:
+    """Resolution of the scene's computations, and the collision engine."""
 
     view_points: int = 24
-    """Points of the ring that the endoscope looks for."""
+    """Points of the ring that are tested for visibility (a count)."""
     depth_mm: float = 0.3
-    """The ring counts as cut where it is this deep, mm."""
+    """Depth from which the ring counts as cut, mm."""
     band_mm: float = 2.0
-    """Width of the ring's band, mm."""
+    """Width of the ring to be cut, mm."""
     geometry: str = "batched"
-    """Who decides about clearance and the beam's hit: `batched`, or `fcl`, the referee, one
-    environment after the other. The endoscope's lines of sight are batched either way."""
+    """Engine that computes clearance and the beam's hit: `batched`, or `fcl`, the exact collision
+    checker, one environment after the other. Lines of sight are batched with either."""
 
     def __post_init__(self):
         if self.geometry not in GEOMETRIES:
             raise unknown_name("geometry", self.geometry, GEOMETRIES)
 
 
-class Surroundings:
-    """A scene with its engines; built once, asked every step, holds no state.
+class SceneEngine:
+    """Computes the state of a scene from the arms in it; built once, holds no state.
 
-    `spec` is the scene's file; of its K lesions `paths_mm` (K, 360, 3) are the rings' closed paths
-    and `centres_mm` (K, 3) their middles, world frame, mm. `path_mm` and `centre_mm` are the first.
+    `spec` is the scene's file. `paths_mm` (K, 360, 3) mm, world frame, are the closed paths of the
+    rings around its K lesions, `centres_mm` (K, 3) mm their centres; `path_mm` and `centre_mm` are
+    those of the first. `collision` is the engine of clearance and of the beam's hit.
     """
 
     def __init__(
         self,
         scene: Scene,
-        config: SceneryConfig | None = None,
+        config: SceneEngineConfig | None = None,
         device: str | torch.device = "cpu",
         engine: str | None = None,
-        vary: Randomisation = EVER_THE_SAME,
+        vary: Randomisation = NOT_RANDOMISED,
     ):
         """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere."""
-        config, spec, self.device = config or SceneryConfig(), scene.spec, torch.device(device)
+        config, spec, self.device = config or SceneEngineConfig(), scene.spec, torch.device(device)
         radii = {mount.tool: 0.5 * mount.diameter_mm for mount in spec.mounts}
         self.geometry = BatchedScene(scene.bodies, radii, device, engine=engine)
-        self.judge = judge_of(config.geometry, self.geometry)
+        self.collision = collision_engine(config.geometry, self.geometry)
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
@@ -118,65 +124,93 @@ class Surroundings:
         self.rings_mm = held([look.points_mm for look in looks])
         self.ring_normals = held([look.normals for look in looks])
 
-    def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, Scenery]:
-        """Untouched tissue, on a lesion that the stream draws, around arms at the start."""
+    def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, SceneState]:
+        """Draw a lesion for each stream; the scene with untouched tissue around the arms."""
         lesion = torch.zeros_like(stream.count)
         if self.lesions > 1:
             stream, draw = stream.uniform(0.0, float(self.lesions))
             lesion = draw.long().clamp(max=self.lesions - 1)
-        scenery = self._look(parts, lesion)
-        dose = self.ablation.start(*self._beam(scenery, parts), lesion)
-        return stream, replace(scenery, dose=dose)
+        scene = self._look(parts, lesion)
+        dose = self.ablation.start(*self._beam(scene, parts), lesion)
+        return stream, replace(scene, dose=dose)
 
     def step(
         self,
-        scenery: Scenery,
+        scene: SceneState,
         parts: Mapping[str, ArmPart],
         power_w: float | Tensor,
         dt_s: float,
-        in_place: bool,
-    ) -> Scenery:
-        """The surroundings of the moved arms, the beam having swept with `power_w` (B,) W."""
-        after = self._look(parts, scenery.lesion)
+    ) -> SceneState:
+        """The scene after the arms moved and the beam swept with `power_w` (B,) W for dt_s."""
+        after = self._look(parts, scene.lesion)
         beam = self._beam(after, parts)
-        in_place = in_place and _may_change(scenery.dose.dose)
-        dose = self.ablation.advance(scenery.dose, *beam, power_w, dt_s, in_place)
-        return replace(after, dose=dose)
+        in_place = scene.donated and overwritable(scene.dose.dose)
+        dose = self.ablation.advance(scene.dose, *beam, power_w, dt_s, in_place)
+        return replace(after, dose=dose, donated=scene.donated)
 
     def fresh_dose(
         self,
         dose: AblationState,
         mask: Tensor,
-        scenery: Scenery,
+        scene: SceneState,
         parts: Mapping[str, ArmPart],
-        in_place: bool,
     ) -> AblationState:
-        """Untouched tissue where mask (B,) is set, under the beam as `scenery` has it."""
-        beam, in_place = self._beam(scenery, parts), in_place and _may_change(dose.dose)
-        return self.ablation.reset(dose, mask, *beam, in_place, scenery.lesion)
+        """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
+        beam = self._beam(scene, parts)
+        in_place = scene.donated and overwritable(dose.dose)
+        return self.ablation.reset(dose, mask, *beam, in_place, scene.lesion)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> Scenery:
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
         lines = {name: part.line_mm for name, part in parts.items()}
         beam, eye = parts[LASER], parts[ENDOSCOPE]
-        clearance = self.judge.clearance(lines)
-        hit = self.judge.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+        clearance = self.collision.clearance(lines)
+        hit = self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
         pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
         ring = (self.rings_mm[lesion], self.ring_normals[lesion])
         seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)
-        return Scenery(clearance, hit, None, seen, lesion)
+        return SceneState(clearance, hit, None, seen, lesion)
 
-    def _beam(self, scenery: Scenery, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
-        on = scenery.hit.on_organ & (scenery.hit.body == self.organ)
-        return scenery.hit.point_mm, parts[LASER].tip_direction, on
+    def _beam(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
+        on = scene.hit.on_organ & (scene.hit.body == self.organ)
+        return scene.hit.point_mm, parts[LASER].tip_direction, on
 
 
-def judge_of(geometry: str, engine: BatchedScene) -> BatchedScene | RefereedScene:
-    """Who decides: the batched engine itself, or FCL about the same bodies and arms."""
+class ObstacleEngine:
+    """Computes how clear the arms are of some bodies, without beam, tissue or camera; no state."""
+
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        radii_mm: Mapping[str, float],
+        geometry: str,
+        device: str | torch.device,
+        clearance_mm: float = 0.0,
+    ):
+        """clearance_mm: limit below which an arm is too close, mm; geometry: see `GEOMETRIES`."""
+        self.clearance_mm, self.geometry = clearance_mm, BatchedScene(bodies, radii_mm, device)
+        self.collision = collision_engine(geometry, self.geometry)
+
+    def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, SceneState]:
+        """The arms' clearances at the start of an episode; draws no random number."""
+        return stream, self._look(parts, donated=False)
+
+    def step(
+        self,
+        scene: SceneState,
+        parts: Mapping[str, ArmPart],
+        power_w: float | Tensor,
+        dt_s: float,
+    ) -> SceneState:
+        """The moved arms' clearances; there is no beam, so power and time have no effect."""
+        return self._look(parts, scene.donated)
+
+    def _look(self, parts: Mapping[str, ArmPart], donated: bool) -> SceneState:
+        lines = {name: part.line_mm for name, part in parts.items()}
+        return SceneState(self.collision.clearance(lines), donated=donated)
+
+
+def collision_engine(geometry: str, engine: BatchedScene) -> BatchedScene | RefereedScene:
+    """The batched engine itself, or FCL with the same bodies and arms, by `GEOMETRIES` name."""
     if geometry == "batched":
         return engine
     return RefereedScene(engine.bodies, engine.radii_mm, engine.device)
-
-
-def _may_change(tensor: Tensor) -> bool:
-    """Whether a tensor may be changed in place: one made under inference_mode only there."""
-    return torch.is_inference_mode_enabled() or not tensor.is_inference()

@@ -1,15 +1,17 @@
-"""The batched core: arms that bend in a scene, state in, state out.
+"""The batched simulator: arms that bend in a scene, state in, state out.
 
-The one place where geometry and arm physics meet. A single environment is a batch of one; a batch
-of N does what N batches of one do. World frame, mm, kPa, s.
+This is the one place where geometry and arm physics meet. A single environment is a batch of one,
+and a batch of N environments gives what N batches of one give. World frame, mm, kPa, s.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,26 +20,40 @@ from surgisoft.errors import InputError
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.tasks.world.arm import Arm, ArmPart, Mounted, Pneumatics, Randomisation
+from surgisoft.tasks.world.arm import (
+    Arm,
+    ArmPart,
+    ModelArm,
+    Mounted,
+    Pneumatics,
+    Randomisation,
+)
 from surgisoft.tasks.world.pytree import rows, with_rows
-from surgisoft.tasks.world.random import Stream
-from surgisoft.tasks.world.scene import Scenery, SceneryConfig, Surroundings
+from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.scene import (
+    ObstacleEngine,
+    SceneEngine,
+    SceneEngineConfig,
+    SceneState,
+)
 
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """The numbers of a world."""
+    """Step, resolution, pumps, domain randomization and scene of a world."""
 
     dt_s: float = 0.1
-    """Time of a step, s."""
+    """Duration of a step, s."""
     samples: int = 21
-    """Points of each arm's centreline."""
+    """Points of each arm's centreline (a count)."""
     pneumatics: Pneumatics = field(default_factory=Pneumatics)
     """The pumps."""
     randomisation: Randomisation = field(default_factory=Randomisation)
-    """What differs from episode to episode."""
-    scenery: SceneryConfig = field(default_factory=SceneryConfig)
-    """What of the surroundings is computed."""
+    """Domain randomization: what differs between episodes."""
+    scene_engine: SceneEngineConfig = field(default_factory=SceneEngineConfig)
+    """Resolution of the scene and its collision engine."""
+
+    FORMER_NAMES: ClassVar[dict[str, str]] = {"scenery": "scene_engine"}
 
     def __post_init__(self):
         if not (math.isfinite(self.dt_s) and self.dt_s > 0.0):
@@ -48,89 +64,94 @@ class WorldConfig:
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
-    """A batch of worlds at one instant."""
+    """The state of B environments."""
 
     stream: Stream
-    """Each environment's own random numbers."""
+    """Random number stream of each environment."""
     steps: Tensor
     """(B,) int64: steps since the episode began."""
     arms: dict[str, ArmPart]
     """Each arm by name."""
-    scenery: Scenery
-    """What surrounds them."""
+    scene: SceneState
+    """The scene around them."""
     failed: Tensor
-    """(B,) bool: an arm is not finite; only a reset helps."""
+    """(B,) bool: an arm is not finite; the environment stays failed until it is reset."""
+
+    def donated(self) -> WorldState:
+        """This state with its buffers donated: a step or reset may overwrite them.
+
+        Only the owner of a state may ask for this, because the state is invalid afterwards.
+        """
+        return replace(self, scene=replace(self.scene, donated=True))
 
 
 class World:
-    """Arms by name, and what surrounds them; built once, holds no state."""
+    """Arms by name in a scene, or in empty space; built once, holds no state."""
 
     def __init__(
         self,
         arms: Mapping[str, Mounted],
         config: WorldConfig | None = None,
-        surroundings: Surroundings | None = None,
+        scene: SceneEngine | ObstacleEngine | None = None,
         device: str | torch.device = "cpu",
     ):
-        """Without surroundings the arms bend in empty space: no clearance, no beam, no view."""
+        """Without a scene the arms bend in empty space: no clearance, no beam, no view."""
         self.config, self.device = config or WorldConfig(), torch.device(device)
-        self.surroundings = surroundings
+        self.scene = scene
         c = self.config
-        self.arms = {
-            name: Arm(name, mounted, c.pneumatics, c.randomisation, c.samples, self.device)
+        self.arms: dict[str, Arm] = {
+            name: ModelArm(name, mounted, c.pneumatics, c.randomisation, c.samples, self.device)
             for name, mounted in arms.items()
         }
+
+    def with_arms(self, arms: Mapping[str, Arm]) -> World:
+        """This world with other arms in place of its own, for example arms on the virtual rig."""
+        world = copy.copy(self)
+        world.arms = dict(arms)
+        return world
 
     def start(self, stream: Stream) -> WorldState:
         """Worlds at the start of an episode, one for each of the (B,) streams."""
         parts = {}
         for name, arm in self.arms.items():
             stream, parts[name] = arm.start(stream)
-        scenery = Scenery()
-        if self.surroundings:
-            stream, scenery = self.surroundings.start(stream, parts)
-        return WorldState(
-            stream, torch.zeros_like(stream.count), parts, scenery, _not_finite(parts)
-        )
+        scene = SceneState()
+        if self.scene:
+            stream, scene = self.scene.start(stream, parts)
+        return WorldState(stream, torch.zeros_like(stream.count), parts, scene, _not_finite(parts))
 
-    def reset(self, state: WorldState, mask: Tensor, in_place: bool = False) -> WorldState:
-        """A fresh start where mask (B,) is set, out of each environment's own stream.
-
-        With in_place the old state's dose map is given up.
-        """
+    def reset(self, state: WorldState, mask: Tensor) -> WorldState:
+        """Start the environments where mask (B,) is set anew, each from its own stream."""
         index = mask.nonzero()[:, 0]
         if not len(index):
             return state
-        dose, state = state.scenery.dose, _without_dose(state)
+        dose, state = state.scene.dose, _without_dose(state)
         fresh = _without_dose(self.start(rows(state.stream, index)))
         state = with_rows(state, index, fresh)
-        if dose is None:
+        if dose is None or not isinstance(self.scene, SceneEngine):
             return state
-        scenery = state.scenery
-        dose = self.surroundings.fresh_dose(dose, mask, scenery, state.arms, in_place)
-        return replace(state, scenery=replace(scenery, dose=dose))
+        dose = self.scene.fresh_dose(dose, mask, state.scene, state.arms)
+        return replace(state, scene=replace(state.scene, dose=dose))
 
     def step(
         self,
         state: WorldState,
         actions: Mapping[str, Tensor],
         power_w: float | Tensor = 0.0,
-        in_place: bool = False,
     ) -> WorldState:
-        """One step later.
+        """Advance every environment by one step of `config.dt_s`.
 
-        actions: arm's name -> (B, m) change of pressure, kPa, held to the pumps' largest step.
-        power_w: the laser's power, W, a number or (B,), held over the step. With in_place the old
-        state's dose map is given up, unless it belongs to an inference_mode that has ended.
+        actions: arm's name -> (B, m) change of the commanded pressure, kPa, clipped to the pumps'
+        largest step. power_w: the laser's power, W, a number or (B,), constant over the step.
         """
         dt_s, stream, parts = self.config.dt_s, state.stream, {}
         for name, arm in self.arms.items():
             stream, parts[name] = arm.step(stream, state.arms[name], actions[name], dt_s)
-        scenery = state.scenery
-        if self.surroundings:
-            scenery = self.surroundings.step(scenery, parts, power_w, dt_s, in_place)
+        scene = state.scene
+        if self.scene:
+            scene = self.scene.step(scene, parts, power_w, dt_s)
         failed = state.failed | _not_finite(parts)
-        return WorldState(stream, state.steps + 1, parts, scenery, failed)
+        return WorldState(stream, state.steps + 1, parts, scene, failed)
 
 
 def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:
@@ -140,16 +161,16 @@ def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:
 
 
 def _without_dose(state: WorldState) -> WorldState:
-    return replace(state, scenery=replace(state.scenery, dose=None))
+    return replace(state, scene=replace(state.scene, dose=None))
 
 
-def lone_arm(
+def single_arm_world(
     config: WorldConfig | None = None,
     model: ArmModel | None = None,
     start_kPa: tuple[float, ...] | None = None,
     device: str | torch.device = "cpu",
 ) -> World:
-    """One arm, named `arm`, in empty space; its base frame is the world frame."""
+    """A world of one arm, named `arm`, in empty space; its base frame is the world frame."""
     model = model or default_arm(device)
     return World({"arm": Mounted(model, torch.eye(4), start_kPa)}, config, None, device)
 
@@ -173,12 +194,12 @@ def scene_world(
         name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
         arms[mount.tool] = Mounted(named_arm(name, device, folder), pose, shaft_mm=mount.shaft_mm)
     vary = config.randomisation
-    around = Surroundings(scene, config.scenery, device, engine, vary)
+    around = SceneEngine(scene, config.scene_engine, device, engine, vary)
     return World(arms, config, around, device)
 
 
 def named_arm(name: str | Path, device="cpu", folder: str | Path = ".") -> ArmModel:
-    """`default`, or the fitted model in a folder, looked for in `folder`, then as it is."""
+    """Load `default`, or the fitted model in a folder, relative to `folder` or as it is."""
     if str(name) == "default":
         return default_arm(device)
     places = (Path(folder) / name, Path(name))

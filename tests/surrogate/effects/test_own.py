@@ -66,7 +66,7 @@ def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
     save_model(saved, folder)
     own.FILES.clear()
     with pytest.raises(
-        InputError, match=r"slack\.py, which opening a model does not run.*--effect"
+        InputError, match=r"slack\.py, which opening a model does not run.*--effect-file .*slack"
     ):
         load_model(folder)
     assert not own.FILES

@@ -1,33 +1,39 @@
-"""The arms of a scene as reach tables: where the arm models meet the geometry."""
+"""Reach tables of a scene's arms: the shapes of the arm models as plain geometry."""
 
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from surgisoft.config import Where, read_toml
+from surgisoft.errors import InputError
+from surgisoft.scene.folder import Scene
+from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.spec import FILE, MountSpec
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import default_arm, load_model
+from surgisoft.surrogate.reach import model_table
+
 SAME_LENGTH_MM = 1.0
 """A mount's length may differ by this from its model's (mm)."""
 
 
-def reach_of(mount, folder: Path | None = None, where=None):
+def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None = None) -> ArmReach:
     """The reach table of the arm on a mount, sampled from the model that the tasks bend.
 
     `default` is the model that ships with the package, else the fitted model in the folder that the
-    mount names, looked for beside the scene, then as it is. `where` is the mount's place in the
-    scene file (`toml_config.Where`), for the error.
-    """
-    from surgisoft.scene.reach import ArmReach
+    mount names, looked for beside the scene, then as it is.
 
-    (axes, lines, directions), spec = _table(_model_folder(mount, folder, where))
+    where: the mount's place in the scene file, for the error.
+    """
+    place = _model_folder(mount, folder, where)
+    (axes, lines, directions), spec = _default_table() if place is None else _table(place)
     _check_length(mount, spec, where)
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
 
 
-def reaches_of(scene) -> dict:
-    """Both arms' reach tables of an opened scene, by tool."""
-    from surgisoft.config import Where, read_toml
-    from surgisoft.scene.spec import FILE
-
+def reaches_of(scene: Scene) -> dict[str, ArmReach]:
+    """The reach tables of both arms of a scene, by tool."""
     path = scene.folder / FILE
     where = read_toml(path)[1] if path.is_file() else Where(path)
     return {
@@ -36,7 +42,7 @@ def reaches_of(scene) -> dict:
     }
 
 
-def _model_folder(mount, folder: Path | None, where) -> Path | None:
+def _model_folder(mount: MountSpec, folder: Path | None, where: Where | None) -> Path | None:
     """The folder of the mount's model, None for the default one."""
     if mount.arm == "default":
         return None
@@ -48,26 +54,29 @@ def _model_folder(mount, folder: Path | None, where) -> Path | None:
     return found
 
 
-def _check_length(mount, spec, where) -> None:
-    """The mount and its model must speak of the same arm."""
+def _check_length(mount: MountSpec, spec: ArmSpec, where: Where | None) -> None:
+    """Raise unless the mount states the length of its model."""
     if spec.length_mm is not None and abs(spec.length_mm - mount.length_mm) > SAME_LENGTH_MM:
         came = f"got {mount.length_mm:g} mm for an arm model of {spec.length_mm:g} mm"
         raise _error(mount, where, "length_mm", came, f"{spec.length_mm:g}, or another model")
 
 
-def _error(mount, where, field: str, came: str, expected: str):
-    from surgisoft.errors import InputError
-
+def _error(
+    mount: MountSpec, where: Where | None, field: str, came: str, expected: str
+) -> InputError:
     if where is None:
         return InputError(f"mount of the {mount.tool}: {field}: {came}; expected {expected}")
     return (where / field).error(came, expected)
 
 
-@cache
-def _table(folder: Path | None) -> tuple:
-    """`model_table` of a model, and the model's spec; None: the default model."""
-    from surgisoft.surrogate.checkpoint import default_arm, load_model
-    from surgisoft.surrogate.reach import model_table
+def _table(folder: Path | str) -> tuple:
+    """`model_table` of the model in a folder, and the model's spec."""
+    model = load_model(folder)
+    return model_table(model), model.spec
 
-    model = default_arm() if folder is None else load_model(folder)
+
+@cache
+def _default_table() -> tuple:
+    """`_table` of the model that ships with the package, which never changes."""
+    model = default_arm()
     return model_table(model), model.spec

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from surgisoft.tasks.world.pytree import rows
-from surgisoft.tasks.world.random import Stream, streams
+from surgisoft.tasks.world.random_streams import Stream, streams
 
 LARGE = 2**64
 

@@ -1,0 +1,85 @@
+"""The inputs of every command: a model, recordings, and the identification problem they pose."""
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import torch
+
+from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.weight import under_weight
+from surgisoft.measurement.histories import outside_range
+from surgisoft.measurement.recordings.recording import Recording, load_recordings
+from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.model import ArmModel
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+Model = ArmModel | str | Path
+"""A model, or its folder."""
+Recordings = Iterable[Recording | str | Path] | Recording | str | Path
+"""Recordings, their files, or folders of them."""
+
+
+def read_recordings(given: Recordings) -> list[Recording]:
+    """The recordings in files and folders; recordings that are open already stay as they are."""
+    items = [given] if isinstance(given, Recording | str | Path) else list(given)
+    if not any(isinstance(item, Recording) for item in items):
+        return load_recordings(items)
+    found = []
+    for item in items:
+        found += [item] if isinstance(item, Recording) else load_recordings(item)
+    return found
+
+
+def open_inputs(
+    model: Model, recordings: Recordings
+) -> tuple[ArmModel, list[Recording], tuple[str, ...]]:
+    """The model and the recordings as a diagnosis takes them, with notes for its reader.
+
+    A model whose recordings were made with another direction of gravity is given loads of any
+    direction (`under_weight`); the notes say so, and say where the recordings leave the range of
+    actuation that the model was fitted to.
+    """
+    arm = load_model(model)
+    measured = read_recordings(recordings)
+    turned, notes = under_weight(arm, measured)
+    return turned, measured, (*notes, *outside_range(arm.spec, measured))
+
+
+def identification_problem(
+    model: ArmModel,
+    recordings: list[Recording],
+    reference: Sequence[Recording] | KnownError | None = None,
+) -> Problem:
+    """The training rows of a model's residual table, with its residuals from before.
+
+    reference: recordings from before something changed. Without them the residuals that the model
+    keeps of its own fit (`ArmModel.training_residuals`), where it has them.
+    """
+    return with_known_residuals(residual_table(model, recordings).training(), reference)
+
+
+def with_known_residuals(
+    problem: Problem, reference: Sequence[Recording] | KnownError | None = None
+) -> Problem:
+    """The problem with the residuals of a reference, or those that its model keeps of its fit."""
+    known = problem.model.training_residuals if reference is None else reference
+    return problem if known is None else problem.with_reference(known)
+
+
+def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that computes on one thread of torch, so that sums round alike on any machine."""
+
+    @functools.wraps(function)
+    def computed(*args: P.args, **kwargs: P.kwargs) -> R:
+        before = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            torch.set_num_threads(before)
+
+    return computed

@@ -1,0 +1,92 @@
+"""Files and folders that are written whole or not at all, and values as strict JSON.
+
+A reader never sees half a file: the content goes to a temporary name beside the target, which is
+renamed to the target at the end. What is written has the permissions that the user's umask gives
+to new files.
+"""
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@contextlib.contextmanager
+def new_file(path: str | Path) -> Iterator[Path]:
+    """A temporary path to write to; it becomes `path` when the block ends without an exception.
+
+    The temporary name keeps the suffix, and `path`'s folder is made where it is missing.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = _beside(path)
+    try:
+        yield fresh
+        os.replace(fresh, path)
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
+    """A temporary folder to fill; it becomes `folder` when the block ends without an exception.
+
+    Where `folder` exists, the new one takes its place. Of the old content, what the new folder does
+    not have is kept, except the files of the names in `own`, which belong to the old version.
+    """
+    folder = Path(folder).resolve()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = _beside(folder)
+    fresh.mkdir()
+    try:
+        yield fresh
+        if not folder.exists():
+            os.replace(fresh, folder)
+            return
+        for kept in folder.iterdir():
+            if kept.name not in own and not (fresh / kept.name).exists():
+                copy = shutil.copytree if kept.is_dir() else shutil.copy2
+                copy(kept, fresh / kept.name)
+        old = _beside(folder)
+        os.replace(folder, old)
+        os.replace(fresh, folder)
+        shutil.rmtree(old)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def write_atomically(path: str | Path, content: bytes | str) -> None:
+    """Write a file whole or not at all; text is written as UTF-8."""
+    with new_file(path) as fresh:
+        fresh.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write a value as strict JSON, whole or not at all; not finite numbers become null."""
+    write_atomically(path, json.dumps(json_safe(value), indent=2, allow_nan=False) + "\n")
+
+
+def json_safe(value: Any) -> Any:
+    """The value in what strict JSON can say: NaN and infinite numbers become None.
+
+    Goes through dicts, lists and tuples; numpy arrays become lists and numpy scalars numbers.
+    """
+    if isinstance(value, dict):
+        return {key: json_safe(part) for key, part in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [json_safe(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _beside(path: Path) -> Path:
+    """A free hidden name in the same folder, with the same suffix."""
+    return path.with_name(f".{path.stem}.{secrets.token_hex(6)}{path.suffix}")

@@ -1,0 +1,89 @@
+"""Named blocks of an agent's observation, and those that several tasks share.
+
+An observation is the blocks one after the other. A block's name, unit and scaling stand here or at
+the top of the task's file; `surgisoft.tasks.describe` lists them with their index ranges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from surgisoft.tasks.world.arm import Arm, ArmPart
+
+
+@dataclass(frozen=True)
+class Block:
+    """A named block of an observation; two blocks are the same when their names are."""
+
+    name: str
+    """Name, unique within an observation."""
+    meaning: str = field(compare=False)
+    """What is observed."""
+    unit: str = field(compare=False)
+    """Unit of x before scaling; `-` where it has none."""
+    scale: str = field(compare=False)
+    """The observed value as a function of x."""
+
+
+ObservationBlocks = Mapping[Block, Tensor]
+"""Block -> (B, k) scaled values, in the order of the observation."""
+
+
+def joined(blocks: ObservationBlocks) -> Tensor:
+    """(B, D): the blocks one after the other."""
+    return torch.cat([*blocks.values()], 1)
+
+
+def numbered(block: Block, values: Iterable[Tensor], unit: str = "step") -> ObservationBlocks:
+    """Values (B, k) of the same kind now, 1 step ahead, 2 steps ahead, ... as blocks of their own.
+
+    unit: what `ahead` counts.
+    """
+    return {
+        Block(
+            f"{block.name}_{ahead}" if ahead else block.name,
+            f"{block.meaning}, {ahead} {unit}{'s' * (ahead > 1)} ahead" if ahead else block.meaning,
+            block.unit,
+            block.scale,
+        ): value
+        for ahead, value in enumerate(values)
+    }
+
+
+SHAPE = Block("shape", "measured key points relative to the base, base excluded", "mm", "x / 50")
+COMMAND = Block("command", "commanded pressures", "kPa", "range to -1..1")
+PRESSURE = Block("pressure", "measured pressures", "kPa", "range to -1..1")
+DIRECTION = Block("direction", "the model's direction of pressure change", "-", "x")
+REVERSAL = Block(
+    "reversal",
+    "pressure change since the last direction change, in dead bands; at -1 or 1 the model's "
+    "direction reverses and the arm jumps",
+    "-",
+    "clip(x, -1.5, 1.5)",
+)
+TIME = Block("time", "elapsed share of the episode", "-", "x")
+
+
+def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
+    """What an arm knows of itself: its measured shape and its pressures."""
+    shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
+    return {SHAPE: shape, **pressure_blocks(arm, part)}
+
+
+def pressure_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
+    """Commands, measured pressures, directions of change and distances to a reversal, (B, m) each.
+
+    The last two come from the model beside the arm, fed with the arm's pressures.
+    """
+    half = 0.5 * (arm.high - arm.low)
+    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
+    return {
+        COMMAND: (part.command - arm.low) / half - 1.0,
+        PRESSURE: (part.seen_kPa - arm.low) / half - 1.0,
+        DIRECTION: part.arm.direction,
+        REVERSAL: back.clamp(-1.5, 1.5),
+    }

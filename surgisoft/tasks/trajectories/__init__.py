@@ -1,0 +1,1 @@
+"""Reference trajectories of the tasks, batched."""

@@ -1,0 +1,169 @@
+"""A model that holds a user-defined effect opens in every command, and only with its file named."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from typer.main import get_command
+
+from surgisoft.cli import app, commands, run
+from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.effects import make_effect, own, register_effect_file
+from surgisoft.surrogate.model import ArmModel
+from tests.surrogate.effects.test_own import EXAMPLE
+
+ROOT = Path(__file__).resolve().parents[2]
+
+EXPERIMENT = """
+name = "short"
+scene = "scene"
+repeats = 2
+together = 1
+
+[limits]
+time_s = 0.3
+
+[[phases]]
+name = "look"
+endoscope = "policy"
+timeout_s = 0.3
+on_timeout = "go on"
+
+[[cases]]
+name = "user"
+policy = "scripted"
+"""
+
+NO_MODEL = {
+    "collect": "makes a recording of the virtual rig",
+    "import": "reads raw files",
+    "recording": "reads recordings",
+    "replay": "shows what was recorded",
+    "scene new": "places the default arm",
+    "experiment list": "reads experiment files",
+    "export": "opens policies, which hold no arm",
+}
+"""Commands that open no arm model, and why."""
+
+COMMANDS = {
+    "compare": "compare arm bench.parquet",
+    "diagnose": "diagnose arm bench.parquet",
+    "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
+    "improve": "improve arm bench.parquet --max-effects 1 -o improved",
+    "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
+    "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
+    "evaluate": "evaluate scripted --task track_circle --arm arm --episodes 1",
+    "scene check": "scene check scene",
+    "scene show": "scene show scene --save view.rrd",
+    "experiment check": "experiment check short.toml",
+    "experiment run": "experiment run short.toml --processes 2 --no-replays -o results --force",
+}
+"""What opens a model that holds the effect of the documentation, by command."""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A default arm with the documentation's effect, a recording, a scene and an experiment."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "slack.py").write_text(EXAMPLE)
+    register_effect_file(folder / "slack.py")
+    arm = default_arm()
+    effect = make_effect("slack", arm.facts)
+    effect.loss.data.fill_(0.3)
+    effects = {**dict(arm.effects), "slack": effect}
+    with_slack = ArmModel(arm.spec, arm.network, effects, arm.rest_mm, arm.validation)
+    save_model(with_slack, folder / "arm")
+    own.FILES.clear()
+    rig = VirtualRig(0, take=7)
+    recording = rig.record(make_protocol("mixed", rig.limits, 1200, seed=2))[0]
+    save_recording(recording, folder / "bench.parquet")
+    shutil.copytree(ROOT / "scenes" / "phantom_liver", folder / "scene")
+    scene = (folder / "scene" / "scene.toml").read_text()
+    (folder / "scene" / "scene.toml").write_text(scene.replace('"default"', '"../arm"'))
+    (folder / "short.toml").write_text(EXPERIMENT)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _in_the_lab_without_files(lab, monkeypatch):
+    monkeypatch.setattr(own, "FILES", {})
+    monkeypatch.chdir(lab)
+
+
+def _leaves(path=(), command=None):
+    """(name, command) of every command but the long studies."""
+    command = command or get_command(app)
+    if not hasattr(command, "commands"):
+        yield " ".join(path), command
+        return
+    for name, inner in command.commands.items():
+        if name != "benchmark":
+            yield from _leaves((*path, name), inner)
+
+
+def test_every_command_that_opens_a_model_has_the_option():
+    assert commands
+    having = {
+        name
+        for name, command in _leaves()
+        if any("--effect-file" in option.opts for option in command.params)
+    }
+    assert having == {name for name, _ in _leaves()} - set(NO_MODEL)
+    assert having == set(COMMANDS) | {"fit"}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_opens_the_model_only_with_its_file(name, capsys):
+    arguments = COMMANDS[name].split()
+    assert run(arguments) == 2
+    error = capsys.readouterr().err
+    assert "its effect 'slack' is code in" in error
+    assert "--effect-file" in error
+    assert not own.FILES
+    code = run([*arguments, "--effect-file", "slack.py"])
+    refused = {"amend": (0, 1), "improve": (0, 1), "scene check": (0, 1)}
+    assert code in refused.get(name, (0,)), capsys.readouterr().err
+
+
+def test_amend_takes_the_file_as_the_effect_that_the_model_has(capsys):
+    command = "amend arm --effect slack.py --data bench.parquet -o anew --anyway"
+    assert run(command.split()) in (0, 1)
+    assert "slack: the model has it" in capsys.readouterr().out
+
+
+def test_fit_takes_the_file_in_both_ways():
+    rest = "--epochs 2 --widths 8,8 --inputs pressure"
+    assert run(f"fit bench.parquet -o one --effects slack.py {rest}".split()) == 0
+    own.FILES.clear()
+    more = f"fit bench.parquet -o other --effects slack --effect-file slack.py {rest}"
+    assert run(more.split()) == 0
+
+
+def test_python_names_the_file_when_it_loads():
+    with pytest.raises(InputError, match=r"load_model\(folder, effect_files="):
+        load_model("arm")
+    model = load_model("arm", effect_files=["slack.py"])
+    assert torch.equal(model.effects["slack"].loss, torch.tensor([0.3]))
+
+
+def test_a_run_keeps_an_arm_that_needs_the_file(tmp_path, capsys):
+    """Training stores the arm; evaluating and resuming that run need the file again."""
+    train = f"train --task track_circle --arm arm --envs 8 --steps 64 -o {tmp_path / 'run'}"
+    assert run([*train.split(), "--effect-file", "slack.py"]) == 0
+    evaluate = f"evaluate {tmp_path / 'run'} --episodes 1".split()
+    own.FILES.clear()
+    assert run(evaluate) == 2
+    assert "--effect-file" in capsys.readouterr().err
+    assert run([*evaluate, "--effect-file", "slack.py"]) == 0
+
+
+def test_a_missing_file_is_one_line(capsys):
+    assert run(["compare", "arm", "bench.parquet", "--effect-file", "nothing.py"]) == 2
+    error = capsys.readouterr().err
+    assert "nothing.py: no such file" in error
+    assert error.count("\n") == 1

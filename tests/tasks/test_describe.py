@@ -1,0 +1,83 @@
+"""The reference of the tasks says what the environments do, and the docs hold it."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.describe import describe, renewed
+from surgisoft.tasks.numpy_adapter import NumpyAdapter
+from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
+from surgisoft.tasks.single import ONE_ARM
+from surgisoft.tasks.world.arm import Randomisation
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
+every_task = pytest.mark.parametrize("name", TASKS)
+
+
+@every_task
+def test_blocks_cover_the_whole_observation_and_terms_the_whole_reward(name):
+    task = make_task(name)
+    adapter, told = NumpyAdapter(task), describe(name)
+    assert tuple(told.agents) == task.agents == TASKS[name].agents
+    _, outcome = adapter.step(
+        adapter.seeded([0]), {agent: torch.zeros(1, 3).numpy() for agent in task.agents}
+    )
+    for agent, facts in told.agents.items():
+        (width,) = adapter.observation_bounds(agent)[2]
+        indices = [i for block in facts.observation for i in range(block.first, block.last + 1)]
+        assert indices == list(range(width))
+        names = [block.name for block in facts.observation]
+        assert len(set(names)) == len(names)
+        assert [term.name for term in facts.rewards] == [*outcome.terms[agent]]
+        for block in facts.observation:
+            assert block.unit
+            assert block.scale
+            assert block.meaning
+        assert all(term.meaning for term in facts.rewards)
+    assert all(setting.meaning for setting in (*told.settings, *told.randomisation))
+
+
+def test_indices_and_scales_by_hand():
+    """Clearance, tip error and commands of the keyhole task where the reference says they are."""
+    task = make_task("keyhole")
+    state = Episodes(task).seeded(3, 1)
+    seen = Episodes(task).observe(state)["arm"][0]
+    places = {block.name: block for block in describe("keyhole").agents["arm"].observation}
+    part = state.world.arms["arm"]
+    clearance = places["clearance"]
+    assert (clearance.first, clearance.unit, clearance.scale) == (clearance.last, "mm", "x / 10")
+    assert seen[clearance.first] == state.world.scene.clearance.least_mm[0] / 10.0
+    target = places["target"]
+    missing = seen[target.first : target.last + 1].sinh()
+    torch.testing.assert_close(missing + part.seen_mm[0, -1], task.route_mm(state)[0, -1])
+    command = seen[places["command"].first : places["command"].last + 1]
+    low, high = torch.tensor(task.arm.model.spec.low), torch.tensor(task.arm.model.spec.high)
+    torch.testing.assert_close(low + (high - low) * (command + 1.0) / 2.0, part.command[0])
+
+
+def test_another_config_is_described_as_it_is():
+    config = with_fields(config_of("track_circle"), history_steps=0, preview=1, fine=0.5)
+    told = describe("track_circle", config)
+    names = [block.name for block in told.agents["arm"].observation]
+    assert "pressure_history" not in names
+    assert "error_1" in names
+    assert "error_2" not in names
+    assert [term.weight for term in told.agents["arm"].rewards] == [1.0, 0.5]
+
+
+def test_every_randomised_quantity_is_listed():
+    told = {entry.name: entry.value for entry in describe("track_body").randomisation}
+    assert told == dataclasses.asdict(Randomisation())
+
+
+def test_the_docs_hold_the_present_reference():
+    """Renew with `python -m surgisoft.tasks.describe docs/tasks.md`."""
+    text = PAGE.read_text(encoding="utf-8")
+    assert renewed(text, PAGE) == text
+
+
+def test_the_tasks_of_one_agent_follow_from_the_registry():
+    assert set(TASKS) - set(ONE_ARM) == {"circle_ablation"}

@@ -1,0 +1,100 @@
+"""Files appear whole or not at all, with the permissions that the umask gives."""
+
+import json
+import math
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from surgisoft.files import json_safe, new_file, new_folder, write_atomically, write_json
+
+
+@pytest.fixture(params=[0o022, 0o077, 0o002])
+def umask(request):
+    before = os.umask(request.param)
+    yield request.param
+    os.umask(before)
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_permissions_are_those_of_the_umask(tmp_path, umask):
+    write_atomically(tmp_path / "a.bin", b"\0\1")
+    with new_folder(tmp_path / "folder") as fresh:
+        (fresh / "b.txt").write_text("b")
+    assert mode(tmp_path / "a.bin") == 0o666 & ~umask
+    assert mode(tmp_path / "folder") == 0o777 & ~umask
+    assert (tmp_path / "a.bin").read_bytes() == b"\0\1"
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
+    path = tmp_path / "deep" / "a.txt"
+    write_atomically(path, "old é")
+
+    def interrupted():
+        with new_file(path) as fresh:
+            fresh.write_text("half of the n")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text(encoding="utf-8") == "old é"
+    assert [item.name for item in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_a_failed_folder_leaves_the_old_one_alone(tmp_path):
+    folder = tmp_path / "model"
+    with new_folder(folder) as fresh:
+        (fresh / "weights").write_text("1")
+
+    def failing():
+        with new_folder(folder) as fresh:
+            (fresh / "weights").write_text("2")
+            raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        failing()
+    assert (folder / "weights").read_text() == "1"
+    assert [item.name for item in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_replaced_folder_keeps_what_is_not_its_own(tmp_path):
+    folder = tmp_path / "model"
+    (folder / "notes").mkdir(parents=True)
+    (folder / "notes" / "mine.txt").write_text("mine")
+    for name in ("weights", "report"):
+        (folder / name).write_text("old")
+    with new_folder(folder, own=("weights", "report")) as fresh:
+        (fresh / "weights").write_text("new")
+    assert sorted(item.name for item in folder.iterdir()) == ["notes", "weights"]
+    assert (folder / "weights").read_text() == "new"
+    assert (folder / "notes" / "mine.txt").read_text() == "mine"
+    assert [item.name for item in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_link_to_a_folder_stays_a_link(tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "there")
+    with new_folder(tmp_path / "link") as fresh:
+        (fresh / "a").write_text("a")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "there" / "a").read_text() == "a"
+
+
+def test_json_says_null_for_what_is_not_finite(tmp_path):
+    value = {"a": [1.5, math.nan], "b": (math.inf, "x"), "c": np.array([1.0, -np.inf])}
+    write_json(tmp_path / "a.json", value | {"d": np.float64("nan"), "e": np.int64(3), "f": None})
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail) == {
+        "a": [1.5, None],
+        "b": [None, "x"],
+        "c": [1.0, None],
+        "d": None,
+        "e": 3,
+        "f": None,
+    }
+    assert json_safe(True) is True

@@ -9,7 +9,7 @@ import torch
 
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.weight import under_weight
-from surgisoft.measurement.histories import outside_range
+from surgisoft.measurement.histories import check_fits, outside_range
 from surgisoft.measurement.recordings.recording import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.known_error import KnownError
@@ -45,6 +45,7 @@ def open_inputs(
     """
     arm = load_model(model)
     measured = read_recordings(recordings)
+    check_fits(arm.spec, measured)
     turned, notes = under_weight(arm, measured)
     return turned, measured, (*notes, *outside_range(arm.spec, measured))
 

@@ -1,17 +1,22 @@
-# Two commands on a fresh machine: `make demo` and `make test`. Each sets up all that it needs.
+# Commands on a fresh machine. Each target sets up all that it needs.
 PYTHON ?= python3
 VENV ?= .venv
 TORCH ?= torch==2.13.0
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test lint clean
+.PHONY: demo test fast lint docs clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip setuptools -c constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt "$(TORCH)"
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
+	touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[docs]"
 	touch $@
 
 demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that a model is missing
@@ -28,9 +33,18 @@ demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that
 test: $(STAMP)  ## the whole suite
 	$(BIN)/python -m pytest -n 2 -q
 
-lint: $(STAMP)
+fast: $(STAMP)  ## the tests that are not marked slow
+	$(BIN)/python -m pytest -n 2 -q -m fast
+
+lint: $(STAMP)  ## style, format, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+docs: $(DOCS_STAMP)  ## the documentation site, in site/
+	$(BIN)/python docs/draw_architecture.py --check
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "Read it with: $(BIN)/python -m http.server --directory site"
 
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo site

@@ -2,12 +2,12 @@
 
 import multiprocessing
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from surgisoft.progress import Progress
 from surgisoft.workers import begin_worker
 
 ARCHITECTURES = ("64,64", "128,128", "64,64,64", "128,128,128", "64,64,64,64", "128,128,128,128")
@@ -77,7 +77,7 @@ def collect(seed: int, folder: Path, points: int | None) -> float:
     The floor is the mean square of what the cameras add to each coordinate, from the plant itself.
     """
     from surgisoft.measurement.protocols import make_protocol
-    from surgisoft.measurement.recordings.recording import save_recording
+    from surgisoft.measurement.recordings import save_recording
     from surgisoft.rig import VirtualRig
 
     floor = 0.0
@@ -99,7 +99,7 @@ def fit_one(task: tuple[int, Case, Path]) -> Outcome:
 
     from surgisoft.diagnosis.compare import compare
     from surgisoft.measurement.histories import arm_spec, history_of
-    from surgisoft.measurement.recordings.recording import load_recording
+    from surgisoft.measurement.recordings import load_recording
     from surgisoft.surrogate.checkpoint import save_model
     from surgisoft.surrogate.fit import FitConfig, fit
 
@@ -136,7 +136,7 @@ def run(
     seeds: list[int],
     points: int | None,
     processes: int,
-    report: Callable[[float, float, str], None],
+    report: Progress,
     images: Path | None = None,
 ) -> str:
     """The whole study; returns its Markdown. `images` receives loops and bodies of one robot."""
@@ -163,7 +163,7 @@ def draw(seed: int, folder: Path, images: Path) -> None:
     """Loops of three models on an amplitude ladder, and bodies of the best, of one robot."""
     from surgisoft.diagnosis.pages.pictures import body, ladder_loops, save
     from surgisoft.diagnosis.residuals import residuals
-    from surgisoft.measurement.recordings.recording import load_recording
+    from surgisoft.measurement.recordings import load_recording
     from surgisoft.surrogate.checkpoint import load_model
 
     ladder = load_recording(folder / f"ladder-{seed}.parquet")

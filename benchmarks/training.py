@@ -19,7 +19,7 @@ from torch import nn
 
 from benchmarks.control.policies import plan_of
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.ppo import gather
+from surgisoft.agents.ppo import collect_rollout
 from surgisoft.agents.training import Training
 from surgisoft.tasks.registry import make_task
 
@@ -61,10 +61,12 @@ def measured(training: Training) -> tuple[float, float]:
     size = preset.envs * preset.rollout
     turns = -(-SAMPLES // size)
     rollout = update = 0.0
-    training.turn()
+    training.iterate()
     for _ in range(turns):
         begin = time.process_time()
-        training.seen, _ = gather(training.env, training.agents, training.seen, preset.rollout)
+        training.seen, _ = collect_rollout(
+            training.env, training.agents, training.seen, preset.rollout
+        )
         middle = time.process_time()
         for ppo in training.agents.values():
             ppo.update()

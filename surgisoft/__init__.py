@@ -1,10 +1,118 @@
-"""Multi-agent surgical scenarios for soft robots, with arm models judged by measurements."""
+"""Multi-agent surgical scenarios for soft robots, with arm models judged by measurements.
+
+The names below are the package's functions. Each takes paths or objects and gives the result of
+the command of its name. They are imported when they are first used: `import surgisoft` is quick.
+
+System identification of an arm:
+
+    load_model, save_model       a model's folder <-> `ArmModel`
+    load_recording(s), save_recording
+    collect                      a recording from a rig, by default the virtual one
+    fit                          recordings -> model (grey-box: network and physical effects)
+    compare                      how wrong is a model, and what does its error depend on?
+    diagnose                     which physical effect is missing?
+    next_experiment              what to record to distinguish competing effects
+    amend, improve               add effects, and validate them on held-out data
+    register_effect_file         a user-defined effect
+
+Surgical tasks:
+
+    make, parallel_env           Gymnasium and PettingZoo environments
+    train, evaluate              policies (PPO, centralised training, decentralised execution)
+    open_scene, open_replay      scenes and episodes
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from surgisoft.environments import register_with_gymnasium
 
 __version__ = "0.1.0"
 
+if TYPE_CHECKING:
+    from surgisoft.agents.session import evaluate, train
+    from surgisoft.diagnosis.amend import amend
+    from surgisoft.diagnosis.compare import compare
+    from surgisoft.diagnosis.design.next_experiment import next_experiment
+    from surgisoft.diagnosis.diagnose import diagnose
+    from surgisoft.diagnosis.improve import improve
+    from surgisoft.measurement.fitting import fit
+    from surgisoft.measurement.recordings import (
+        load_recording,
+        load_recordings,
+        save_recording,
+    )
+    from surgisoft.replay.show import open_replay
+    from surgisoft.rig.trial import collect
+    from surgisoft.scene.folder import open_scene
+    from surgisoft.surrogate.checkpoint import load_model, save_model
+    from surgisoft.surrogate.checkpoint import load_model as load
+    from surgisoft.surrogate.effects import register_effect_file
+    from surgisoft.tasks.make import make
+    from surgisoft.tasks.parallel import parallel_env
 
-def parallel_env(task: str, **arguments):
-    """The named task as a PettingZoo ParallelEnv; see `surgisoft.tasks.parallel.parallel_env`."""
-    from surgisoft.tasks import parallel
+_PLACES = {
+    "amend": "diagnosis.amend",
+    "collect": "rig.trial",
+    "compare": "diagnosis.compare",
+    "diagnose": "diagnosis.diagnose",
+    "evaluate": "agents.session",
+    "fit": "measurement.fitting",
+    "improve": "diagnosis.improve",
+    "load_model": "surrogate.checkpoint",
+    "load_recording": "measurement.recordings.recording",
+    "load_recordings": "measurement.recordings.recording",
+    "make": "tasks.make",
+    "next_experiment": "diagnosis.design.next_experiment",
+    "open_replay": "replay.show",
+    "open_scene": "scene.folder",
+    "parallel_env": "tasks.parallel",
+    "register_effect_file": "surrogate.effects",
+    "save_model": "surrogate.checkpoint",
+    "save_recording": "measurement.recordings.recording",
+    "train": "agents.session",
+}
+"""The module of each function, inside the package."""
+_OTHER_NAMES = {"load": "load_model"}
+"""Second names."""
 
-    return parallel.parallel_env(task, **arguments)
+__all__ = [
+    "__version__",
+    "amend",
+    "collect",
+    "compare",
+    "diagnose",
+    "evaluate",
+    "fit",
+    "improve",
+    "load",
+    "load_model",
+    "load_recording",
+    "load_recordings",
+    "make",
+    "next_experiment",
+    "open_replay",
+    "open_scene",
+    "parallel_env",
+    "register_effect_file",
+    "save_model",
+    "save_recording",
+    "train",
+]
+
+
+register_with_gymnasium()
+
+
+def __getattr__(name: str) -> object:
+    """Import a function when it is first asked for (PEP 562)."""
+    own = _OTHER_NAMES.get(name, name)
+    if own not in _PLACES:
+        raise AttributeError(f"module 'surgisoft' has no attribute '{name}'")
+    found = getattr(import_module(f"surgisoft.{_PLACES[own]}"), own)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,14 +1,20 @@
-"""Read a TOML table into a frozen dataclass and write it back; every bad field gets its own line.
+"""Reads TOML into frozen dataclasses and writes them back; a bad field gives one line.
 
-A field's type says what is expected: `float`, `int`, `str`, `bool`, a fixed tuple such as
-`tuple[float, float, float]`, `tuple[X, ...]`, another frozen dataclass, or any of these as
-`Annotated[type, Rule(...)]`. Unknown fields are errors that name the known ones.
+A field's type says what is expected: `float`, `int`, `str`, `bool`, a `Literal` of texts, a fixed
+tuple such as `tuple[float, float, float]`, `tuple[X, ...]`, `dict[str, X]` (tables whose names are
+free), another frozen dataclass, a union of these, `Any`, or any of them as
+`Annotated[type, Rule(...)]`. Unknown fields are errors that name the known ones. A dataclass that
+has a method `checked(where)` checks there what concerns several fields; it returns the value to
+use, normally itself.
+
+Reading is bounded: a file of any content ends in a value or in one line, never in a traceback.
 """
 
 import dataclasses
 import difflib
 import math
 import re
+import reprlib
 import tomllib
 import types
 import typing
@@ -20,13 +26,35 @@ import tomli_w
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 
+LARGEST_BYTES = 4_000_000
+"""A larger file is no configuration and is not parsed."""
+DEEPEST_KEY = 100
+"""A dotted key of more parts is refused."""
+LARGEST_INTEGER = 2**63
+"""Integers of TOML are smaller in size (TOML 1.0.0: 64-bit)."""
+
 
 @dataclass(frozen=True)
 class Rule:
     """What a value must hold beyond its type; the text completes 'expected ...'."""
 
     expected: str
-    holds: typing.Callable[[object], bool]
+    holds: typing.Callable[[typing.Any], bool]
+
+
+def one_of(names: typing.Iterable[str]) -> Rule:
+    """A text out of a list."""
+    known = tuple(names)
+    return Rule(f"one of {', '.join(known)}", lambda value: value in known)
+
+
+def at_least(least: int) -> Rule:
+    """An integer from this one upwards."""
+    return Rule(f"an integer >= {least}", lambda value: value >= least)
+
+
+POSITIVE = Rule("a number > 0", lambda value: value > 0)
+"""For lengths, times, rates."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +80,8 @@ class Where:
         """One line: file, line, field, what came, what was expected."""
         line = line_of(self.text, self.keys)
         place = f"{self.path}:{line}" if line else str(self.path)
-        return InputError(f"{place}: {self.field}: {came}; expected {expected}")
+        field = f"{_short(self.field)}: " if self.keys else ""
+        return InputError(f"{place}: {field}{came}; expected {expected}")
 
 
 def line_of(text: str, keys: tuple[str | int, ...]) -> int:
@@ -62,11 +91,12 @@ def line_of(text: str, keys: tuple[str | int, ...]) -> int:
     best, best_depth = 0, 0
     for number, line in enumerate(text.splitlines(), start=1):
         here = table
-        if header := re.match(r"\s*(\[\[?)\s*([\w.\"' -]+?)\s*\]\]?\s*(#.*)?$", line):
-            parts = [part.strip().strip("\"'") for part in header[2].split(".")]
+        if header := re.match(r"\s*(\[\[?)([^\[\]#]+)\]\]?\s*(#.*)?$", line):
+            name = header[2].strip()
+            parts = [part.strip().strip("\"'") for part in name.split(".")]
             if header[1] == "[[":
-                index = counts.get(header[2], -1) + 1
-                counts[header[2]] = index
+                index = counts.get(name, -1) + 1
+                counts[name] = index
                 parts = [*parts, index]
             here = table = tuple(parts)
         elif entry := re.match(r"\s*[\"']?([\w.-]+)[\"']?\s*=", line):
@@ -83,28 +113,47 @@ def line_of(text: str, keys: tuple[str | int, ...]) -> int:
 def read_toml(path: Path) -> tuple[dict, Where]:
     """The parsed file and its place; a file that cannot be parsed is one line."""
     try:
-        text = path.read_bytes().decode("utf-8")
+        with path.open("rb") as file:
+            content = file.read(LARGEST_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; expected a TOML file") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; expected a TOML file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if len(content) > LARGEST_BYTES:
+        raise InputError(f"{path}: larger than {LARGEST_BYTES} bytes; expected a TOML file")
+    try:
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text; expected a TOML file") from None
+    return parse_toml(text, path), Where(path, text)
+
+
+def parse_toml(text: str, path: Path) -> dict:
+    """The tables of a TOML text; `path` is for the message about a text that is no TOML."""
+    depth = 0
+    for piece in text.split("."):  # tomllib takes quadratic time in the parts of a dotted key
+        depth = depth + 1 if re.fullmatch(r"[^\n=,#\[\]{}]+", piece) else 0
+        if depth > DEEPEST_KEY:
+            raise InputError(f"{path}: not valid TOML: a key of more than {DEEPEST_KEY} parts")
     try:
-        return tomllib.loads(text), Where(path, text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, and integers of too many digits
+        raise InputError(f"{path}: not valid TOML: {_short(str(error), 200)}") from None
 
 
 def from_table(kind: type, table: object, where: Where):
     """Build the frozen dataclass `kind` from a TOML table; the error names the first bad field."""
     if not isinstance(table, dict):
-        raise where.error(f"got {describe(table)}", "a table")
+        raise where.error(f"got {describe(table)}", f"a table [{where.field}]")
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name in table:
         if name not in fields:
-            near = difflib.get_close_matches(name, fields, n=1)
+            near = difflib.get_close_matches(name[:100], fields, n=1)
             hint = f" (did you mean '{near[0]}'?)" if near else ""
             raise (where / name).error(f"unknown field{hint}", f"one of {', '.join(fields)}")
     values = {}
@@ -112,17 +161,31 @@ def from_table(kind: type, table: object, where: Where):
         if name in table:
             values[name] = _value(hints[name], table[name], where / name)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise (where / name).error("missing", expectation(hints[name]))
-    return kind(**values)
+            table_of = f"a table [{(where / name).field}]"
+            is_table = dataclasses.is_dataclass(_split(hints[name])[0])
+            raise (where / name).error(
+                "missing", table_of if is_table else expectation(hints[name])
+            )
+    built = kind(**values)
+    return built.checked(where) if hasattr(built, "checked") else built
 
 
-def to_table(config) -> dict:
-    """The dataclass as nested dicts and lists, in the order of its fields."""
+def to_table(config: typing.Any) -> typing.Any:
+    """The dataclass as dicts and lists, in the order of its fields; a path becomes text."""
     if dataclasses.is_dataclass(config):
         return {f.name: to_table(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    if isinstance(config, tuple):
+    if isinstance(config, dict):
+        return {name: to_table(part) for name, part in config.items()}
+    if isinstance(config, tuple | list):
         return [to_table(item) for item in config]
-    return config
+    return str(config) if isinstance(config, Path) else config
+
+
+def merged(base: typing.Any, changes: typing.Any) -> typing.Any:
+    """A table with the fields of another one changed, at whatever depth they are."""
+    if not (isinstance(base, dict) and isinstance(changes, dict)):
+        return changes
+    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
 
 
 def write_toml(path: Path, table: dict) -> None:
@@ -135,74 +198,144 @@ def write_toml(path: Path, table: dict) -> None:
     write_atomically(path, text)
 
 
+class _Repr(reprlib.Repr):
+    """`repr` of values of any size and depth in a bounded number of characters."""
+
+    def repr_int(self, value: int, level: int) -> str:
+        if abs(value) >= LARGEST_INTEGER:
+            return f"of {value.bit_length()} bits"
+        return repr(value)
+
+
+_REPR = _Repr()
+_REPR.maxlist = _REPR.maxdict = 20
+_REPR.maxstring = _REPR.maxother = 80
+
+
+def _short(text: str, most: int = 100) -> str:
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def describe(value: object) -> str:
     """What came, short enough for one line."""
-    names = {bool: "boolean", int: "integer", float: "number", str: "text", dict: "a table"}
+    names = {bool: "boolean", int: "integer", float: "number", str: "text"}
     if isinstance(value, dict):
         return "a table"
-    text = repr(value) if not isinstance(value, bool) else str(value).lower()
-    text = text if len(text) <= 60 else text[:57] + "..."
-    return f"{names.get(type(value), 'a list' if isinstance(value, list) else 'value')} {text}"
+    text = _REPR.repr(value) if not isinstance(value, bool) else str(value).lower()
+    kind = names.get(type(value), "a list" if isinstance(value, list) else "value")
+    return f"{kind} {_short(text, 60)}"
 
 
-def expectation(hint) -> str:
+def expectation(hint: typing.Any) -> str:
     """The type and its rules in words."""
     base, rules = _split(hint)
     if rules:
         return " and ".join(rule.expected for rule in rules)
     words = {float: "a number", int: "an integer", str: "text", bool: "true or false"}
+    words |= {Path: "text", typing.Any: "a value"}
+    parts = typing.get_args(base)
     if base in words:
         return words[base]
     if dataclasses.is_dataclass(base):
         return "a table"
-    parts = typing.get_args(base)
-    if isinstance(base, types.UnionType):
-        known = {words.get(part, "text" if part is Path else "nothing") for part in parts}
-        return " or ".join(sorted(known, reverse=True))
+    if _is_union(base):
+        known = [expectation(part) for part in parts if part is not types.NoneType]
+        return " or ".join(dict.fromkeys(known))
+    origin = typing.get_origin(base)
+    if origin is typing.Literal:
+        return f"one of {', '.join(parts)}" if len(parts) > 1 else f'"{parts[0]}"'
+    if origin is dict:
+        return f"a table, each entry {expectation(parts[1])}"
     if parts[-1] is Ellipsis:
         return f"a list, each {expectation(parts[0])}"
     return f"{len(parts)} numbers" if set(parts) == {float} else f"a list of {len(parts)}"
 
 
-def _split(hint) -> tuple[object, tuple[Rule, ...]]:
+def _split(hint: typing.Any) -> tuple[typing.Any, tuple[Rule, ...]]:
     if typing.get_origin(hint) is typing.Annotated:
         base, *extra = typing.get_args(hint)
         return base, tuple(rule for rule in extra if isinstance(rule, Rule))
     return hint, ()
 
 
-def _value(hint, value: object, where: Where):
+def _is_union(base: typing.Any) -> bool:
+    return typing.get_origin(base) in (typing.Union, types.UnionType)
+
+
+def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = None):
+    """The value as `hint` asks for; messages state what `said` (default: the hint) asks for."""
     base, rules = _split(hint)
-    bad = where.error(f"got {describe(value)}", expectation(hint))
-    if dataclasses.is_dataclass(base):
-        return from_table(base, value, where)
-    if typing.get_origin(base) is tuple:
-        converted = _tuple(typing.get_args(base), value, where, bad)
-    elif base is float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise bad
-        try:
-            converted = float(value)
-        except OverflowError:
-            raise bad from None
-        if not math.isfinite(converted):
-            raise where.error(f"got {converted}", f"a finite number ({expectation(hint)})")
-    elif isinstance(value, base) and isinstance(value, bool) == (base is bool):
+    said = hint if said is None else said
+
+    def bad() -> InputError:
+        return where.error(f"got {describe(value)}", expectation(said))
+
+    if base is typing.Any:
         converted = value
+    elif dataclasses.is_dataclass(base):
+        converted = from_table(typing.cast(type, base), value, where)
+    elif _is_union(base):
+        part = next((part for part in typing.get_args(base) if _admits(part, value)), None)
+        if part is None:
+            raise bad()
+        converted = None if part is types.NoneType else _value(part, value, where, said)
+    elif typing.get_origin(base) is dict:
+        if not isinstance(value, dict):
+            raise bad()
+        kind = typing.get_args(base)[1]
+        converted = {name: _value(kind, part, where / name) for name, part in value.items()}
+    elif typing.get_origin(base) is tuple:
+        converted = _tuple(typing.get_args(base), value, where, bad)
+    elif not _admits(base, value):
+        raise bad()
+    elif base is float:
+        converted = _float(value, bad)
+        if not math.isfinite(converted):
+            raise where.error(f"got {converted}", f"a finite number ({expectation(said)})")
     else:
-        raise bad
+        converted = value
     if not all(rule.holds(converted) for rule in rules):
-        raise bad
+        raise bad()
     return converted
 
 
-def _tuple(parts: tuple, value: object, where: Where, bad: InputError) -> tuple:
+def _admits(hint: typing.Any, value: object) -> bool:
+    """Whether a value is of the kind that a type asks for: text, number, list, table."""
+    base, _ = _split(hint)
+    origin = typing.get_origin(base)
+    if base is typing.Any:
+        return True
+    if _is_union(base):
+        return any(_admits(part, value) for part in typing.get_args(base))
+    if origin is typing.Literal:
+        return isinstance(value, str) and value in typing.get_args(base)
+    if origin is tuple:
+        return isinstance(value, list | tuple)
+    if origin is dict or dataclasses.is_dataclass(base):
+        return isinstance(value, dict)
+    if isinstance(value, bool):
+        return base is bool
+    if base is int:
+        return isinstance(value, int) and abs(value) < LARGEST_INTEGER
+    return isinstance(value, int | float) if base is float else isinstance(value, base)
+
+
+def _float(value: typing.Any, bad: typing.Callable[[], InputError]) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise bad() from None
+
+
+def _tuple(
+    parts: tuple, value: object, where: Where, bad: typing.Callable[[], InputError]
+) -> tuple:
     if not isinstance(value, list | tuple):
-        raise bad
+        raise bad()
     if parts[-1] is Ellipsis:
         return tuple(_value(parts[0], item, where / i) for i, item in enumerate(value))
     if len(value) != len(parts):
-        raise bad
+        raise bad()
     return tuple(
         _value(part, item, where / i)
         for i, (part, item) in enumerate(zip(parts, value, strict=True))

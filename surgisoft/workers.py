@@ -23,7 +23,10 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-    asker = multiprocessing.parent_process().sentinel
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise RuntimeError("begin_worker is for a new process, and this is the first one")
+    asker = parent.sentinel
 
     def end_with_it() -> None:
         multiprocessing.connection.wait([asker])
@@ -32,6 +35,22 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
     threading.Thread(target=end_with_it, daemon=True).start()
     if prepare is not None:
         prepare()
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch inside the block, or inside the function that this decorates.
+
+    The number of threads decides in which order sums are added, and so about their last digits.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from surgisoft.tasks.world.scene import PHANTOM
+from surgisoft.scene.packaged import PHANTOM
 
 ROOT = Path(__file__).resolve().parents[1]
 WANTED = {

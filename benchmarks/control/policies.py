@@ -1,4 +1,4 @@
-"""Policies for studies: trained into a folder once, gone on with if cut off; drivers played."""
+"""Policies of benchmarks: trained into a folder once, resumed if interrupted, and rolled out."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.cache import Report
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.evaluate import evaluate
 from surgisoft.agents.on_rig import RigConfig, on_rig
-from surgisoft.agents.policies import open_driver
+from surgisoft.agents.policies import open_policy
 from surgisoft.agents.presets import Plan, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.agents.training import resume, train_new
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, noted, silent
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What training took."""
+    """Cost of a training run."""
 
     steps: int
     """Steps over all episodes."""
@@ -44,7 +44,7 @@ def plan_of(
     arm: Path | None = None,
     preset: str = "fast",
 ) -> Plan:
-    """A training run: the task's own number of steps and the default arm unless told otherwise."""
+    """A training run, by default with the task's number of steps and the default arm."""
     config = config_of(task)
     if arm is not None:
         config = with_fields(config, arm=str(arm))
@@ -52,7 +52,7 @@ def plan_of(
     return Plan(task, config, preset, preset_for(preset, task), own, seed=seed)
 
 
-def trained(folder: Path, plan: Plan, report: Report) -> RunFolder:
+def trained(folder: Path, plan: Plan, report: Progress) -> RunFolder:
     """The run of a plan: the one in the folder, finished if it was cut off, or a new one."""
     own, device = Processes(), torch.device("cpu")
 
@@ -73,7 +73,7 @@ def trained(folder: Path, plan: Plan, report: Report) -> RunFolder:
 
 
 def cost(run: RunFolder) -> Cost:
-    """What a run took so far."""
+    """Cost of a run so far."""
     last = _rows(run.path)[-1]
     return Cost(last["steps"], last["wall_s"], last["cpu_s"])
 
@@ -85,11 +85,11 @@ def played(
     seed: int,
     rig: RigConfig | None = None,
     arm: Path | None = None,
-    report: Report = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> dict[str, dict]:
-    """What a driver's episodes brought: name with unit -> fields of `Summary`; FCL is the referee.
+    """Evaluation of a policy: name with unit -> fields of `Summary`; contact is checked by FCL.
 
-    driver: `scripted`, `random` or a run's folder. rig: None plays in simulation.
+    driver: `scripted`, `random` or a run's folder. rig: None for simulation.
     """
     config = config_of(task)
     if arm is not None:
@@ -97,10 +97,8 @@ def played(
     place = make_task(task, config)
     if rig is not None:
         place = on_rig(place, rig)
-    opened = open_driver(driver, place)
-    found = evaluate(
-        place, driver, opened, episodes, seed, progress=lambda d, t: report(d, t, "playing")
-    )
+    opened = open_policy(driver, place)
+    found = evaluate(place, driver, opened, episodes, seed, progress=noted(report, "rollout"))
     return found.to_json()["overall"]
 
 
@@ -129,7 +127,7 @@ def _rows(folder: Path) -> list[dict]:
 
 
 def _finished(folder: Path, plan: Plan) -> bool:
-    """Whether all that was planned is done; a run that was cut off before its first turn is not."""
+    """Whether the plan is done; a run interrupted before its first iteration is not."""
     file = folder / "metrics.jsonl"
     if not file.is_file() or not file.read_text().strip():
         return False

@@ -1,7 +1,7 @@
-"""Control: learned, scripted and random drivers on every task, in simulation and on the rig.
+"""Benchmark `control`: learned, scripted and random policies on every task and plant.
 
-Runs lie in one folder as `TASK-seed-N`; what is missing is trained there, what is there is taken
-as it is. Results are kept beside them by the content of the policy.
+Runs are in one folder as `TASK-seed-N`; missing ones are trained, others are used as they are.
+Evaluations are cached beside them by the content of the policy.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.cache import Kept, Meter, Report
+from benchmarks.cache import Cache
 from benchmarks.control.policies import Cost, cost, plan_of, played, trained
 from benchmarks.control.two_processes import trained_by_two
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import PAPER_STEPS
 from surgisoft.agents.run_folder import BEST, RunFolder
+from surgisoft.config import to_table
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.registry import config_of, config_table
+from surgisoft.progress import Progress, Stages
+from surgisoft.tasks.registry import config_of
 
 LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
 """Tasks that policies are trained for."""
@@ -38,11 +40,11 @@ class ControlConfig:
     seeds: tuple[int, ...] = (1, 2, 3)
     """Seeds of the training runs."""
     episodes: int = 100
-    """Episodes of each driver in simulation."""
+    """Episodes of each policy in simulation."""
     rig_episodes: int = 20
-    """Episodes of each driver on the rig."""
+    """Episodes of each policy on the rig."""
     episode_seed: int = 1000
-    """Seed of the episodes that are played; training and its evaluations use others."""
+    """Seed of the evaluated episodes; training and checkpoint selection use others."""
     rate_steps: int = 1_048_576
     """Steps of preset `paper` by which its rate is measured; 0: it is not."""
     whole_steps: int = PAPER_STEPS
@@ -67,14 +69,14 @@ class Trained:
     preset: str
     """Its preset."""
     cost: Cost
-    """What it took."""
+    """Its cost."""
     best: dict[str, float]
-    """What its own evaluation found for the policy that was kept."""
+    """Evaluation of the selected checkpoint."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """One driver's episodes."""
+    """Evaluation of one policy on one task and plant."""
 
     task: str
     """What was played."""
@@ -88,7 +90,7 @@ class Played:
 
 @dataclass(frozen=True)
 class Results:
-    """All that was measured."""
+    """All results of the benchmark."""
 
     runs: tuple[Trained, ...]
     """Every policy's training."""
@@ -100,13 +102,13 @@ class Results:
     """The run of as many steps as the paper's, by two processes; its wall time is what counts."""
 
 
-def run(config: ControlConfig, folder: Path, report: Report) -> Results:
-    """Train what is missing, then play everything that is not kept from before."""
+def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
+    """Train what is missing, then evaluate everything that is not in the cache."""
     learned = [(task, seed) for task in LEARNED if task in config.tasks for seed in config.seeds]
     plays = 2 * (len(learned) + 2 * len(config.tasks))
     whole = config.whole_steps if RATE_TASK in config.tasks else 0
     alone = 25 * bool(config.rate_steps) + 100 * bool(whole)
-    meter = Meter(report, 100 * len(learned) + alone + 5 * (plays + 2 * bool(whole)))
+    meter = Stages(report, 100 * len(learned) + alone + 5 * (plays + 2 * bool(whole)))
     folder.mkdir(parents=True, exist_ok=True)
     drivers, runs, both = [], [], None
     if whole:
@@ -120,7 +122,7 @@ def run(config: ControlConfig, folder: Path, report: Report) -> Results:
         drivers.append((task, f"learned, seed {one.seed}", str(place)))
     paper = _paper(config, folder, meter) if config.rate_steps else None
     drivers += [(task, name, name) for task in config.tasks for name in ("scripted", "random")]
-    kept, shown = Kept(folder / "results"), []
+    kept, shown = Cache(folder / "results"), []
     for where in PLACES:
         for task, name, driver in drivers:
             tell = meter.stage(5, f"{task}: {name}, {where}")
@@ -130,7 +132,7 @@ def run(config: ControlConfig, folder: Path, report: Report) -> Results:
     return Results(tuple(runs), tuple(shown), paper, cost(both) if both else None)
 
 
-def _learned(folder: Path, task: str, seed: int, report: Report) -> Trained:
+def _learned(folder: Path, task: str, seed: int, report: Progress) -> Trained:
     """A finished run as it is; else one that is trained with the task's own number of steps."""
     there = RunFolder(folder) if (folder / "config.json").is_file() else None
     if there is not None and there.config["task"] != task:
@@ -140,22 +142,22 @@ def _learned(folder: Path, task: str, seed: int, report: Report) -> Trained:
     return Trained(task, opened.config["seed"], opened.config["preset"], cost(opened), best)
 
 
-def _paper(config: ControlConfig, folder: Path, meter: Meter) -> Cost:
+def _paper(config: ControlConfig, folder: Path, meter: Stages) -> Cost:
     """A run of preset `paper`, long enough to know its rate."""
     place = folder / f"rate-paper-{config.rate_steps}"
     plan = plan_of(RATE_TASK, 1, config.rate_steps, preset="paper")
     return cost(trained(place, plan, meter.stage(25, "rate of preset paper")))
 
 
-def _played(config: ControlConfig, kept: Kept, task: str, where: str, driver: str, tell) -> dict:
-    """What one driver's episodes brought, from the folder of results where it is there."""
+def _played(config: ControlConfig, kept: Cache, task: str, where: str, driver: str, tell) -> dict:
+    """Evaluation of one policy, from the cache where it is there."""
     rig = RigConfig() if where == "rig" else None
     count = config.episodes if rig is None else config.rig_episodes
     about = {
         "task": task,
-        "config": config_table(config_of(task)),
+        "config": to_table(config_of(task)),
         "driver": driver,
-        "rig": rig and config_table(rig),
+        "rig": rig and to_table(rig),
         "episodes": count,
         "seed": config.episode_seed,
     }

@@ -7,10 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.cache import Report
 from benchmarks.control.policies import cost
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress
 
 ENVS = 4096
 """Episodes side by side in each process: what a small tensor operation costs is shared by many."""
@@ -23,10 +23,10 @@ def arguments(task: str, steps: int, folder: Path) -> list[str]:
     resumed = (folder / "config.json").is_file()
     new = ["--task", task, "--steps", str(steps), "--envs", str(ENVS), "-o", str(folder)]
     own = ["--resume", str(folder)] if resumed else new
-    return ["--nproc-per-node", "2", "-m", "surgisoft.cli", "train", *own]
+    return ["--nproc-per-node", "2", "-m", "surgisoft", "train", *own]
 
 
-def trained_by_two(folder: Path, task: str, steps: int, report: Report) -> RunFolder:
+def trained_by_two(folder: Path, task: str, steps: int, report: Progress) -> RunFolder:
     """The run in a folder, trained with preset `fast` by two processes where it is missing."""
     if (folder / "config.json").is_file() and _checked(folder, task) and _steps(folder) >= steps:
         return RunFolder(folder)

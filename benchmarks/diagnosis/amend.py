@@ -11,9 +11,9 @@ import numpy as np
 
 from benchmarks.diagnosis.robots import Recorded
 from surgisoft.diagnosis.amend import amend
-from surgisoft.diagnosis.refinement.network import retune
+from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 from benchmarks.diagnosis.cases import Case
 from benchmarks.diagnosis.robots import record_experiment
-from surgisoft.diagnosis.design.next_experiment import effect_left, recommend
+from surgisoft.diagnosis.design.next_experiment import recommend
 from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS
-from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
+from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose, effect_left
 from surgisoft.diagnosis.residuals import problem_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 

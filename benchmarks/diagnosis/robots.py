@@ -18,7 +18,7 @@ from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, Case
 from surgisoft.diagnosis.design.schedules import Setup
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.rig.virtual import MOUNT
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -74,8 +74,9 @@ def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
                 if name in noise:
                     value.add_(middle * noise[name])
         rows = Data(history, history, None).judging_rows(answer)
-        answer.validation |= validated_error(rows.target, model_rows(answer, rows))
-        if answer.validation["rmse_mm"] < wanted_mm:
+        found = validated_error(rows.target, model_rows(answer, rows))
+        answer.validation = replace(found, noise_mm=model.validation.noise_mm)
+        if found.rmse_mm < wanted_mm:
             low = middle
         else:
             high = middle

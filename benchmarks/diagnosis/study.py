@@ -9,7 +9,6 @@ of some cases the model is amended by what was named.
 import hashlib
 import json
 import time
-from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from benchmarks.diagnosis.experiment import Settled, settle_both
 from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.workers import workers
 
@@ -63,7 +63,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     begin = time.process_time()
     torch.set_num_threads(1)
     model = base_model(case.robot, folder, case.undertrained)
-    if case.discrepancy_mm > model.validation["rmse_mm"]:
+    if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, case.robot, case.discrepancy_mm, case.take)
     known = KnownError.of(model, [validation_of(case.robot)])
     recorded = record(case)
@@ -83,7 +83,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
         ranking=tuple(row.effect for row in found.ranking),
         confidence=found.ranking[0].confidence if found.ranking else 0.0,
         effect_mm=recorded.effect_mm,
-        discrepancy_mm=model.validation["rmse_mm"],
+        discrepancy_mm=model.validation.rmse_mm,
         seconds=seconds,
         statistics=found.statistics,
         settled=settled,
@@ -104,7 +104,7 @@ def run(
     some: list[Case],
     folder: Path,
     processes: int,
-    report: Callable[[float, float, str], None],
+    report: Progress,
     amend: int = 0,
 ) -> list[Outcome]:
     """All outcomes; base models first, then the cases, over processes.

@@ -1,14 +1,16 @@
-"""Policies trained on a model, and all drivers played on the rig that hides something."""
+"""Policies trained on a model, and all policies evaluated on the rig that hides an effect."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.cache import Kept, Meter, model_digest
+from benchmarks.cache import Cache, model_digest
 from benchmarks.control.policies import cost, plan_of, played, trained
 from surgisoft.agents.on_rig import RigConfig
-from surgisoft.tasks.registry import config_table, with_fields
+from surgisoft.config import to_table
+from surgisoft.progress import Stages
+from surgisoft.tasks.registry import with_fields
 
 TASK = "track_circle"
 """What the policies learn."""
@@ -19,13 +21,13 @@ TRAIN, PLAY = 100, 8
 
 
 @dataclass(frozen=True)
-class Drivers:
-    """How policies are trained, and the rig that drivers are played on."""
+class PolicyEvaluation:
+    """How policies are trained, and the rig on which they are evaluated."""
 
-    kept: Kept
+    kept: Cache
     """Where policies and results are kept."""
     specimen: int
-    """Seed of the arm's casting."""
+    """Seed of the virtual robot."""
     hidden: tuple[tuple[str, float], ...]
     """Hidden effects of the rig and their strengths."""
     steps: int
@@ -33,18 +35,18 @@ class Drivers:
     seed: int
     """Seed of the training and of the episodes."""
     episodes: int
-    """Episodes of each driver."""
+    """Episodes of each policy."""
 
     def on_model(
-        self, title: str, arm: Path, meter: Meter, names: tuple[str, ...]
+        self, title: str, arm: Path, meter: Stages, names: tuple[str, ...]
     ) -> tuple[dict[str, dict], dict]:
-        """Drivers that know the arm by the model in a folder: NAME/SIGHT -> fields of `Summary` of
+        """Policies that know the arm by the model in a folder: NAME/SIGHT -> fields of `Summary` of
         the episodes' mean errors [mm], and the `Cost` of the policy.
 
         names: of `learned`, `scripted`, `random`.
         """
         plan = plan_of(TASK, self.seed, self.steps, arm)
-        told = _told(plan, arm)
+        told = _inputs(plan, arm)
         tell = meter.stage(TRAIN, f"{title}: policy")
         run = trained(self.kept.place(f"policies/{TASK}", told), plan, tell)
         found = {}
@@ -63,7 +65,7 @@ class Drivers:
         about = {
             "plan": told,
             "learned": driver not in ("scripted", "random"),
-            "rig": config_table(rig),
+            "rig": to_table(rig),
             "episodes": self.episodes,
             "seed": self.seed,
         }
@@ -74,11 +76,11 @@ class Drivers:
         )
 
 
-def _told(plan, arm: Path) -> dict:
-    """What a policy depends on; the arm by its content, not by its place."""
+def _inputs(plan, arm: Path) -> dict:
+    """The inputs of a policy, for the cache; the arm by its content, not by its path."""
     return {
         "task": plan.task,
-        "config": config_table(with_fields(plan.task_config, arm=model_digest(arm))),
+        "config": to_table(with_fields(plan.task_config, arm=model_digest(arm))),
         "hyper_parameters": asdict(plan.preset),
         "steps": plan.steps,
         "seed": plan.seed,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 
 BANDS = (1.0, 3.0, 6.0, 10.0, 20.0)

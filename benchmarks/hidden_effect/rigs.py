@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cache import Kept, Report
+from benchmarks.cache import Cache
 from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import Recording, load_recording, save_recording
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
+from surgisoft.progress import Progress
 from surgisoft.rig import VirtualRig
 from surgisoft.rig.virtual import MOUNT
 
@@ -51,7 +52,7 @@ def circles(samples: int, limits: np.ndarray, seed: int) -> Protocol:
 class Bench:
     """One arm with what is hidden in it."""
 
-    kept: Kept
+    kept: Cache
     """Where recordings are kept."""
     specimen: int
     """Seed of the arm's casting."""
@@ -66,19 +67,19 @@ class Bench:
         hidden = [list(pair) for pair in self.hidden]
         return {"specimen": self.specimen, "hidden": hidden, "samples": self.samples}
 
-    def mixed(self, take: int, report: Report = _silent) -> Recording:
+    def mixed(self, take: int, report: Progress = _silent) -> Recording:
         """A recording of the `mixed` protocol; another take draws another schedule and noise."""
         limits = VirtualRig(self.specimen).limits
         protocol = make_protocol("mixed", limits, self.samples, seed=take)
         return self.record(protocol, take, report=report)
 
-    def circles(self, take: int, report: Report = _silent) -> Recording:
+    def circles(self, take: int, report: Progress = _silent) -> Recording:
         """A recording of slow rounds of the tip, as the tracking tasks ask for them."""
         limits = VirtualRig(self.specimen).limits
         return self.record(circles(self.samples, limits, take), take, report=report)
 
     def record(
-        self, protocol: Protocol, take: int, setting: str = AS_IT_STANDS, report: Report = _silent
+        self, protocol: Protocol, take: int, setting: str = AS_IT_STANDS, report: Progress = _silent
     ) -> Recording:
         """A recording of a protocol on the bench as it stands, or after a change of it."""
         about = {**self.about, "take": take, "setting": setting, "protocol": protocol.name}

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.cache import Kept, Meter, Report, model_digest
-from benchmarks.hidden_effect.policies import PLAY, TRAIN, Drivers
+from benchmarks.cache import Cache, model_digest
+from benchmarks.hidden_effect.policies import PLAY, TRAIN, PolicyEvaluation
 from benchmarks.hidden_effect.rates import by_rate
 from benchmarks.hidden_effect.rigs import Bench
 from surgisoft.diagnosis.amend import amend, fall_of
@@ -26,7 +26,8 @@ from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress, Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.fit import FitConfig, fit
@@ -40,7 +41,7 @@ TAKE, JUDGING_TAKE, FURTHER_TAKE, PACED_TAKE = 1, 9, 20, 33
 MODELS = ("before", "after", "oracle")
 """The model without the effect, the one amended by the diagnosis, the one told the name."""
 LASTING = ("learned", "scripted")
-"""Drivers that know the arm by a model."""
+"""PolicyEvaluation that know the arm by a model."""
 STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
 """Length of one effect, by the meter."""
 
@@ -125,9 +126,9 @@ class Study:
     """One specimen; models, recordings, policies and results are kept in a folder."""
 
     def __init__(self, config: StudyConfig, folder: Path):
-        self.config, self.kept = config, Kept(folder)
+        self.config, self.kept = config, Cache(folder)
 
-    def run(self, name: str, meter: Meter) -> Outcome:
+    def run(self, name: str, meter: Stages) -> Outcome:
         """All of one effect, or what of it was left to do."""
         case, config = CASES[name], self.config
         hidden = ((case.effect, config.strength),) if case.hidden else ()
@@ -145,7 +146,7 @@ class Study:
         rates = self.kept.values(
             f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
         )
-        drivers = Drivers(
+        drivers = PolicyEvaluation(
             self.kept, config.specimen, hidden, config.steps, config.seed, config.episodes
         )
         driven, training = self._driven(name, models, drivers, meter)
@@ -166,7 +167,7 @@ class Study:
             **judged,
         )
 
-    def base(self, memory: bool, report: Report) -> Path:
+    def base(self, memory: bool, report: Progress) -> Path:
         """A model of the specimen as it was cast: with its hysteresis, or from pressure alone."""
         config = self.config
         about = {"specimen": config.specimen, "memory": memory, "points": config.grid_points}
@@ -247,7 +248,7 @@ class Study:
             "claim": told["sentence"],
         }
 
-    def _oracle(self, case: Case, before: Path, bench: Bench, report: Report) -> Path:
+    def _oracle(self, case: Case, before: Path, bench: Bench, report: Progress) -> Path:
         """A model that was told the effect's name: amended on more data, or fitted with it."""
         if not case.hidden:
             return self.base(True, report)
@@ -285,7 +286,7 @@ class Study:
 
         return self.kept.values(f"errors/{name}", about, make)
 
-    def _driven(self, name: str, models: dict[str, Path], drivers: Drivers, meter: Meter):
+    def _driven(self, name: str, models: dict[str, Path], drivers: PolicyEvaluation, meter: Stages):
         """MODEL/DRIVER/SIGHT -> summary, MODEL -> cost of its policy."""
         driven, training = {}, {}
         for key, arm in models.items():
@@ -294,7 +295,9 @@ class Study:
             driven |= {f"{key}/{which}": summary for which, summary in found.items()}
         return driven, training
 
-    def _paced(self, name: str, before: Path, effects, bench: Bench, drivers: Drivers, meter):
+    def _paced(
+        self, name: str, before: Path, effects, bench: Bench, drivers: PolicyEvaluation, meter
+    ):
         """The same effects amended on circles at the task's own pace, where that is called for."""
         about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
         folder = self.kept.place(f"models/{name}-paced", about)
@@ -311,7 +314,7 @@ class Study:
             }
 
         told = self.kept.values(f"amendments/{name}-paced", about, make)
-        beside = Meter(lambda done, total, note: meter.stage(0, note), 1.0)
+        beside = Stages(lambda done, total, note: meter.stage(0, note), 1.0)
         found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
         return {
             "claim": told["sentence"],
@@ -327,10 +330,10 @@ def worse(driven: dict[str, dict]) -> bool:
     return after["low"] > before["high"]
 
 
-def run(names: list[str], config: StudyConfig, folder: Path, report: Report) -> list[Outcome]:
+def run(names: list[str], config: StudyConfig, folder: Path, report: Progress) -> list[Outcome]:
     """The named effects one after the other; what the folder holds is not done again."""
     for name in names:
         if name not in CASES:
             raise unknown_name("effect of this study", name, CASES)
-    study, meter = Study(config, folder), Meter(report, STAGES * max(len(names), 1))
+    study, meter = Study(config, folder), Stages(report, STAGES * max(len(names), 1))
     return [study.run(name, meter) for name in names]

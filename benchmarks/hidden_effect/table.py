@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.hidden_effect.policies import SIGHTS, TASK
 from benchmarks.hidden_effect.study import CASES, MODELS, Outcome, StudyConfig
-from surgisoft.diagnosis.refinement.intervals import values_text
+from surgisoft.diagnosis.estimation.intervals import values_text
 from surgisoft.report.charts import BLUE, GREEN, RED, drawing
 from surgisoft.report.style import MUTED
 

@@ -1,4 +1,4 @@
-"""How well drivers do a task: numbers of each episode, and of all with intervals."""
+"""Evaluation of policies on a task: numbers of each episode, and means with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ import torch
 from scipy.stats import binomtest
 from torch import Tensor
 
-from surgisoft.agents.policies import Driver
-from surgisoft.agents.referee import EpisodeReferee, Verdict, contacts_of, has_referee
+from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, contacts_in, has_obstacles
+from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import BATCH, Instant, Rollout, rollout
 from surgisoft.files import json_safe
+from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Task
 
 RESAMPLES = 2000
-"""Times that the episodes are drawn anew for an interval."""
+"""Bootstrap resamples of an interval."""
 CONFIDENCE = 0.95
-"""Share of intervals that hold the true mean."""
+"""Confidence level of the intervals."""
 
 SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "completion": Rollout.end,
@@ -30,7 +31,7 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "collided": Rollout.largest,
     "clearance_mm": Rollout.smallest,
 }
-"""What stands for an episode: of measures named here this, of errors four, else the mean."""
+"""Measure -> number that stands for an episode; errors have four numbers, others the mean."""
 RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
 
@@ -55,33 +56,33 @@ class Summary:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What N episodes of one driver brought."""
+    """Results of N episodes of one policy."""
 
-    driver: str
-    """Name or folder of the driver."""
+    policy: str
+    """Name of the policy, or its run's folder."""
     per_episode: dict[str, np.ndarray]
     """name with unit -> (N,); nan where it does not apply."""
     overall: dict[str, Summary]
     """The same names."""
-    verdicts: list[Verdict] | None
-    """The referee's, for each episode; None where none was asked."""
+    checks: list[EpisodeCheck] | None
+    """Exact collision checks of each episode; None where there were none."""
 
     def to_json(self) -> dict:
-        """Plain numbers and lists; what does not apply is null."""
+        """Numbers and lists for JSON; what does not apply is null."""
         answer = {
             "overall": {name: json_safe(asdict(value)) for name, value in self.overall.items()},
             "per_episode": {
                 name: json_safe(value.tolist()) for name, value in self.per_episode.items()
             },
         }
-        if self.verdicts is not None:
+        if self.checks is not None:
             answer["referee"] = {
-                "instants": sum(v.steps for v in self.verdicts),
-                "contact_differs": sum(v.contact_differs for v in self.verdicts),
-                "beam_differs": sum(v.beam_differs for v in self.verdicts),
-                "beam_off_mm": max(v.beam_off_mm for v in self.verdicts),
-                "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.verdicts)),
-                "contacts": [_contact(v) for v in self.verdicts],
+                "instants": sum(v.steps for v in self.checks),
+                "contact_differs": sum(v.contact_differs for v in self.checks),
+                "beam_differs": sum(v.beam_differs for v in self.checks),
+                "beam_off_mm": max(v.beam_off_mm for v in self.checks),
+                "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.checks)),
+                "contacts": [_contact(v) for v in self.checks],
             }
         return answer
 
@@ -89,65 +90,67 @@ class Evaluation:
 def evaluate(
     task: Task,
     name: str,
-    driver: Driver,
+    policy: Policy,
     episodes: int,
     seed: int,
-    referee: bool = True,
+    exact: bool = True,
     batch: int = BATCH,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
     watch: Callable[[Instant], None] | None = None,
 ) -> Evaluation:
-    """Play episodes 0 to `episodes - 1` of a seed; `watch` as for `rollout`.
+    """Roll out episodes 0 to `episodes - 1` of a seed and summarise them.
 
-    With a referee, contact, clearance and success are its own wherever the task has surroundings.
+    name: how the result names the policy. exact: contact, clearance and success are those of the
+    exact collision checker (FCL) where the task has obstacles. batch, progress, watch: as for
+    `rollout`.
     """
-    judge = EpisodeReferee(task) if referee and has_referee(task) else None
-    watchers = [each for each in (judge, watch) if each is not None]
+    exactly = ExactChecks(task) if exact and has_obstacles(task) else None
+    watchers = [each for each in (exactly, watch) if each is not None]
 
     def see(now: Instant) -> None:
         for each in watchers:
             each(now)
 
-    played = rollout(task, driver, episodes, seed, batch, progress, see if watchers else None)
-    verdicts = judge.verdicts() if judge else None
-    table = episode_table(task, played, verdicts)
+    result = rollout(task, policy, episodes, seed, batch, progress, see if watchers else None)
+    checks = exactly.checks() if exactly else None
+    table = episode_table(task, result, checks)
     overall = {key: summary(values, key in RATES) for key, values in table.items()}
-    return Evaluation(name, table, overall, verdicts)
+    return Evaluation(name, table, overall, checks)
 
 
 def episode_table(
-    task: Task, played: Rollout, verdicts: list[Verdict] | None = None
+    task: Task, result: Rollout, checks: list[EpisodeCheck] | None = None
 ) -> dict[str, np.ndarray]:
     """name with unit -> (N,) numbers of each episode."""
     columns: dict[str, Tensor] = {}
-    for name in played.measures:
+    for name in result.measures:
         if name in SUMMARIES:
-            columns[name] = SUMMARIES[name](played, name)
+            columns[name] = SUMMARIES[name](result, name)
         elif name.endswith("error_mm"):
             stem = name.removesuffix("_mm")
-            columns[f"{stem}_mean_mm"] = played.mean(name)
-            columns[f"{stem}_rms_mm"] = played.rms(name)
-            columns[f"{stem}_p95_mm"] = played.quantile(name, 0.95)
-            columns[f"{stem}_max_mm"] = played.largest(name)
+            columns[f"{stem}_mean_mm"] = result.mean(name)
+            columns[f"{stem}_rms_mm"] = result.rms(name)
+            columns[f"{stem}_p95_mm"] = result.quantile(name, 0.95)
+            columns[f"{stem}_max_mm"] = result.largest(name)
         else:
-            columns[name] = played.mean(name)
-        if name == "view_fraction" and has_referee(task):
-            columns["in_view"] = _in_view(task, played)
-    columns["time_s"] = played.time_s
-    columns["failed"] = played.failed.float()
-    if verdicts is not None:
-        hit = contacts_of(verdicts).to(played.failed.device)
+            columns[name] = result.mean(name)
+        if name == "view_fraction" and has_obstacles(task):
+            columns["in_view"] = _in_view(task, result)
+    columns["time_s"] = result.time_s
+    columns["failed"] = result.failed.float()
+    if checks is not None:
+        hit = contacts_in(checks).to(result.failed.device)
         columns["collided"] = hit.float()
         if "success" in columns:
             columns["success"] = columns["success"].masked_fill(hit, 0.0)
-        clearance = [verdict.clearance_mm for verdict in verdicts]
+        clearance = [check.clearance_mm for check in checks]
         columns["clearance_mm"] = torch.tensor(clearance, dtype=torch.float64)
     return {name: value.double().cpu().numpy() for name, value in columns.items()}
 
 
-def _in_view(task: Task, played: Rollout) -> Tensor:
-    """(N,) share of the steps at which the endoscope sees as much as the scene asks for."""
-    seen = played.measures["view_fraction"]
+def _in_view(task: Task, result: Rollout) -> Tensor:
+    """(N,) share of the steps at which the endoscope sees as much as the scene requires."""
+    seen = result.measures["view_fraction"]
     enough = (seen >= task.world.scene.spec.limits.view_fraction).float()
     return enough.where(seen.isfinite(), seen).nanmean(1)
 
@@ -174,6 +177,6 @@ def bootstrap(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _contact(verdict: Verdict) -> dict | None:
-    found = verdict.contact
+def _contact(check: EpisodeCheck) -> dict | None:
+    found = check.contact
     return found and {"time_s": found.time_s, "between": list(found.between)}

@@ -16,11 +16,11 @@ from pathlib import Path
 import torch
 
 from surgisoft.agents.learned import LearnedPolicy
-from surgisoft.agents.policy_network import KiloPascals
+from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
 
 TOLERANCE = 1e-5
-"""Exported policies answer with the same actions to this, kPa."""
+"""Largest difference of an exported policy's actions from the policy's own, kPa."""
 
 
 def export(policy: LearnedPolicy, folder: Path) -> list[Path]:
@@ -47,7 +47,7 @@ def export(policy: LearnedPolicy, folder: Path) -> list[Path]:
     return [*written, folder / "policy.json"]
 
 
-def _torch_script(actor: KiloPascals, width: int, file: Path) -> Path:
+def _torch_script(actor: ScaledActor, width: int, file: Path) -> Path:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         script = torch.jit.trace(actor, torch.zeros(2, width))
@@ -57,7 +57,7 @@ def _torch_script(actor: KiloPascals, width: int, file: Path) -> Path:
     return file
 
 
-def _onnx(actor: KiloPascals, width: int, file: Path) -> Path:
+def _onnx(actor: ScaledActor, width: int, file: Path) -> Path:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -84,7 +84,7 @@ def _onnx(actor: KiloPascals, width: int, file: Path) -> Path:
     return file
 
 
-def _check(actor: KiloPascals, width: int, other, file: Path) -> None:
+def _check(actor: ScaledActor, width: int, other, file: Path) -> None:
     """Compare on 64 observations far beyond what tasks give; delete the file if they differ."""
     seen = 3.0 * torch.randn(64, width, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Trained policies as drivers: from a run's folder alone, or while they are being trained."""
+"""Trained policies: from a run's folder alone, or while they are being trained."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.agents.policy_network import KiloPascals, empty_actor
+from surgisoft.agents.policy_network import ScaledActor, empty_actor
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Episodes, Task, TaskState
 
 
-class Policies:
-    """Each agent's actor, without noise."""
+class ActorPolicy:
+    """A `Policy` of one trained actor for each agent, without exploration noise."""
 
-    def __init__(self, actors: Mapping[str, KiloPascals]):
+    def __init__(self, actors: Mapping[str, ScaledActor]):
         self.actors = dict(actors)
 
     @torch.inference_mode()
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """As for `Driver`; the task and its true state are not looked at."""
+        """Each actor's action from its agent's observation alone; not privileged."""
         return {agent: self.actors[agent](observations[agent]) for agent in task.agents}
 
 
-class LearnedPolicy(Policies):
+class LearnedPolicy(ActorPolicy):
     """The policies in a training run's folder."""
 
     def __init__(self, folder: str | Path, task: Task | None = None, which: str | None = None):
-        """which: `best` (by evaluation) or `last`; None: the best one if there is one yet.
+        """which: checkpoint `best` (by evaluation) or `last`; None: `best` if there is one yet.
 
-        task: where they shall act, which must have the same agents, observations and actions.
+        task: where the policies will act; it must have the agents, observations and actions of the
+        task that they were trained on.
         """
         if which not in (None, BEST, LAST):
             raise unknown_name("checkpoint", which, (BEST, LAST))
@@ -49,8 +50,8 @@ class LearnedPolicy(Policies):
             actor = empty_actor(agent, size["observation"], size["chambers"], plan.preset)
             weights = saved["agents"][agent]
             actor.load_state_dict(weights if which == BEST else weights["actor_state_dict"])
-            kilo_pascals = KiloPascals(actor, plan.preset.action_kPa, size["step_kPa"])
-            actors[agent] = kilo_pascals.to(device).eval().requires_grad_(False)
+            scaled = ScaledActor(actor, plan.preset.action_kPa, size["step_kPa"])
+            actors[agent] = scaled.to(device).eval().requires_grad_(False)
         super().__init__(actors)
         if task is not None:
             check_fits(self.run, task)
@@ -72,7 +73,7 @@ def agent_sizes(task: Task) -> dict[str, dict]:
 
 
 def check_fits(run: RunFolder, task: Task) -> None:
-    """Raise unless the run's policies see and do what the task's agents see and do."""
+    """Raise an InputError unless agents, observations and actions are those of the run."""
     sizes, place = agent_sizes(task), f"{run.path} was trained on {run.config['task']}"
     if list(sizes) != list(run.agents):
         raise InputError(

@@ -26,7 +26,7 @@ from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
-from surgisoft.tasks.world.pytree import Objects
+from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
 
@@ -78,7 +78,7 @@ class RigPlant:
     that hold the same rig only the later one is true.
     """
 
-    rigs: Objects[SimulatedRig]
+    rigs: ObjectBatch[SimulatedRig]
     """The B rigs."""
     target_kPa: Tensor
     """(B, m) kPa: pressures that were commanded last."""
@@ -99,10 +99,11 @@ class Reading:
 
 
 class RigArm:
-    """An arm of the world whose plant is a batch of rigs; see `Arm` for each attribute and method.
+    """An arm of the world whose plant is a batch of rigs; see `Arm` for its attributes and methods.
 
-    Predictions (`predict`, `settled`) come from the arm's model within the rig's pressure limits.
-    Holds no state: the rigs are in `ArmPart.plant`.
+    Predictions (`predict`, `settled`) and the range by which observations are scaled (`low`,
+    `high`) are those of the simulated arm, on which policies were trained; commands are held within
+    the rig's limits besides (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
     """
 
     def __init__(
@@ -123,8 +124,9 @@ class RigArm:
             )
         self.period_s = rig.period_s
         low, high = (torch.tensor(end).to(arm.low) for end in rig.limits.T)
-        self.simulated = _limited(arm, low, high)
-        arm = self.simulated
+        self.lowest = torch.maximum(arm.low, low)
+        self.highest = torch.minimum(arm.high, high)
+        self.simulated = arm
         self.name, self.device, self.vary = arm.name, arm.device, arm.vary
         self.chambers, self.key_points = arm.chambers, arm.key_points
         self.model, self.backbone, self.pneumatics = arm.model, arm.backbone, arm.pneumatics
@@ -134,17 +136,17 @@ class RigArm:
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Rigs at rest that then went through random pressures, at the start of an episode."""
         trials = zip(stream.key.tolist(), stream.count.tolist(), strict=True)
-        rigs = Objects(self._fresh(key, count) for key, count in trials)
+        rigs = ObjectBatch(tuple(self._fresh(key, count) for key, count in trials))
         salt = zlib.crc32(f"history {self.name}".encode())
         own = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
         _, share = own.uniform(0.0, 1.0, self.vary.history, self.chambers)
         stream, part = self.simulated.start(stream)
-        first = part.pressure
-        passed = (self.low + (self.high - self.low) * share).unbind(1)
+        first = torch.minimum(torch.maximum(part.pressure, self.lowest), self.highest)
+        passed = (self.lowest + (self.highest - self.lowest) * share).unbind(1)
         part = replace(
             part,
             gain=torch.ones_like(part.gain),
-            arm=self.model.initial_state(len(rigs)),
+            arm=self.model.initial_state(len(rigs.items)),
             plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
         )
         for target in (*passed, first):
@@ -156,14 +158,14 @@ class RigArm:
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
-        """One step with changes of pressure (B, m), kPa, asked for now.
+        """Advance one step with changes of pressure (B, m), kPa.
 
         `part.command` is the command after which a pump of the simulated arm would give what the
         rig's pump gives: the two differ by an offset, which is estimated here.
         """
         target = part.plant.target_kPa.to(action)
         shift = part.command - target
-        target = self.pneumatics.command(target, action, self.low, self.high)
+        target = self.pneumatics.command(target, action, self.lowest, self.highest)
         expected = self.pneumatics.follow(part.pressure, target + shift, dt_s)
         for _ in range(self.reads):
             part, reading = self._read(part, target)
@@ -178,14 +180,6 @@ class RigArm:
     def settled(self, pressure: Tensor) -> Tensor:
         """The model's steady-state key points, see `Arm.settled`."""
         return self.simulated.settled(pressure)
-
-    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float):
-        """The model's state and key points, see `ModelArm.bent`."""
-        return self.simulated.bent(part, pressure, dt_s)
-
-    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
-        """The part with its body where the key points are, see `ModelArm.posed`."""
-        return self.simulated.posed(part, points_mm)
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest pressure a step from now, see `Arm.within_reach`."""
@@ -203,14 +197,14 @@ class RigArm:
     def _read(self, part: ArmPart, target: Tensor) -> tuple[ArmPart, Reading]:
         """One period of the rigs towards pressures (B, m) kPa; the model goes along."""
         rows = []
-        for rig, asked in zip(part.plant.rigs.things, target.double().cpu().numpy(), strict=True):
+        for rig, asked in zip(part.plant.rigs.items, target.double().cpu().numpy(), strict=True):
             rig.command(np.clip(asked, *rig.limits.T))
             sample, truth = rig.read_beside_truth()
             rows.append((sample.measured, sample.key_points_mm, truth.noise_free_mm[0]))
         columns = (np.stack(column) for column in zip(*rows, strict=True))
         row = {"dtype": torch.float32, "device": self.device}
         reading = Reading(*(torch.tensor(column, **row) for column in columns))
-        model, points = self.bent(part, reading.pressure, self.period_s)
+        model, points = self.simulated.bent(part, reading.pressure, self.period_s)
         plant = replace(part.plant, target_kPa=target)
         part = replace(part, arm=model, points_mm=points, pressure=reading.pressure, plant=plant)
         return part, reading
@@ -233,15 +227,8 @@ class RigArm:
                 now = offset + self.config.observer_gain * surprise
             seen, offset = seen + now, now + drift
             plant = replace(plant, drift_mm=drift)
-        part = self.posed(part, frames.apply(part.mount, reading.true_mm))
+        part = self.simulated.posed(part, frames.apply(part.mount, reading.true_mm))
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
-
-
-def _limited(arm: ModelArm, low: Tensor, high: Tensor) -> ModelArm:
-    """The arm within pressures low, high (m,) kPa besides its own."""
-    limited = copy.copy(arm)
-    limited.low, limited.high = torch.maximum(arm.low, low), torch.minimum(arm.high, high)
-    return limited
 
 
 def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtual_rig) -> Task:
@@ -250,8 +237,8 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtua
     Tasks ask their world for its arms, so that this exchanges the world only.
     """
     config = config or RigConfig()
-    world, moved = task.world, copy.copy(task)
+    world, moved = copy.copy(task.world), copy.copy(task)
     dt_s = world.config.dt_s
-    arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
-    moved.world = world.with_arms(arms)
+    world.arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
+    moved.world = world
     return moved

@@ -1,4 +1,4 @@
-"""Drivers: whatever chooses the actions of all agents of a task."""
+"""Policies: whatever chooses the actions of all agents of a task, and the untrained ones."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.world.random_streams import Stream, streams
 
 
-class Driver(Protocol):
+class Policy(Protocol):
     """Chooses actions for a batch of episodes.
 
-    A function of its arguments: what it chooses for one episode does not depend on the others in
-    the batch, nor on what was asked before.
+    A function of its arguments: the actions of one episode depend neither on the other episodes of
+    the batch nor on earlier calls. A policy that reads `state` is privileged: it knows the truth.
     """
 
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Agent -> (B, m) changes of pressure, kPa; observations: agent -> (B, D)."""
+        """Actions: agent -> (B, m) changes of pressure, kPa; observations: agent -> (B, D)."""
 
 
 @dataclass(frozen=True)
 class Scripted:
-    """The task's own solver, which knows the true state."""
+    """The task's scripted expert: privileged inverse kinematics on the true state."""
 
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """As for `Driver`."""
+        """The expert's actions, see `Policy.act`."""
         return task.script(state)
 
 
 @dataclass(frozen=True)
 class Random:
-    """Changes of pressure drawn evenly from all that the pumps allow: what no skill is worth."""
+    """Changes of pressure drawn evenly from all that the pumps allow: the lower baseline."""
 
     seed: int = 0
-    """Another seed gives other actions in the same episodes."""
+    """Seed of the actions; the episodes have their own."""
 
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """As for `Driver`; an episode's actions follow from its stream, its step and the seed."""
+        """Actions drawn from an episode's random number stream, its step and the seed."""
         world, own = state.world, streams(self.seed, 1, device=state.world.steps.device)
         arms = [task.world.arms[agent] for agent in task.agents]
         each = sum(arm.chambers for arm in arms)
@@ -60,24 +60,25 @@ class Random:
         }
 
 
-DRIVERS: dict[str, Callable[[], Driver]] = {"scripted": Scripted, "random": Random}
-"""Drivers that need no training, by name."""
+POLICIES: dict[str, Callable[[], Policy]] = {"scripted": Scripted, "random": Random}
+"""Policies that need no training, by name."""
 
 
-def open_driver(name: str, task: Task) -> Driver:
-    """A driver by name, or the policy of a training run's folder, which must fit the task."""
-    check_driver(name)
-    if name in DRIVERS:
-        return DRIVERS[name]()
+def open_policy(name: str, task: Task) -> Policy:
+    """A policy by name, or the trained one of a run's folder, which must fit the task."""
+    check_policy(name)
+    if name in POLICIES:
+        return POLICIES[name]()
+    # Only here: loading rsl-rl takes seconds, which the untrained policies need not wait for.
     from surgisoft.agents.learned import LearnedPolicy
 
     return LearnedPolicy(Path(name), task)
 
 
-def check_driver(name: str) -> None:
-    """Raise unless that is a driver's name or something on disk."""
-    if name in DRIVERS or Path(name).exists():
+def check_policy(name: str) -> None:
+    """Raise an InputError unless that is a policy's name or a path that exists."""
+    if name in POLICIES or Path(name).exists():
         return
     if Path(name).name == name:
-        raise unknown_name("driver", name, [*DRIVERS, "the folder of a training run"])
+        raise unknown_name("policy", name, [*POLICIES, "the folder of a training run"])
     raise InputError(f"{name}: no such folder; expected a training run, scripted or random")

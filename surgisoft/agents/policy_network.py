@@ -1,4 +1,4 @@
-"""An actor as rsl-rl builds it, and as something that answers in kPa."""
+"""Networks of actors and critics for rsl-rl, and the actor with its outputs scaled to kPa."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def empty_actor(agent: str, width: int, chambers: int, preset: Preset) -> MLPMod
     return MLPModel(seen, {"actor": [agent]}, "actor", chambers, **config)
 
 
-class KiloPascals(nn.Module):
-    """A trained actor without noise: (B, D) observations to (B, m) changes of pressure, kPa."""
+class ScaledActor(nn.Module):
+    """An actor with action scaling: (B, D) observations to (B, m) changes of pressure, kPa."""
 
     def __init__(self, actor: MLPModel, action_kPa: float, step_kPa: float):
-        """`action_kPa` is the change for an output of 1, `step_kPa` the pumps' largest."""
+        """action_kPa: change for an output of 1; step_kPa: largest change that the pumps accept."""
         super().__init__()
         self.network, self.scale, self.limit = actor.as_jit(), action_kPa, step_kPa
 

@@ -1,4 +1,10 @@
-"""One PPO of rsl-rl for each agent, on one world, and the loop that turns both at once."""
+"""Independent PPO with centralised critics: one rsl-rl PPO for each agent of a shared world.
+
+Centralised training with decentralised execution (CTDE): an actor sees its own agent's observation,
+its critic the observations of all agents (`vec_env.STATE`), a privileged input that only training
+needs. Agents share neither networks nor rewards (independent learners; De Witt et al. 2020, IPPO;
+with the joint observation in the critic as in MAPPO, Yu et al. 2022).
+"""
 
 from __future__ import annotations
 
@@ -87,7 +93,7 @@ def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
+class RolloutMeans:
     """Means over the steps of a rollout."""
 
     rewards: dict[str, float]
@@ -101,8 +107,8 @@ class Gathered:
 
 
 @torch.inference_mode()
-def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
-    """Play `steps` steps into the agents' storages; the last observations, and `Gathered`."""
+def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
+    """Roll out `steps` steps into the agents' storages; last observations and `RolloutMeans`."""
     notes: dict[str, list[Tensor]] = {}
 
     def note(name: str, value: Tensor) -> None:
@@ -133,7 +139,7 @@ def gather(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, steps: int):
         return {n.removeprefix(prefix): v for n, v in means.items() if n.startswith(prefix)}
 
     ended = int(torch.stack(notes["done"]).sum())
-    return seen, Gathered(part("reward/"), part("term/"), part("measure/"), ended)
+    return seen, RolloutMeans(part("reward/"), part("term/"), part("measure/"), ended)
 
 
 def _mean(values: list[Tensor]) -> float:

@@ -1,4 +1,4 @@
-"""What training is told: presets, and how long each task is trained."""
+"""Hyper-parameters of training: presets, their changes for each task, and plans of runs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Preset:
     """Activation of the hidden layers, by rsl-rl's name."""
     normalise: bool = False
     """Whether observations are normalised by their running mean and deviation. The tasks' own are
-    of the order of 1, and a normaliser that moves changes the policy below the learner's feet."""
+    of the order of 1, and a moving normaliser changes the policy between two updates."""
     action_kPa: float = 1.0
     """Change of pressure for an output of 1, kPa; the pumps' own limit holds besides."""
     noise: float = 0.5
@@ -90,9 +90,9 @@ their own."""
 
 
 def preset_for(name: str, task: str, **changes) -> Preset:
-    """The named preset as it suits a task, with some fields changed (None: as it is).
+    """The named preset for a task, with some fields changed (None: unchanged).
 
-    An unknown name answers with the known ones.
+    An unknown name raises an InputError that lists the known ones.
     """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
@@ -102,7 +102,7 @@ def preset_for(name: str, task: str, **changes) -> Preset:
 
 
 def steps_for(name: str, task: str) -> int:
-    """Steps that a preset trains a task unless told otherwise."""
+    """Default number of steps that a preset trains a task."""
     own = spec_of(task).training_steps if name == "fast" else None
     return PAPER_STEPS if own is None else own
 

@@ -1,4 +1,4 @@
-"""The page of an evaluation: the verdict, the table, charts of each driver's first episode."""
+"""The HTML page of an evaluation: summary, table, charts of each policy's first episode."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ WORDS = {
 """Numbers that are drawn for every episode, in words."""
 HOW = (
     "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
-    "for all else. The beam's error is how far its axis passes from its target while it is on. "
-    "Clearance, contact and success are judged by exact collision queries where there is a scene."
+    "for all else. The beam's error is the distance of its axis from its target while it is on. "
+    "Clearance, contact and success come from exact collision checks (FCL) where there is a scene."
 )
 
 
 def evaluation_page(
     task: str, on: str, results: Sequence[Evaluation], logs: Mapping[str, EpisodeLog], about: str
 ) -> Page:
-    """`logs`: driver -> its first episode."""
+    """logs: policy -> its first episode."""
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
         (name, *(cell(result.overall.get(name), name in RATES) for result in results))
         for name in names
     ]
-    header = ["mean [95 % interval]", *(Path(result.driver).name for result in results)]
+    header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
     best = next(iter(results))
     return Page(
         title=f"Evaluation of {task}, {on}",
@@ -78,13 +78,13 @@ def _scrolling(picture: Picture) -> Picture:
 
 
 def verdict(task: str, results: Sequence[Evaluation]) -> str:
-    """One sentence on what came out for each driver."""
+    """One sentence with each policy's success and error."""
     parts = []
     for result in results:
         success, error = result.overall.get("success"), _error(result)
         words = [] if success is None else [f"{success.mean:.0%} success"]
         words += [] if error is None else [f"mean error {error.mean:.3g} mm"]
-        parts.append(f"{Path(result.driver).name}: {', '.join(words) or 'see the table'}")
+        parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
     episodes = len(next(iter(results[0].per_episode.values())))
     plural = "s" if episodes > 1 else ""
     return f"{task}, {episodes} episode{plural} each. {'; '.join(parts)}."
@@ -114,7 +114,7 @@ def _tone(results: Sequence[Evaluation]) -> str:
 
 
 def _facts(result: Evaluation) -> list[tuple[str, str]]:
-    items = [("driver", Path(result.driver).name)]
+    items = [("policy", Path(result.policy).name)]
     for name in ("success", "completion", "collided", "clearance_mm", "time_s"):
         value = result.overall.get(name)
         if value is not None and value.episodes:
@@ -131,7 +131,7 @@ def _spreads(results: Sequence[Evaluation]) -> list[Picture]:
     drawn = []
     for name in names:
         groups = [
-            (Path(result.driver).name, result.per_episode[name].tolist())
+            (Path(result.policy).name, result.per_episode[name].tolist())
             for result in results
             if name in result.per_episode
         ]

@@ -43,7 +43,7 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     wanted = log.path_mm if len(log.path_mm) else log.target_mm
     on = log.beam.on if log.beam is not None else np.ones(log.rows, bool)
     done = log.beam.end_mm if log.beam is not None else log.actual_mm
-    middle, plane = _plane(wanted)
+    middle, plane = path_plane(wanted)
     flat = (wanted - middle) @ plane
     if len(log.path_mm):
         flat = np.vstack((flat, flat[:1]))
@@ -51,9 +51,9 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
     with drawing():
         figure, axis = plt.subplots(figsize=(CHART[0], 4.2))
-        axis.plot(*_broken(flat).T, c=AMBER, lw=5, alpha=0.55, label="asked for")
+        axis.plot(*broken_at_jumps(flat).T, c=AMBER, lw=5, alpha=0.55, label="reference")
         word = "burnt" if log.beam is not None else "done"
-        axis.plot(*_broken(went).T, c=BLUE, lw=1.3, label=word)
+        axis.plot(*broken_at_jumps(went).T, c=BLUE, lw=1.3, label=word)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
@@ -63,7 +63,7 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
 
 
 def error_chart(log: EpisodeLog) -> Picture | None:
-    """The distance from what was asked for, over time; with a beam, only while it burns."""
+    """The distance from the reference over time; with a beam, only while it is on."""
     named = log.measures.get("beam_error_mm")
     error = log.error_mm if named is None else named
     if not np.isfinite(error).any():
@@ -187,10 +187,10 @@ def spread_chart(
         axis.set_ylim(len(known) - 0.5, -0.5)
         axis.set_xlabel(label)
         axis.set_title(title)
-        return chart(figure, title, "A dot an episode; red: the mean")
+        return chart(figure, title, "One dot per episode; red: the mean")
 
 
-def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def path_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middle (3,) and two directions (3, 2) of the plane that fits points (N, 3) mm best."""
     known = points[np.isfinite(points).all(1)].astype(float)
     middle = known.mean(axis=0)
@@ -201,7 +201,7 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle, plane @ (turn[0] @ turn[2]).T
 
 
-def _broken(points: np.ndarray) -> np.ndarray:
+def broken_at_jumps(points: np.ndarray) -> np.ndarray:
     """(N, 2) mm with a gap wherever the next point is far."""
     jump = np.linalg.norm(np.diff(points, axis=0), axis=1) > JUMP_MM
     return np.insert(points, np.flatnonzero(jump) + 1, np.nan, axis=0)

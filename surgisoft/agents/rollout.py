@@ -1,4 +1,4 @@
-"""Play whole episodes with a driver, many at once, and keep what the task measures."""
+"""Rollouts: whole episodes of a policy, many at once, with the task's measures and their logs."""
 
 from __future__ import annotations
 
@@ -8,41 +8,43 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surgisoft.agents.policies import Driver
+from surgisoft.agents.policies import Policy
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.episodes.log import EpisodeLog, EpisodeRecorder
 from surgisoft.tasks.world.pytree import rows
 
 BATCH = 256
-"""Episodes that are played at once unless told otherwise."""
+"""Default number of episodes that run side by side."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """What a watcher sees of a batch of R episodes: the start, then every step."""
+    """One instant of a batch of R episodes for `rollout(watch=...)`: the start, then every step."""
 
     episodes: Tensor
     """(R,) int64: number of each episode."""
     state: TaskState
-    """The state come to. The dose map is given up with the next step: copy what is kept."""
+    """The state reached. The next step overwrites its dose map: copy what is kept."""
     actions: dict[str, Tensor] | None
     """agent -> (R, m) kPa that led here; None at the start."""
     outcome: Outcome | None
-    """What the step brought; None at the start."""
+    """Rewards and ends of the step; None at the start."""
     live: Tensor
-    """(R,) bool: the episode was not over before this step; the others are to be ignored."""
+    """(R,) bool: the episode was not over before this step; ignore the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """What N episodes brought, step by step."""
+    """Results of N episodes, step by step."""
 
     task: str
     """Name of the task."""
     dt_s: float
     """Time of a step, s."""
     steps: Tensor
-    """(N,) int64: steps played."""
+    """(N,) int64: steps until each episode's end."""
     returns: dict[str, Tensor]
     """agent -> (N,): sum of its rewards."""
     terminated: Tensor
@@ -71,7 +73,7 @@ class Rollout:
         return self.measures[name].square().nanmean(1).sqrt()
 
     def quantile(self, name: str, share: float) -> Tensor:
-        """(N,): what the measure stays below for this share of its steps."""
+        """(N,): quantile of the measure over each episode; share: 0..1."""
         return self.measures[name].nanquantile(share, 1)
 
     def largest(self, name: str) -> Tensor:
@@ -96,32 +98,32 @@ def _extreme(values: Tensor, of: Callable, empty: float) -> Tensor:
 
 def rollout(
     task: Task,
-    driver: Driver,
+    policy: Policy,
     episodes: int,
     seed: int,
     batch: int = BATCH,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
     watch: Callable[[Instant], None] | None = None,
     first: int = 0,
 ) -> Rollout:
-    """Play episodes from number `first` of a seed on; the batch's size changes nothing.
+    """Roll out episodes `first` to `first + episodes - 1` of a seed with a policy.
 
-    progress: called with the steps done and the most that may be to do. watch: sees every instant.
+    batch: how many run side by side, which changes no result. progress: called with the steps done
+    and the most that may be to do. watch: called with every instant.
     """
     if episodes < 1 or batch < 1:
         raise InputError(f"rollout: {episodes} episodes in batches of {batch}, expected 1 or more")
-    report = progress or (lambda done, total: None)
     parts, total = [], task.steps * -(-episodes // batch)
     for number, done in enumerate(range(0, episodes, batch)):
         count, before = min(batch, episodes - done), number * task.steps
         parts.append(
-            _played(
+            _rolled_out(
                 task,
-                driver,
+                policy,
                 seed,
                 first + done,
                 count,
-                lambda k, n=before: report(n + k, total),
+                lambda k, n=before: progress(n + k, total),
                 watch,
             )
         )
@@ -129,18 +131,18 @@ def rollout(
 
 
 @torch.inference_mode()
-def _played(
+def _rolled_out(
     task: Task,
-    driver: Driver,
+    policy: Policy,
     seed: int,
     first: int,
     count: int,
     report: Callable[[int], None],
     watch: Callable[[Instant], None] | None,
 ) -> Rollout:
-    """Episodes `first` to `first + count - 1` at once; those that are over leave the batch."""
-    play, device = Episodes(task, donate=True), task.world.device
-    state = play.seeded(seed, count, first)
+    """Episodes `first` to `first + count - 1` side by side; finished ones leave the batch."""
+    runner, device = Episodes(task, donate=True), task.world.device
+    state = runner.seeded(seed, count, first)
     at = torch.arange(count, device=device)
     live = torch.ones(count, dtype=torch.bool, device=device)
     steps = torch.zeros(count, dtype=torch.int64, device=device)
@@ -150,8 +152,8 @@ def _played(
     if watch:
         watch(Instant(first + at, state, None, None, live))
     for step in range(task.steps):
-        actions = driver.act(task, state, play.observe(state))
-        state, outcome = play.step(state, actions)
+        actions = policy.act(task, state, runner.observe(state))
+        state, outcome = runner.step(state, actions)
         if watch:
             watch(Instant(first + at, state, actions, outcome, live))
         for name, value in outcome.measures.items():
@@ -200,3 +202,31 @@ def joined(parts: list[Rollout]) -> Rollout:
     return Rollout(
         one.task, one.dt_s, steps, all_of("returns"), terminated, failed, all_of("measures")
     )
+
+
+class EpisodeRecorders:
+    """Records episodes of a rollout as logs; given as `rollout(watch=...)`."""
+
+    def __init__(
+        self, task: Task, policy: str, seed: int, on: str = "simulation", only: int | None = None
+    ):
+        """policy, seed, on: what the logs state about their origin; only: one episode's number."""
+        self.task, self.only = task, only
+        self._about = {"driver": policy, "seed": seed, "on": on}
+        self._recorders: dict[int, EpisodeRecorder] = {}
+
+    def __call__(self, now: Instant) -> None:
+        """Record every live episode of an instant."""
+        live = now.live if self.only is None else now.live & (now.episodes == self.only)
+        for row in live.nonzero()[:, 0].tolist():
+            number = int(now.episodes[row])
+            if now.outcome is None:
+                self._recorders[number] = EpisodeRecorder(
+                    self.task, now.state, row, episode=number, **self._about
+                )
+            else:
+                self._recorders[number].step(now.state, now.outcome, now.actions, row)
+
+    def log(self, episode: int) -> EpisodeLog:
+        """The log of an episode, after the rollout."""
+        return self._recorders[episode].log()

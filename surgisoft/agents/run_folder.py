@@ -1,8 +1,8 @@
-"""A training run is a folder that opens by itself: it takes scene and arm models along.
+"""The folder of a training run, which needs no other file: it holds scene and arm models too.
 
-`config.json` says what was asked for, `metrics.jsonl` what happened, `arms/` and `scene/` hold what
-the world was made of, `checkpoints/last.pt` all that training goes on from, `best.pt` the policies
-that did best in evaluation. Checkpoints are read as plain tensors and numbers: none runs code.
+`config.json` is the plan, `metrics.jsonl` the log; `arms/` and `scene/` are parts of the world,
+`checkpoints/last.pt` the state from which training resumes, `best.pt` the policies with the best
+evaluation. Checkpoints are read as plain tensors and numbers: none runs code.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.registry import config_from, config_table, make_task, with_fields
+from surgisoft.tasks.registry import config_from, make_task, with_fields
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -69,7 +69,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
             "versions": versions(),
             "started": datetime.now().isoformat(timespec="seconds"),
             "task": plan.task,
-            "task_config": config_table(plan.task_config),
+            "task_config": to_table(plan.task_config),
             "scene": scene,
             "arms": {
                 name: {"model": arm.model.summary(), "effects": [*arm.model.effects]}
@@ -90,7 +90,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
 
 
 def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
-    """The scene in the run's folder, its mounts told the run's own arm models."""
+    """Copy the scene into the run's folder; its mounts name the run's own arm models."""
     source = getattr(plan.task_config, "scene", None)
     if source is None:
         return None
@@ -142,7 +142,7 @@ class RunFolder:
         return self.config["agents"]
 
     def plan(self) -> Plan:
-        """What was asked for; its world is made of what the folder holds."""
+        """The plan of the run; its world is built from the parts in the folder."""
         c = self.config
         parameters = {
             key: tuple(value) if isinstance(value, list) else value

@@ -1,4 +1,8 @@
-"""Training as a state that goes on: world, agents, random numbers; saved and loaded whole."""
+"""Training of one policy for each agent: the loop, its state, its checkpoints and its log.
+
+The state (world, networks, optimisers, random numbers) is saved and loaded whole, so that a run
+that was interrupted continues as if it had not been. See `ppo` for the algorithm.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +21,12 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.learned import Policies, agent_sizes
-from surgisoft.agents.policy_network import KiloPascals
-from surgisoft.agents.ppo import Gathered, gather, make_ppo, set_noise
+from surgisoft.agents.learned import ActorPolicy, agent_sizes
+from surgisoft.agents.policy_network import ScaledActor
+from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import Plan
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run
-from surgisoft.agents.selection import better, judge
+from surgisoft.agents.selection import evaluate_checkpoint, is_better
 from surgisoft.agents.vec_env import JointEnv
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
@@ -31,12 +35,12 @@ from surgisoft.tasks.registry import make_task
 from surgisoft.tasks.world.pytree import tree_map
 
 _FAR = 1 << 20
-"""Episodes of different processes are further apart than this."""
+"""Distance between the numbers of the first episodes of two processes."""
 
 
 @dataclass
 class Clock:
-    """Time that training took so far, over all its resumptions."""
+    """Time that training took so far, resumptions included."""
 
     wall_s: float = 0.0
     """Wall time, s."""
@@ -56,9 +60,9 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """What one turn of rollout and update brought."""
+    """Results of one iteration: a rollout and an update of every agent."""
 
-    gathered: Gathered
+    gathered: RolloutMeans
     """Rewards and measures of the rollout."""
     losses: dict[str, float]
     """agent/loss -> value of the update."""
@@ -69,10 +73,10 @@ class Iteration:
 
 
 class Training:
-    """The agents of a task while they learn; `state` and `load_state` are all that changes.
+    """The agents of a task while they learn; `state` and `load_state` save and restore all of it.
 
-    `iteration` counts the turns, `share` 0..1 is how much of the plan is done, `best` what
-    evaluation found for the best policies so far.
+    `iteration` counts rollouts with their updates, `share` 0..1 is how much of the plan is done,
+    `best` the evaluation of the best policies so far.
     """
 
     def __init__(self, plan: Plan, task: Task, processes: Processes):
@@ -97,18 +101,18 @@ class Training:
         return self.iteration * preset.envs * preset.rollout * self.processes.count
 
     def _shared(self) -> float:
-        """Share of the training that is done; all processes ask together."""
+        """Share of the training that is done; all processes call this together."""
         seconds = 0.0
         if self.plan.minutes is not None:
             seconds = self.processes.of_leader(self.clock.wall_s)
         return self.plan.share(self.steps, seconds)
 
-    def turn(self) -> Iteration:
+    def iterate(self) -> Iteration:
         """One rollout, and one update of every agent."""
         preset = self.plan.preset
         for ppo in self.agents.values():
             set_noise(ppo, preset, self.share)
-        self.seen, gathered = gather(self.env, self.agents, self.seen, preset.rollout)
+        self.seen, gathered = collect_rollout(self.env, self.agents, self.seen, preset.rollout)
         losses = {}
         for agent, ppo in self.agents.items():
             for name, value in ppo.update().items():
@@ -127,7 +131,7 @@ class Training:
         }
 
     def state(self) -> dict[str, Any] | None:
-        """All that goes on from here, as plain tensors and numbers; None but in the leader.
+        """All that resuming needs, as plain tensors and numbers; None but in the leading process.
 
         Worlds and random numbers are those of every process, in the order of their ranks.
         """
@@ -154,7 +158,7 @@ class Training:
         }
 
     def load_state(self, saved: dict[str, Any]) -> None:
-        """Go on from a saved state; as many processes as it was saved by."""
+        """Restore a saved state, in as many processes as it was saved by."""
         count, device = len(saved["processes"]), self.task.world.device
         if count != self.processes.count:
             raise InputError(
@@ -186,31 +190,31 @@ def _copied(weights: dict[str, Tensor]) -> dict[str, Tensor]:
 REPLAYS = "replays"
 """Folder of a run that holds the first episode of each evaluation, for `surgisoft replay`."""
 CHECKPOINT_S = 30.0
-"""Longest time between two checkpoints, s; what lies after the last is played again."""
+"""Longest time between two checkpoints, s; what comes after the last is computed again."""
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What a watcher is told after each turn."""
+class TrainingProgress:
+    """How far a training run is, reported after each iteration."""
 
     share: float
     """Share 0..1 of the training that is done."""
     steps: int
     """Steps so far, over all episodes and processes."""
     steps_per_s: float
-    """Steps per second of the last turn."""
+    """Steps per second of the last iteration."""
     reward: float
     """Mean reward of a step, over all agents."""
     evaluation: dict[str, float] | None
-    """What the last evaluation found."""
+    """Result of the last evaluation."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """How training ended."""
+    """State of a run when training returned."""
 
     done: bool
-    """All that was planned is done; else it was interrupted and can be resumed."""
+    """Whether the plan is done; else the run was interrupted and can be resumed."""
     steps: int
     """Steps over all episodes and processes."""
     wall_s: float
@@ -218,7 +222,7 @@ class Result:
     cpu_s: float
     """Time on a processor of the leading process, s."""
     best: dict[str, float] | None
-    """What evaluation found for the best checkpoint."""
+    """Evaluation of the best checkpoint."""
 
 
 def train_new(
@@ -226,30 +230,30 @@ def train_new(
     plan: Plan,
     processes: Processes,
     device: torch.device,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[TrainingProgress], None] = lambda progress: None,
 ) -> Result:
-    """Train a new run into a folder, which is written before training begins."""
+    """Train a new run; its folder is complete before training begins."""
     task = make_task(plan.task, plan.task_config, device)
     if processes.leads:
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
-    # From here on the run is made of what its folder holds: resuming finds the same.
-    return _go_on(RunFolder(folder), None, processes, device, report)
+    # Everything is read back from the folder, so that resuming finds the same.
+    return _continue(RunFolder(folder), None, processes, device, report)
 
 
 def resume(
     folder: Path,
     processes: Processes,
     device: torch.device,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[TrainingProgress], None] = lambda progress: None,
 ) -> Result:
-    """Go on with a run where its last checkpoint stands; from the start if it has none."""
+    """Continue a run from its last checkpoint; from the start if it has none."""
     run = RunFolder(folder)
     saved = run.load(LAST) if run.checkpoint(LAST).is_file() else None
-    return _go_on(run, saved, processes, device, report)
+    return _continue(run, saved, processes, device, report)
 
 
-def _go_on(run, saved, processes, device, report) -> Result:
+def _continue(run, saved, processes, device, report) -> Result:
     plan = run.plan()
     training = Training(plan, run.task(device), processes)
     if saved is not None:
@@ -260,7 +264,7 @@ def _go_on(run, saved, processes, device, report) -> Result:
     with _asked_to_stop() as asked:
         while training.share < 1.0 and not (stopped or reached):
             before = training.clock.wall_s
-            turn = training.turn()
+            turn = training.iterate()
             ends = training.share >= 1.0
             row = {}
             if ends or training.iteration % plan.preset.evaluate_every == 0:
@@ -283,23 +287,23 @@ def _go_on(run, saved, processes, device, report) -> Result:
 
 
 def _evaluated(run: RunFolder, training: Training) -> dict[str, float]:
-    """Judge the policies as they are, and keep them if no earlier ones were better.
+    """Evaluate the present policies, and save them if no earlier ones were better.
 
-    Only the leader does; the others go on to where they wait for it.
+    Only the leading process does; the others wait for it at the next exchange.
     """
     if not training.processes.leads:
         return {"error_mm": math.nan}
     preset = training.plan.preset
     actors = {
-        agent: KiloPascals(
+        agent: ScaledActor(
             ppo.get_policy(), preset.action_kPa, training.task.world.arms[agent].pneumatics.step_kPa
         ).eval()
         for agent, ppo in training.agents.items()
     }
-    found, log = judge(training.task, Policies(actors), preset.evaluation_episodes)
+    found, log = evaluate_checkpoint(training.task, ActorPolicy(actors), preset.evaluation_episodes)
     (run.path / REPLAYS).mkdir(exist_ok=True)
     save_episode(log, run.path / REPLAYS / f"{training.steps:012d}.npz")
-    if better(found, training.best):
+    if is_better(found, training.best):
         training.best = found
         run.save(
             BEST,
@@ -326,18 +330,18 @@ def _save_last(run: RunFolder, training: Training) -> None:
         run.save(LAST, state)
 
 
-def _progress(training: Training, turn: Iteration, found, seconds: float) -> Progress:
+def _progress(training: Training, turn: Iteration, found, seconds: float) -> TrainingProgress:
     preset, rewards = training.plan.preset, turn.gathered.rewards
     steps = preset.envs * preset.rollout * training.processes.count
     reward = sum(rewards.values()) / len(rewards)
-    return Progress(training.share, training.steps, steps / seconds, reward, found)
+    return TrainingProgress(training.share, training.steps, steps / seconds, reward, found)
 
 
 class _Log:
-    """`metrics.jsonl`, one line a turn, and TensorBoard's events."""
+    """`metrics.jsonl`, one line for each iteration, and TensorBoard's events."""
 
     def __init__(self, run: RunFolder, iteration: int):
-        """What was written after `iteration` belongs to turns that are played again."""
+        """Lines after `iteration` are dropped: those iterations are computed again."""
         from torch.utils.tensorboard import SummaryWriter
 
         file = run.path / "metrics.jsonl"
@@ -352,7 +356,7 @@ class _Log:
         self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=iteration + 1)
 
     def add(self, training: Training, turn: Iteration, found: dict, seconds: float) -> None:
-        """One turn, and what evaluation found after it."""
+        """Write one iteration, and the evaluation after it."""
         got = turn.gathered
         values = {
             **{f"reward/{name}": value for name, value in got.rewards.items()},

@@ -18,7 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes, Task
 
 STATE = "state"
-"""Observation group of the critics: what all agents observe, one after the other."""
+"""Observation group of the critics, privileged in training (CTDE): all agents' observations."""
 
 
 class JointEnv:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from importlib import import_module
 
 import typer
 from typer.exceptions import TyperException
@@ -16,12 +17,37 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+COMMANDS = (
+    "collect",
+    "import_",
+    "fit",
+    "compare",
+    "diagnose",
+    "next_experiment",
+    "amend",
+    "improve",
+    "train",
+    "evaluate",
+    "scene",
+    "experiment",
+    "replay",
+    "benchmark",
+)
+"""Modules of commands, in the order of the help."""
+
 MANY = {
     *("--between", "--data", "--effect", "--effect-file", "--effects", "--hidden", "--policy"),
     *("--reference", "--strength", "--valid", "--without"),
 }
 """Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
+
+OLD_NAMES = {
+    "--specimen": "--robot-seed",
+    "--take": "--trial",
+    "--trust": "--observer-gain",
+}
+"""Options that were renamed: the old name still works and is not shown."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -45,9 +71,12 @@ def _root(
 
 
 def spread(arguments: list[str]) -> list[str]:
-    """Repeat each option of `MANY` before every value that follows it."""
+    """Repeat each option of `MANY` before every value that follows it; rename old options."""
     answer, option = [], None
-    for argument in arguments:
+    old = {} if arguments[:1] == ["benchmark"] else OLD_NAMES
+    for given in arguments:
+        name, equals, value = given.partition("=")
+        argument = old.get(name, name) + equals + value
         if argument.startswith("-") and not argument.lstrip("-").replace(".", "").isdigit():
             option = argument if argument in MANY else None
             first = option is not None
@@ -77,13 +106,18 @@ def _usage(error: TyperException, many: list[str]) -> int:
     return _fail(f"{message}; see '{where} --help'")
 
 
+def with_commands() -> typer.Typer:
+    """The app with every command; a module of commands registers them when it is imported."""
+    for name in COMMANDS:
+        import_module(f"surgisoft.cli.{name}")
+    return app
+
+
 def run(arguments: list[str] | None = None) -> int:
     """Run one command; the exit code: 0, 2 for bad input, 130 when interrupted."""
-    from surgisoft.cli import commands  # noqa: F401  (registers every command on `app`)
-
     arguments = spread(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(args=arguments, standalone_mode=False, prog_name="surgisoft")
+        code = with_commands()(args=arguments, standalone_mode=False, prog_name="surgisoft")
     except InputError as error:
         return _fail(str(error))
     except TyperException as error:

@@ -1,5 +1,6 @@
-"""`python -m surgisoft.cli`, for torchrun."""
+"""`python -m surgisoft.cli`, the name of before for `python -m surgisoft`."""
 
 from surgisoft.cli import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model, NewModel, Report
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_json
@@ -19,7 +19,11 @@ def amend(
     model: Model,
     effects: Annotated[
         list[str],
-        typer.Option("--effect", metavar="NAME|FILE.py...", help="Effects to add, or to fit anew."),
+        typer.Option(
+            "--effect",
+            metavar="NAME|FILE.py...",
+            help="Effects to add, or to fit again where the model has them.",
+        ),
     ],
     data: Annotated[
         list[Path],
@@ -31,60 +35,72 @@ def amend(
     effect_files: EffectFiles = None,
     force: Force = False,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Write NEW even where no fall can be claimed.")
+        bool,
+        typer.Option(
+            "--anyway", help="Write NEW even where the error does not fall significantly."
+        ),
     ] = False,
     keep_network: Annotated[
         bool,
         typer.Option(
             "--keep-network",
-            help="Leave the network as it is; else its last layer is re-tuned behind the effects "
-            "where held-out data rewards that.",
+            help="Leave the network as it is; else its last layer is fitted again behind the "
+            "effects where that lowers the error on held-out data.",
         ),
     ] = False,
 ) -> None:
-    """Amend a model: put a physical effect into it and say what that is worth.
+    """Amend a model: add a physical effect and validate it on held-out data.
 
-    The parameters are fitted to the first three quarters of each recording; the last quarter,
-    locked until then, judges. Without a fall beyond chance nothing is written (exit code 1).
+    The parameters are fitted to the first three quarters of each recording and validated on the
+    last quarter. Where the error does not fall significantly, nothing is written (exit code 1).
     """
+    check_free(json_file, "error_mm")
+    check_folder(report)
+    check_model(model)
+    measured = read_recordings(data)
+    claim_other_folder(output, model, force)
+
     from surgisoft.diagnosis.amend import amend as amend_model
     from surgisoft.surrogate.checkpoint import load_model
     from surgisoft.surrogate.effects import named_effect
 
-    claim_other_folder(output, model, force)
-    check_free(json_file, "error_mm")
-    check_folder(report)
     # Files of effects first: the model may hold one of them.
     names = [named_effect(given) for given in effects]
     arm = load_model(model)
-    measured = read_recordings(data)
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
             arm, measured, names, not keep_network, lambda text: tell(next(stages), 4, text)
         )
     warn_all(result.notes)
-    for name in result.refitted:
-        print(f"{name}: the model has it; its parameters were fitted anew")
-    show_parameters(result.parameters)
-    if result.retuned:
-        print("the network's last layer was re-tuned: held-out motion rewards it")
-    claimed = result.claimed
-    if claimed or anyway:
+    saved = result.claimed or anyway
+    written = []
+    if saved:
         save_amended(result, output, model, measured, force)
     if json_file:
         write_json(json_file, result.to_json())
+        written.append(json_file)
     if report:
         from surgisoft.diagnosis.pages.amendment import amend_page
         from surgisoft.report import write_page
 
         title = f"{model.name} with {' + '.join(result.effects)}"
         page = amend_page(result, title, result.model.summary())
-        print(f"wrote {write_page(page, report / 'report.html')}")
+        written.append(write_page(page, report / "report.html"))
+    for name in result.refitted:
+        print(f"{name}: the model has it; its parameters were fitted anew")
+    show_parameters(result.parameters)
+    if result.retuned:
+        print("the network's last layer was fitted again: that lowers the error on held-out data")
+    for path in written:
+        print(f"wrote {path}")
     print(result.sentence)
-    if claimed or anyway:
+    if saved:
         print(f"wrote {output}: {result.model.summary()}")
+        print(
+            f"next, what is still missing: surgisoft diagnose {output} {' '.join(map(str, data))}"
+        )
     else:
         print(f"{output} was not written; --anyway writes it", flush=True)
-    if not claimed:
+    if not result.claimed:
         raise typer.Exit(NOT_CLAIMED)

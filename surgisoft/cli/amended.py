@@ -30,7 +30,7 @@ def save_amended(result, output: Path, model: Path, recordings, force: bool) -> 
 
 def show_parameters(parameters) -> None:
     """The fitted parameters, one a line, and which of them are implausible."""
-    from surgisoft.diagnosis.refinement.intervals import values_text
+    from surgisoft.diagnosis.estimation.intervals import values_text
 
     for each in parameters:
         unit = f" {each.unit}" if each.unit else ""

@@ -1,13 +1,11 @@
 """`surgisoft collect`: a recording from the virtual rig."""
 
-import zlib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.inputs import hidden_effects
 from surgisoft.cli.options import SEED_MAX, Force, Hidden
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -46,14 +44,20 @@ def collect(
     seed: Annotated[
         int,
         typer.Option(
-            "--seed", "--specimen", min=0, max=SEED_MAX, help="Which specimen of the arm was cast."
+            "--seed",
+            "--robot-seed",
+            min=0,
+            max=SEED_MAX,
+            help="Seed of the robot: another one is another arm of the same design.",
         ),
     ] = 0,
-    take: Annotated[
-        int, typer.Option(min=0, help="Another take: same arm, other noise and random schedule.")
+    trial: Annotated[
+        int,
+        typer.Option("--trial", min=0, help="Another trial: same robot, other noise and schedule."),
     ] = 0,
     points: Annotated[
-        int | None, typer.Option(help="Settled points, or frames at 20 Hz; default: protocol's.")
+        int | None,
+        typer.Option(help="Steady-state points, or frames at 20 Hz; default: the protocol's own."),
     ] = None,
     hidden: Hidden = None,
     strength: Annotated[
@@ -95,26 +99,22 @@ def collect(
     ] = False,
 ) -> None:
     """Collect a recording on the virtual rig: the paper's arm, pumps and motion capture."""
-    from surgisoft.measurement.protocols import make_protocol
-    from surgisoft.measurement.recordings.recording import save_recording
-    from surgisoft.rig import VirtualRig
-    from surgisoft.rig.virtual import MOUNT
+    from surgisoft.measurement.recordings import save_recording
+    from surgisoft.rig.trial import collect as collect_recording
 
     _check_output(output, force)
     effects = _pairs(hidden or [], strength or [])
-    noise_seed = zlib.crc32(f"{protocol} {take}".encode())
-    rig = VirtualRig(
-        seed,
-        gravity=gravity or MOUNT,
-        roll_deg=roll_deg,
-        payload_g=payload_g,
-        noise=noise_scale,
-        take=noise_seed,
-        hidden=effects,
-    )
-    plan = make_protocol(protocol, rig.limits, points, seed=seed + 1_000_003 * take)
-    with progress(f"collect {plan.name}") as report:
-        recording, _ = rig.record(plan, report)
+    mount = {"gravity": gravity, "roll_deg": roll_deg, "payload_g": payload_g, "noise": noise_scale}
+    with progress(f"collect {protocol}") as report:
+        recording = collect_recording(
+            protocol,
+            seed=seed,
+            trial=trial,
+            points=points,
+            hidden=effects,
+            progress=report,
+            **{name: value for name, value in mount.items() if value is not None},
+        )
     save_recording(recording, output, force)
     minutes = recording.t_s[-1] / 60
     secret = "".join(f", hidden {name} {size:g}" for name, size in effects)
@@ -133,6 +133,8 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
         )
     if strengths and any(":" in text for text in given):
         raise InputError("--hidden NAME:X and --strength both give strengths; expected one of them")
+    from surgisoft.rig.trial import hidden_effects
+
     pairs = hidden_effects(given)
     return (
         [(name, x) for (name, _), x in zip(pairs, strengths, strict=True)] if strengths else pairs

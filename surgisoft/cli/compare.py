@@ -4,7 +4,7 @@ import math
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
-from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Replay, Report
 from surgisoft.files import write_json
 
@@ -28,19 +28,20 @@ def compare(
     check_folder(report)
     check_replay(replay)
 
+    check_model(model)
+    measured = read_recordings(recordings)
+
     from surgisoft.diagnosis.compare import compare as compare_model
     from surgisoft.surrogate.checkpoint import load_model
 
     arm = load_model(model)
-    measured = read_recordings(recordings)
     result, rest = compare_model(arm, measured)
     warn_all(result.notes)
-    print(result.sentence)
-    print(arm.summary())
-    _show(result)
+    title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
+    written = []
     if json_file:
         write_json(json_file, result.to_json())
-    title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
+        written.append(json_file)
     if report:
         from surgisoft.diagnosis.pages.compare import compare_page
         from surgisoft.diagnosis.pages.pictures import draw_all
@@ -49,14 +50,21 @@ def compare(
         backbone = arm.backbone() if arm.spec.key_points > 1 else None
         drawn = draw_all(rest, backbone, arm.spec.unit, report, title)
         page = compare_page(result, rest, title, arm.summary(), drawn)
-        for path in [write_page(page, report / "report.html"), *drawn]:
-            print(f"wrote {path}")
+        written += [write_page(page, report / "report.html"), *drawn]
     if replay:
         from surgisoft.replay.comparison import write_comparison
 
         points = (rest.measured_mm, rest.predicted_mm)
         write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
-        print(f"wrote {replay}")
+        written.append(replay)
+    print(result.sentence)
+    print(arm.summary())
+    _show(result)
+    for path in written:
+        print(f"wrote {path}")
+    if result.explainable:
+        names = " ".join(map(str, recordings))
+        print(f"next, which effect is missing: surgisoft diagnose {model} {names}")
 
 
 def _show(result) -> None:

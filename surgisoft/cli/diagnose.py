@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_json
@@ -38,30 +38,43 @@ def diagnose(
 ) -> None:
     """Diagnose a model: name the physical effect that it is missing, or say why not.
 
-    Looks at the first three quarters of each recording; the last quarter stays locked for `amend`.
+    Uses the first three quarters of each recording; the last quarter is held out for `amend`.
     """
+    check_free(json_file, "verdict")
+    check_folder(report)
+    check_model(model)
+    measured = read_recordings(recordings)
+    before = read_recordings(reference) if reference else None
+
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.surrogate.checkpoint import load_model
 
-    check_free(json_file, "verdict")
-    check_folder(report)
     arm = load_model(model)
-    measured = read_recordings(recordings)
-    before = read_recordings(reference) if reference else None
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(
             arm, measured, lambda text: tell(next(stages), 5, text), before, without or ()
         )
     warn_all(found.notes)
+    written = []
     if json_file:
         write_json(json_file, found.to_json())
-    _show(found)
+        written.append(json_file)
     if report:
         from surgisoft.diagnosis.pages.diagnosis import write_report
 
         title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
-        print(f"wrote {write_report(found, report, title)}")
+        written.append(write_report(found, report, title))
+    _show(found)
+    for path in written:
+        print(f"wrote {path}")
+    data = " ".join(map(str, recordings))
+    if found.verdict.kind == "ambiguous":
+        between = " ".join(found.verdict.effects)
+        print(f"next: surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv")
+    elif found.verdict.kind in ("identified", "several"):
+        effects = " ".join(found.verdict.effects)
+        print(f"next: surgisoft amend {model} --effect {effects} --data {data} -o NEW")
 
 
 def _show(found) -> None:
@@ -70,7 +83,7 @@ def _show(found) -> None:
     print(f"{verdict.kind}: {verdict.sentence}")
     print(
         f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
-        f"ceiling {error.ceiling:.4f} mm (best on held-out blocks)"
+        f"best achievable {error.ceiling:.4f} mm (on held-out blocks)"
     )
     for check in found.checks:
         print(f"check: {check}")

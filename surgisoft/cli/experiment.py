@@ -1,6 +1,5 @@
 """`surgisoft experiment`: scripted experiments on a scene, from a TOML file to a report."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -8,10 +7,9 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
+from surgisoft.cli.inputs import counted
 from surgisoft.cli.options import EffectFiles, ExperimentFile
 from surgisoft.cli.progress import progress
-from surgisoft.errors import InputError
-from surgisoft.files import write_atomically
 
 commands = typer.Typer(
     no_args_is_help=True, help="Scripted experiments on a scene: run, check, list."
@@ -48,23 +46,16 @@ def run(
     effect_files: EffectFiles = None,
 ) -> None:
     """Play an experiment; write tables, logs, pictures, replays and one HTML report."""
-    from surgisoft.experiments.plan import settings
-    from surgisoft.experiments.run import open_results, run_experiment
-    from surgisoft.experiments.spec import load_experiment
+    from surgisoft.experiments.page import markdown
+    from surgisoft.experiments.session import finish_experiment, start_experiment
 
-    if resume and force:
-        raise InputError("--resume goes on, --force begins anew: give one of them")
-    spec = load_experiment(file)
-    settings(spec, _where(file))
-    for folder in policy or []:
-        spec = _with_policy(spec, folder)
-    spec = spec if repeats is None else replace(spec, repeats=repeats)
-    output = output or Path("results") / spec.name
     check_folder(output)
-    open_results(spec, output, resume, force)
+    spec, folder = start_experiment(file, output, policy or (), repeats, resume=resume, force=force)
     with progress(f"experiment {spec.name}") as report:
-        rows = run_experiment(spec, output, processes, report)
-    for path in _written(spec, output, rows, replays, f"surgisoft experiment run {file.name}"):
+        about = f"surgisoft experiment run {file.name}"
+        results, files = finish_experiment(spec, folder, processes, replays, about, report)
+    print(markdown(results))
+    for path in files:
         print(f"wrote {path}")
 
 
@@ -76,14 +67,14 @@ def check(
     """Say what an experiment would play; a bad file is one line with its line and field."""
     from surgisoft.experiments.plan import settings
     from surgisoft.experiments.run import check_playable
-    from surgisoft.experiments.spec import load_experiment
+    from surgisoft.experiments.session import open_experiment
 
-    spec = load_experiment(file)
-    found = settings(spec, _where(file))
+    spec = open_experiment(file)
+    found = settings(spec)
     check_playable(spec)
-    episodes = len(found) * spec.repeats
+    episodes = counted(len(found) * spec.repeats, "episode")
     print(
-        f"{spec.name}: {len(found)} settings, {episodes} episodes of at most "
+        f"{spec.name}: {counted(len(found), 'setting')}, {episodes} of at most "
         f"{spec.limits.time_s:g} s"
     )
     for phase in spec.phases:
@@ -100,85 +91,16 @@ def check(
 def list_(
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="DIR", help="Where to look; default: the liver phantom's."),
+        typer.Argument(
+            metavar="DIR", help="A folder of experiments, or a scene; default: the liver phantom."
+        ),
     ] = None,
 ) -> None:
-    """List the experiments of a folder."""
+    """List the experiments of a folder or a scene."""
     from surgisoft.experiments.plan import settings
-    from surgisoft.experiments.spec import load_experiment
-    from surgisoft.tasks.world.scene import PHANTOM
+    from surgisoft.experiments.session import experiments_of, open_experiment
 
-    folder = folder or PHANTOM / "experiments"
-    files = sorted(folder.glob("*.toml"))
-    if not files:
-        raise InputError(f"{folder}: no experiment (*.toml) there")
-    for path in files:
-        spec = load_experiment(path)
-        count = len(settings(spec, _where(path)))
-        print(f"{path}: {count} settings x {spec.repeats} episodes. {spec.note}")
-
-
-def _where(file: Path):
-    from surgisoft.config import read_toml
-
-    return read_toml(file)[1]
-
-
-def _with_policy(spec, folder: str):
-    """The experiment with a learned twin of every scripted case."""
-    from surgisoft.agents.run_folder import RunFolder
-    from surgisoft.experiments.spec import SCRIPTED
-
-    trained = RunFolder(folder).config["task"]
-    if trained != "circle_ablation":
-        raise InputError(f"{folder}: was trained on {trained}; expected a run of circle_ablation")
-    path = Path(folder).resolve()
-    twins = tuple(
-        replace(case, name=f"{case.name}-{path.name}", policy=str(path))
-        for case in spec.cases
-        if case.policy == SCRIPTED
-    )
-    names = [case.name for case in (*spec.cases, *twins)]
-    if len(set(names)) < len(names):
-        raise InputError(f"{folder}: a case of that name is there already; rename the folder")
-    return replace(spec, cases=(*spec.cases, *twins))
-
-
-def _written(spec, output: Path, rows, replays: bool, about: str) -> list[Path]:
-    """Write everything that follows from the rows, and say what came out."""
-    from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
-    from surgisoft.experiments.pictures import film, write_pictures
-    from surgisoft.experiments.results import drop_logs, sum_up, write_tables
-    from surgisoft.report import write_page
-
-    results = sum_up(spec, output, rows)
-    files = write_tables(results)
-    shown = shown_episodes(results)
-    with progress("pictures") as report:
-        films = {}
-        for number, (label, episode) in enumerate(shown):
-            report(number, len(shown), label)
-            films[label, episode] = film(results.log(label, episode))
-    files += write_pictures(results, films)
-    files.append(write_page(experiment_page(results, films, about), output / "report.html"))
-    drop_logs(results)
-    if replays:
-        files += _replays(results)
-    text = markdown(results)
-    write_atomically(output / "summary.md", text)
-    print(text)
-    return [*files, output / "summary.md"]
-
-
-def _replays(results) -> list[Path]:
-    from surgisoft.replay.episode_view import write_replay
-
-    files = []
-    worst = ("worst", *results.worst)
-    for name, label, episode in (("first", results.settings[0].label, 0), worst):
-        path = results.folder / "replays" / f"{name}.rrd"
-        path.parent.mkdir(exist_ok=True)
-        with progress(f"replay of {label}, episode {episode}") as report:
-            write_replay(results.log(label, episode), path, 1.0, report)
-        files.append(path)
-    return files
+    for path in experiments_of(folder):
+        spec = open_experiment(path)
+        settings_ = counted(len(settings(spec)), "setting")
+        print(f"{path}: {settings_} x {counted(spec.repeats, 'episode')}. {spec.note}")

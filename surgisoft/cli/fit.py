@@ -61,41 +61,31 @@ def fit(
     Grows from pressure to effects to direction, keeps each only where held-out data rewards it,
     and says which inputs the recordings cannot support.
     """
-    import torch
+    train = read_recordings(recordings)
+    held = read_recordings(valid) if valid else None
 
-    from surgisoft.measurement.histories import arm_spec, check_fits, history_of
-    from surgisoft.measurement.recordings.recording import check_same_arm
+    from surgisoft.measurement.fitting import fit as fit_model
     from surgisoft.surrogate.checkpoint import claim_folder, save_model
-    from surgisoft.surrogate.effects import named_effect
-    from surgisoft.surrogate.fit import FitConfig
-    from surgisoft.surrogate.fit import fit as fit_model
     from surgisoft.surrogate.networks import parse_widths
 
     claim_folder(output, force)
-    torch.set_num_threads(threads)
-    train = read_recordings(recordings)
-    held = read_recordings(valid) if valid else None
-    check_same_arm(train)
-    spec = arm_spec(train, actuation)
-    if held:
-        check_fits(spec, held)
-    config = FitConfig(
-        network=network,
-        inputs=inputs,
-        effects=tuple(named_effect(name) for item in effects or [] for name in item.split(",")),
-        hidden=parse_widths(widths),
-        epochs=epochs,
-        seed=seed,
-    )
     with progress("fit") as report:
         result = fit_model(
-            history_of(train, actuation),
-            history_of(held, actuation) if held else None,
-            spec,
-            config,
-            lambda stage, epoch, of, loss: report(epoch, of, f"{stage}: held-out {loss:.4f} mm2"),
+            train,
+            held,
+            actuation=actuation,
+            threads=threads,
+            progress=lambda stage, epoch, of, loss: report(
+                epoch, of, f"{stage}: held-out {loss:.4f} mm2"
+            ),
+            network=network,
+            inputs=inputs,
+            effects=[name for item in effects or [] for name in item.split(",")],
+            hidden=parse_widths(widths),
+            epochs=epochs,
+            seed=seed,
         )
-    save_model(result.model, output, result.report(), force, result.known)
+    save_model(result.model, output, result.report(), force)
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")

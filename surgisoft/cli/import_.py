@@ -34,10 +34,13 @@ def import_(
     ] = False,
 ) -> None:
     """Import somebody else's files: columns, units and frames as a map says."""
-    from surgisoft.measurement.importing.convert import import_files
-    from surgisoft.measurement.importing.map_file import load_map
-    from surgisoft.measurement.recordings.quality import find_oddities, summary
-    from surgisoft.measurement.recordings.recording import check_writable, save_recording
+    from surgisoft.measurement.importing import import_files, load_map
+    from surgisoft.measurement.recordings import (
+        check_writable,
+        find_warnings,
+        save_recording,
+        summary,
+    )
 
     to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
     if to_file and output.suffix not in (".csv", ".parquet"):
@@ -46,13 +49,14 @@ def import_(
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
     for target in targets if not dry_run else []:
         check_writable(target, force)
+    if not dry_run:
+        for part, target in zip(parts, targets, strict=True):
+            save_recording(part.recording, target, force)
     for part, target in zip(parts, targets, strict=True):
         for note in part.notes:
             print(f"note: {note}")
-        for oddity in find_oddities(part.recording):
-            warn(f"{target}, row {oddity.sample + 1}: {oddity.text}")
-        if not dry_run:
-            save_recording(part.recording, target, force)
+        for found in find_warnings(part.recording):
+            warn(f"{target}, row {found.sample + 1}: {found.text}")
         first, *rest = summary(part.recording)
         about = first.partition(": ")[2]
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
@@ -63,7 +67,7 @@ def recording_(
     recordings: Recordings,
 ) -> None:
     """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings."""
-    from surgisoft.measurement.recordings.quality import summary
+    from surgisoft.measurement.recordings import summary
 
     for recording in read_recordings(recordings):
         print(*summary(recording), sep="\n")

@@ -1,4 +1,4 @@
-"""`surgisoft improve`: diagnose and amend, until the error stands at its floor."""
+"""`surgisoft improve`: diagnose and amend, until no further effect is significant."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
     EffectFiles,
     Force,
@@ -35,19 +35,21 @@ def improve(
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
-    """Improve a model: diagnose, amend, and again, until nothing more is missing.
+    """Improve a model: diagnose, amend, and again, until no further effect is significant.
 
-    The last quarter of each recording judges at the end. Where nothing was added, or the error
-    did not fall beyond chance, nothing is written (exit code 1).
+    The result is validated on the last quarter of each recording. Where no effect was added, or
+    the error did not fall significantly, nothing is written (exit code 1).
     """
+    check_free(json_file, "rounds")
+    check_folder(report)
+    check_model(model)
+    measured = read_recordings(recordings)
+    claim_other_folder(output, model, force)
+
     from surgisoft.diagnosis.improve import improve as improve_model
     from surgisoft.surrogate.checkpoint import load_model
 
-    claim_other_folder(output, model, force)
-    check_free(json_file, "rounds")
-    check_folder(report)
     arm = load_model(model)
-    measured = read_recordings(recordings)
     with progress("improve") as tell:
         done = []
 
@@ -57,13 +59,17 @@ def improve(
 
         result = improve_model(arm, measured, most, after)
     warn_all(result.notes)
-    _show(result)
+    written = []
     if result.claimed:
         save_amended(result, output, model, measured, force)
     if json_file:
         write_json(json_file, result.to_json())
+        written.append(json_file)
     if report:
-        _write_report(result, report, model.name)
+        written += _write_report(result, report, model.name)
+    _show(result)
+    for path in written:
+        print(f"wrote {path}")
     print(result.sentence)
     if not result.claimed:
         print(f"{output} was not written")
@@ -72,30 +78,31 @@ def improve(
 
 
 def _show(result) -> None:
-    """Each round, then the parameters and the errors on the locked part."""
+    """Each round, then the parameters and the errors on the held-out part."""
     for number, done in enumerate(result.rounds, 1):
-        what = f"+ {done.step}" if done.step else "no effect more"
+        what = f"+ {done.step}" if done.step else "no further effect"
         rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")
-        print(f"  {what}{rivals}: error on the open part {done.error_open_mm:.4f} mm")
+        print(f"  {what}{rivals}: error on the training part {done.error_open_mm:.4f} mm")
     if result.steps:
         show_parameters(result.parameters)
         fall = result.held_out
         width = max(len(name) for name, _ in result.steps) + 2
-        print(f"{'before':{width}s} {fall.before:8.4f} mm on the locked part")
+        print(f"{'before':{width}s} {fall.before:8.4f} mm on the held-out part")
         for name, error in result.steps:
             print(f"{'+ ' + name:{width}s} {error:8.4f} mm")
         print(f"{'floor':{width}s} {fall.floor:8.4f} mm")
 
 
-def _write_report(result, folder: Path, name: str) -> None:
-    """The page and the waterfall."""
+def _write_report(result, folder: Path, name: str) -> list[Path]:
+    """Write the page and the waterfall chart."""
     from surgisoft.diagnosis.pages.amendment import improve_page, write_waterfall
     from surgisoft.report import write_page
 
     added = " + ".join(step for step, _ in result.steps) or "no more effects"
     page = improve_page(result, f"{name} with {added}", result.model.summary())
-    print(f"wrote {write_page(page, folder / 'report.html')}")
+    written = [write_page(page, folder / "report.html")]
     if result.steps:
         fall, path = result.held_out, folder / "waterfall.png"
-        print(f"wrote {write_waterfall(fall.before, result.steps, fall.floor, path)}")
+        written.append(write_waterfall(fall.before, result.steps, fall.floor, path))
+    return written

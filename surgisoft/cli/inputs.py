@@ -13,23 +13,24 @@ def warn(text: str) -> None:
     typer.echo(f"surgisoft: warning: {text}", err=True)
 
 
+def check_model(folder: Path) -> None:
+    """Raise where there is no model, before anything is loaded that takes seconds."""
+    if str(folder) != "default" and not (folder / "config.json").is_file():
+        raise InputError(
+            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+        )
+
+
 def read_recordings(paths: Iterable[Path]) -> list:
     """The recordings in files and folders; what is odd but usable is warned of."""
-    from surgisoft.measurement.recordings.recording import load_recordings
+    from surgisoft.measurement.recordings import load_recordings
 
     return load_recordings(paths, on_warning=warn)
 
 
-def hidden_effects(given: Iterable[str] | None) -> list[tuple[str, float]]:
-    """`creep:0.5` as name and strength; without a number 1."""
-    answer = []
-    for text in given or ():
-        name, colon, strength = text.partition(":")
-        try:
-            answer.append((name, float(strength) if colon else 1.0))
-        except ValueError:
-            raise InputError(f"--hidden {text}: expected NAME or NAME:STRENGTH") from None
-    return answer
+def counted(number: int, thing: str) -> str:
+    """`1 episode`, `2,000 episodes`."""
+    return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"
 
 
 def warn_all(notes: Iterable[str]) -> None:

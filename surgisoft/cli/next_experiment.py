@@ -1,4 +1,4 @@
-"""`surgisoft next-experiment`: the schedule that best tells rival effects apart."""
+"""`surgisoft next-experiment`: the schedule that best distinguishes competing effects."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
@@ -30,7 +30,7 @@ def next_experiment(
         list[str] | None,
         typer.Option(
             metavar="NAME...",
-            help="The rival effects, one after another or with commas; default: those that explain "
+            help="The competing effects, with spaces or commas; default: those that explain "
             "the recordings best, without recordings all known ones.",
         ),
     ] = None,
@@ -38,17 +38,13 @@ def next_experiment(
         float, typer.Option(metavar="MIN", help="Longest time on the bench, minutes.")
     ] = 15.0,
     as_it_stands: Annotated[
-        bool, typer.Option("--as-it-stands", help="Ask for no change of the bench itself.")
+        bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
     ] = False,
     json_file: JsonFile = None,
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
-    """Find the experiment that best tells rival effects apart, ready for the rig."""
-    from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
-    from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
-    from surgisoft.surrogate.checkpoint import load_model
-
+    """Find the experiment that best distinguishes competing effects, ready for the rig."""
     if output.suffix != ".csv":
         raise InputError(
             f"{output}: suffix '{output.suffix}', expected .csv, as `collect` reads it"
@@ -57,11 +53,17 @@ def next_experiment(
         raise InputError(f"{output}: exists already; choose another name or use --force")
     check_folder(output.absolute().parent)
     check_free(json_file, "separates")
-    arm = load_model(model)
-    rivals = [name for item in between or [] for name in item.split(",") if name] or None
-    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
+    check_model(model)
     measured = read_recordings(recordings) if recordings else []
-    answer = find_experiment(arm, measured, rivals, minutes, settings)
+
+    from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
+    from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
+    from surgisoft.surrogate.checkpoint import load_model
+
+    arm = load_model(model)
+    competing = [name for item in between or [] for name in item.split(",") if name] or None
+    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
+    answer = find_experiment(arm, measured, competing, minutes, settings)
     warn_all(answer.notes)
     write_atomically(output, schedule_text(answer.protocol))
     if json_file:

@@ -41,13 +41,19 @@ EffectFiles = Annotated[
         "--effect-file",
         metavar="FILE.py...",
         callback=_register,
-        help="Files of user-defined effects (docs/effects.md): models may hold them, and diagnose, "
-        "improve and next-experiment consider them. The files are run: trust them.",
+        help="Files of user-defined effects (docs/effects.md) that a model holds or may lack. The "
+        "files are run: name only those that you trust.",
     ),
 ]
 """Of every command that opens a model. The effects are registered when the command line is read."""
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
-ExperimentFile = Annotated[Path, Argument(metavar="FILE.toml", help="The experiment.")]
+ExperimentFile = Annotated[
+    Path,
+    Argument(
+        metavar="FILE.toml",
+        help="The experiment, or the name of one of the package: 'surgisoft experiment list'.",
+    ),
+]
 
 JsonFile = Annotated[
     Path | None, Option("--json", metavar="FILE.json", help="Write all numbers here.")
@@ -67,16 +73,20 @@ Hidden = Annotated[
     Option(
         "--hidden",
         metavar="NAME[:X]...",
-        help="Effects that are hidden in the rig, each with its strength; without a number 1.",
+        help="Effects that the rig has and a model lacks, each with its strength; default 1.",
     ),
 ]
 Arm = Annotated[
     str | None,
-    Option("--arm", metavar="MODEL", help="Arm model of all arms; without it the task's own."),
+    Option("--arm", metavar="MODEL", help="Arm model of all arms; default: the task's own."),
 ]
 SceneFolder = Annotated[
     Path | None,
-    Option("--scene", metavar="DIR", help="Scene; without it the liver phantom."),
+    Option(
+        "--scene",
+        metavar="DIR",
+        help="Folder of a scene, or phantom_liver; default: the task's own.",
+    ),
 ]
 TaskConfig = Annotated[
     Path | None,

@@ -1,4 +1,4 @@
-"""`surgisoft scene new`, `check` and `show`: author, judge and look at a scene."""
+"""`surgisoft scene new`, `check` and `show`: make, check and view a scene."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,11 +8,14 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
 
 commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
 app.add_typer(commands, name="scene")
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a scene (or scene.toml).")]
+Folder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder of a scene (or scene.toml), or phantom_liver.")
+]
 Vector = tuple[float, float, float]
 
 
@@ -49,12 +52,16 @@ def new(
     force: Force = False,
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
+    _check_meshes(meshes)
+
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
     from surgisoft.scene.spec import TOOLS, MountSpec
-    from surgisoft.tasks.world.reach import reach_of
 
     request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
     check_target(output, force)
+
+    from surgisoft.tasks.world.reach import reach_of
+
     blank = {tool: MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in TOOLS}
     reaches = {tool: reach_of(mount) for tool, mount in blank.items()}
     try:
@@ -82,7 +89,7 @@ def check(
     ] = None,
     effect_files: EffectFiles = None,
 ) -> int:
-    """Judge a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
+    """Check a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
     from surgisoft.scene.check import check_scene, reach_patch
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
@@ -91,11 +98,13 @@ def check(
     reaches = reaches_of(scene)
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
-    _print_check(verdict)
-    if picture is not None and verdict.work is not None:
+    drawn = picture is not None and verdict.work is not None
+    if drawn:
         from surgisoft.replay.reach_map import draw_reach_map
 
         draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)
+    _print_check(verdict)
+    if drawn:
         print(f"wrote {picture}")
     return 0 if verdict.good else 1
 
@@ -132,11 +141,18 @@ def show(
             open_viewer(recording)
 
 
+def _check_meshes(meshes: list[str]) -> None:
+    """Raise where a mesh file is missing, with or without a role behind its name."""
+    for text in meshes:
+        path, _, _ = text.rpartition(":")
+        if not Path(text).exists() and not (path and Path(path).exists()):
+            raise InputError(f"{path or text}: there is no such file; expected a mesh")
+
+
 def _request(meshes, unit, lesion, direction, diameter, clearance):
     """The user's wish; contradictions are one line."""
     import numpy as np
 
-    from surgisoft.errors import InputError
     from surgisoft.scene.author import Request
     from surgisoft.scene.mesh import ROLES
     from surgisoft.scene.spec import LimitsSpec

@@ -26,9 +26,11 @@ def train(
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="MIN", help="Time to train, minutes, instead of --steps."),
+        typer.Option(metavar="MIN", help="Time to train, minutes, in place of --steps."),
     ] = None,
-    envs: Annotated[int | None, typer.Option(min=1, help="Episodes side by side.")] = None,
+    envs: Annotated[
+        int | None, typer.Option(min=1, help="Episodes that are simulated side by side.")
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=SEED_MAX, help="Seed of weights, noise and episodes.")
     ] = None,
@@ -56,87 +58,41 @@ def train(
 ) -> None:
     """Train the agents of a task with PPO; every agent learns at once.
 
-    The run's folder is written first and opens by itself. Ctrl-C ends it so that --resume goes on
-    as if nothing had been. Several processes: torchrun --nproc-per-node N -m surgisoft train ...
+    The folder of the run is written first and holds all that is needed to open it. After Ctrl-C,
+    --resume goes on with the same numbers as without a break. For several processes:
+    torchrun --nproc-per-node N -m surgisoft train ...
     """
-    from surgisoft.errors import InputError
+    from surgisoft.agents.session import train as train_agents
 
     given = {
-        "--task": task, "--preset": preset, "--steps": steps, "--minutes": minutes,
-        "--envs": envs, "--seed": seed, "--target-error": target_error, "--output": output,
-        "--arm": arm, "--scene": scene, "--config": config,
+        "preset": preset, "steps": steps, "minutes": minutes, "envs": envs, "seed": seed,
+        "target_error": target_error, "arm": arm, "scene": scene, "config": config,
     }  # fmt: skip
-    told = [name for name, value in given.items() if value is not None]
-    if resume is not None and told:
-        raise InputError(
-            f"--resume goes on with what the run was started with: leave {', '.join(told)} out"
-        )
-    if resume is None and task is None:
-        from surgisoft.tasks.registry import TASKS
+    with progress(f"train {resume or output or task}") as report:
 
-        raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")
-    if resume is None:
-        plan = _plan(task, preset, steps, minutes, envs, seed, target_error, arm, scene, config)
-        folder = _new_folder(task, output)
-    else:
-        plan, folder = None, resume
-    result, leads = _run(plan, folder, device, threads)
-    if not leads:
+        def tell(state) -> None:
+            note = f"{state.steps:,} steps, {state.steps_per_s:,.0f}/s, reward {state.reward:.3f}"
+            report(state.share, 1.0, f"{note}, {_measures(state.evaluation)}")
+
+        run = train_agents(
+            task,
+            output,
+            resume_from=resume,
+            device=device,
+            threads=threads,
+            progress=tell,
+            **{name: value for name, value in given.items() if value is not None},
+        )
+    if not run.leads:
         return
-    if not result.done:
+    if not run.result.done:
         print(
-            f"stopped after {result.steps:,} steps; go on with: surgisoft train --resume {folder}"
+            f"stopped after {run.result.steps:,} steps; go on with: "
+            f"surgisoft train --resume {run.folder}"
         )
         raise typer.Exit(INTERRUPTED)
-    print(_summary(folder, result))
-
-
-def _plan(task, preset, steps, minutes, envs, seed, target_error, arm, scene, config):
-    from surgisoft.agents.presets import Plan, preset_for, steps_for
-    from surgisoft.tasks.registry import config_of, read_config, with_fields
-
-    own = read_config(task, config) if config else config_of(task)
-    paths = {"arm": arm, "scene": None if scene is None else str(scene)}
-    own = with_fields(own, **{name: value for name, value in paths.items() if value is not None})
-    name = preset or "fast"
-    numbers = preset_for(name, task, envs=envs)
-    if steps is None and minutes is None:
-        steps = steps_for(name, task)
-    return Plan(task, own, name, numbers, steps, minutes, target_error, seed or 0)
-
-
-def _new_folder(task: str, output: Path | None) -> Path:
-    """The folder of a new run; only processes that torchrun did not number may choose by time."""
-    import os
-
-    from surgisoft.agents.run_folder import check_free, default_folder
-    from surgisoft.errors import InputError
-
-    if output is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise InputError("several processes need one folder: name it with -o RUN")
-    folder = output or default_folder(task)
-    if os.environ.get("RANK", "0") == "0":
-        check_free(folder)
-    return folder
-
-
-def _run(plan, folder: Path, device: str, threads: int):
-    """Train or resume; the result, and whether this process leads."""
-    import torch
-
-    from surgisoft.agents.distributed import processes
-    from surgisoft.agents.training import resume, train_new
-
-    torch.set_num_threads(threads)
-    with processes(device) as (here, kind), progress(f"train {folder}") as report:
-
-        def tell(p) -> None:
-            note = f"{p.steps:,} steps, {p.steps_per_s:,.0f}/s, reward {p.reward:.3f}"
-            report(p.share, 1.0, f"{note}, {_measures(p.evaluation)}")
-
-        if plan is None:
-            return resume(folder, here, kind, tell), here.leads
-        return train_new(folder, plan, here, kind, tell), here.leads
+    print(_summary(run.folder, run.result))
+    print(f"next: surgisoft evaluate {run.folder}")
 
 
 def _measures(found: dict | None) -> str:
@@ -146,7 +102,8 @@ def _measures(found: dict | None) -> str:
     if "success" in found:
         words.append(f"success {found['success']:.0%}")
     if "error_mm" in found:
-        words.append(f"error {found['error_mm']:.4f} mm")
+        error = found["error_mm"]
+        words.append("error not measured" if error != error else f"error {error:.4f} mm")
     return "evaluation: " + ", ".join(words)
 
 

@@ -12,14 +12,15 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
-from surgisoft.diagnosis.refinement.effects import fit_effects
-from surgisoft.diagnosis.refinement.intervals import Parameter
-from surgisoft.diagnosis.refinement.network import retune
+from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.intervals import Parameter
+from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 LEAST_FALL = 0.05
 """Least fall of the error that is claimed, as a share of what stands above the noise floor."""
@@ -139,7 +140,7 @@ class Amendment:
         }
 
 
-@on_one_thread
+@torch_threads(1)
 def amend(
     model: Model,
     recordings: Recordings,

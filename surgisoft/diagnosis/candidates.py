@@ -1,4 +1,4 @@
-"""What each effect would change in a model's prediction, to first order in its strengths."""
+"""Candidates: first-order sensitivities of a model's prediction to effects that it may lack."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -8,38 +8,41 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.residuals import Problem
+from surgisoft.surrogate.chain import Taps, context_of
 from surgisoft.surrogate.effects import (
     ArmFacts,
     Context,
     Effect,
+    Stage,
     free_name,
+    hypothesis_of,
     known_effects,
 )
-from surgisoft.surrogate.model import ArmModel, context_of
+from surgisoft.surrogate.model import ArmModel
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One effect with one choice of its shape, added to a model at zero strength."""
+    """One effect with given nonlinear parameters, added to a model at zero amplitude."""
 
     name: str
     """The effect's name."""
     effect: Effect
-    """The effect, at zero strength."""
+    """The effect, at zero amplitude."""
     columns: np.ndarray
-    """(S, n, 3, K) change of the key points with each strength, mm."""
+    """(S, n, 3, K) sensitivity of the key points to each amplitude, mm."""
     more: bool = False
     """Whether the columns make an effect that the model has already stronger."""
     fitted: bool = False
-    """Whether the shape was fitted through the whole chain; else it is one of a grid."""
+    """Whether its nonlinear parameters were fitted and not taken from a grid."""
 
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:
-        """The effect at strengths (K,); None for more of one that the model has."""
+        """The effect at amplitudes (K,); None for more of one that the model has."""
         if self.more:
             return None
         effect, first = copy.deepcopy(self.effect), 0
-        for parameter in effect.strengths().values():
+        for parameter in effect.amplitudes().values():
             part = amplitudes[first : first + parameter.numel()]
             parameter.copy_(torch.as_tensor(part, dtype=parameter.dtype).view_as(parameter))
             first += parameter.numel()
@@ -48,8 +51,7 @@ class Candidate:
 
 def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
     """The model with one effect more, behind those of its stage; the parts are shared."""
-    effects = {**model.effects, free_name(name, model.effects): effect}
-    return ArmModel(model.spec, model.network, effects, model.rest_mm, model.validation)
+    return model.replace(effects={**model.effects, free_name(name, model.effects): effect})
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,67 +60,44 @@ class Signals:
 
     context: Context
     """Times and chamber pressure of every row."""
-    line: Tensor
-    """(R, T, m) actuation behind the line effects."""
-    material: Tensor
-    """(R, T, m) effective actuation."""
-    body: Tensor
-    """(R, T, n, 3) key points before sensor effects, mm."""
-    sensor: Tensor
-    """(R, T, n, 3) key points, mm."""
+    taps: Taps
+    """Signals behind each stage and memories, every row (R, T, ...)."""
     slope: Tensor
     """(S, n, 3, m) change of key points with the effective actuation, mm a unit."""
-    rest: dict[str, Tensor]
+    rest: dict[Stage, Tensor]
     """The signal of each stage before the first row, (R, m) or (R, n, 3)."""
     first: Tensor
     """(R, m) actuation at which each run begins."""
+
+    @property
+    def body(self) -> Tensor:
+        """(R, T, n, 3) key points before sensor effects, mm."""
+        return self.taps.behind["body"]
 
 
 @torch.no_grad()
 def signals(problem: Problem) -> Signals:
     """The signals of a problem's model."""
-    model, history = problem.model, problem.history
-    trace = model.trace(history)
-    effective = model.effective(trace.pressure, trace.memory)
-    points = model.network(effective, trace.direction)
-    first = model.first_pressure(history)
-    state, rest = model.before(first)
-    context = replace(context_of(history), pressure=trace.pressure)
-    stages = {}
-    for stage in ("body", "sensor"):
-        for name, effect in model.stage(stage):
-            points = effect.apply(points, effect.scan(state.memory[name], points, context))
-        stages[stage] = points
-    at, direction = problem.rows(effective), problem.rows(trace.direction)
-    slope = network_slope(model, at, direction)
-    return Signals(
-        context, trace.pressure, effective, stages["body"], stages["sensor"], slope, rest, first
-    )
-
-
-def network_slope(model: ArmModel, effective: Tensor, direction: Tensor) -> Tensor:
-    """(S, n, 3, m) change of key points with the effective actuation (S, m), mm a unit."""
-    with torch.enable_grad():
-        at = effective.detach().clone().requires_grad_(True)
-        points = model.network(at, direction).flatten(1)
-        parts = [torch.autograd.grad(p.sum(), at, retain_graph=True)[0] for p in points.unbind(1)]
-    return torch.stack(parts, 1).unflatten(1, (model.spec.key_points, 3))
+    chain, history = problem.model.chain, problem.history
+    first = problem.model.first_pressure(history)
+    taps = chain.scan(history, first)
+    context = replace(context_of(history), pressure=taps.pressure)
+    at, direction = problem.rows(taps.behind["material"]), problem.rows(taps.direction)
+    slope = chain.network_slope(at, direction)
+    return Signals(context, taps, slope, chain.standing(first)[1], first)
 
 
 @torch.no_grad()
 def columns_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
-    """(S, n, 3, K) change of the key points, mm, with each strength of an effect at zero.
+    """(S, n, 3, K) sensitivity of the key points, mm, to each amplitude of an effect at zero.
 
-    Effects of line and material act through the network's slope; the memory of effects behind
-    them is taken to follow.
+    The effect stands behind the others of its stage. Effects of line and material act through the
+    network's slope; the memory of effects behind them is taken to follow.
     """
-    at = getattr(signal, effect.stage)
-    seen = signal.rest[effect.stage]
-    before = problem.model.first_memory(effect, seen, at[:, 0], signal.first)
+    chain, at = problem.model.chain, signal.taps.behind[effect.stage]
+    before = chain.first_memory(effect, signal.rest, at[:, 0], signal.first)
     memory = effect.scan(before, at, signal.context)
-    changes = effect.columns(problem.rows(at), problem.rows(memory))
-    if effect.stage in ("line", "material"):
-        changes = torch.einsum("snjm,ksm->ksnj", signal.slope, changes)
+    changes = chain.sensitivities(effect, problem.rows(at), problem.rows(memory), signal.slope)
     return changes.movedim(0, -1).numpy()
 
 
@@ -128,24 +107,19 @@ def more_of(problem: Problem, signal: Signals, name: str) -> Candidate | None:
 
     For an effect on the actuation one for each chamber too, in turn.
     """
-    model, effect = problem.model, problem.model.effects[name]
+    effect = problem.model.effects[name]
     if effect.stage != "material":
         return None
-    trace = model.trace(problem.history)
-    before = trace.pressure
-    for other, part in model.stage("material"):
-        after = part.apply(before, trace.memory[other])
-        if other == name:
-            change = problem.rows(after - before)
-            break
-        before = after
+    before, after = problem.model.chain.around(name, signal.taps)
+    change = problem.rows(after - before)
     each = torch.diag_embed(change).movedim(-1, 0)
     columns = torch.einsum("snjm,ksm->ksnj", signal.slope, torch.cat([change[None], each[:-1]]))
     return Candidate(name, effect, columns.movedim(0, -1).numpy(), more=True)
 
 
 def facts_of(problem: Problem) -> ArmFacts:
-    """What effects may know of the arm; what a room that was warm all along does is not drift."""
+    """What effects may know of the arm. A model that does not say how warm its room was takes the
+    mean of the recordings: a room that was warm all along causes no drift."""
     facts, room = problem.model.facts, problem.history.temperature_C
     if facts.temperature_C is None and room is not None:
         return replace(facts, temperature_C=float(room.nanmean()))
@@ -153,17 +127,18 @@ def facts_of(problem: Problem) -> ArmFacts:
 
 
 def candidates(problem: Problem, names: list[str] | None = None) -> list[Candidate]:
-    """Every known effect in each of its shapes, as columns."""
+    """The sensitivities of every known effect (or the named ones) over its grid."""
     model, signal = problem.model, signals(problem)
     points = problem.rows(signal.body)
     answer, known, facts = [], known_effects(), facts_of(problem)
     for name in names or known:
         more = more_of(problem, signal, name) if name in model.effects else None
+        hypothesis = hypothesis_of(known[name])
         if more is None:
-            fresh = known[name].candidates(facts, points)
+            fresh = hypothesis.candidates(facts, points)
         else:
             answer.append(more)
-            fresh = known[name].further(facts, points)
+            fresh = hypothesis.further(facts, points)
         for effect in fresh:
             columns = columns_of(problem, signal, effect)
             answer.append(Candidate(name, copy.deepcopy(effect), columns))

@@ -12,7 +12,6 @@ from surgisoft.diagnosis.error_axes import AxisShare, Band, bands, shares
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
-    on_one_thread,
     open_inputs,
     with_known_residuals,
 )
@@ -29,8 +28,9 @@ from surgisoft.diagnosis.selection import BestAchievable, best_achievable, selec
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
+from surgisoft.workers import torch_threads
 
 WORST = 5
 """Worst moments that are listed."""
@@ -164,7 +164,7 @@ class Comparison:
         return json_safe(values)
 
 
-@on_one_thread
+@torch_threads(1)
 def compare(
     model: Model,
     recordings: Recordings,

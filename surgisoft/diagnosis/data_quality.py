@@ -50,7 +50,7 @@ def data_quality_warnings(problem: Problem) -> list[str]:
             "fitted on, where its own error is larger: an effect that shows there alone may be an "
             "error of the model"
         )
-    validated = problem.model.validation.get("rmse_mm")
+    validated = problem.model.validation.rmse_mm
     noise = problem.floor_mm
     if validated and source == "holds" and noise > validated:
         warnings.append(

@@ -15,7 +15,7 @@ from surgisoft.diagnosis.criteria import CRITERIA, Calibration, Criteria, Decisi
 from surgisoft.diagnosis.effect_knowledge import knowledge_of
 from surgisoft.diagnosis.selection import Findings
 from surgisoft.diagnosis.statistics import studentised, win_shares
-from surgisoft.surrogate.effects import known_effects
+from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
 Kind = Literal[
     "identified",
@@ -213,7 +213,7 @@ def _mimicked(evidence: Evidence, asked: DecisionCriteria) -> bool:
     missed = evidence.box_share - explained
     counts = _box_counts(evidence, asked)
     if evidence.left_size >= asked.far_size:
-        exact = all(known_effects()[name].settled_form for name in evidence.effects)
+        exact = all(hypothesis_of(known_effects()[name]).exact_form for name in evidence.effects)
         if together < asked.explained or (exact and explained < asked.explained_exactly):
             return True
     if together < asked.explained_beside_box and counts and missed >= asked.missed_share:

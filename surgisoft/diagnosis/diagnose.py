@@ -26,7 +26,6 @@ from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
 from surgisoft.diagnosis.residuals import Problem
@@ -38,9 +37,10 @@ from surgisoft.diagnosis.selection import (
     rmse_interval,
 )
 from surgisoft.errors import unknown_name
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.known_error import KnownError
+from surgisoft.workers import torch_threads
 
 MOST_RIVALS = CRITERIA.selection.most_competing
 """Most competing effects that an experiment is sought for."""
@@ -126,7 +126,7 @@ class Diagnosis:
         return asdict(self)
 
 
-@on_one_thread
+@torch_threads(1)
 def diagnose(
     model: Model,
     recordings: Recordings,

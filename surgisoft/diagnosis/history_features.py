@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.scan import last_nonzero, linear_scan, play_scan
+from surgisoft.surrogate.scan import direction_scan, last_nonzero, linear_scan, play_scan
 
 TIMES_S = (0.15, 0.5, 1.5, 5.0, 15.0, 50.0, 150.0)
 """Time constants of the low passes, s."""
@@ -62,7 +61,7 @@ def memory_of(history: History, spec: ArmSpec) -> Memory:
     wide = signal.unsqueeze(-1).expand(*signal.shape, len(RADII))
     play = play_scan(wide, radius, start.unsqueeze(-1).expand(*start.shape, len(RADII)))
     band = torch.tensor(spec.band, dtype=torch.float64)
-    anchor, direction = directions.trace(signal, band, torch.tensor(spec.rest, dtype=torch.float64))
+    anchor, direction = direction_scan(signal, band, torch.tensor(spec.rest, dtype=torch.float64))
     moved = (anchor.diff(dim=1, prepend=anchor[:, :1]) != 0).any(-1)
     last = torch.where(moved, history.t_s, history.t_s[:, :1]).cummax(dim=1).values
 

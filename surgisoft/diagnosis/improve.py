@@ -12,15 +12,16 @@ from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
-from surgisoft.diagnosis.inputs import Model, Recordings, on_one_thread, open_inputs
-from surgisoft.diagnosis.refinement.effects import fit_effects, fit_plausible
-from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
-from surgisoft.diagnosis.refinement.network import retune
+from surgisoft.diagnosis.estimation.effects import fit_effects, fit_plausible
+from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
+from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 MOST_EFFECTS = 6
 """Most effects that are added."""
@@ -106,7 +107,7 @@ class Improvement:
         }
 
 
-@on_one_thread
+@torch_threads(1)
 def improve(
     model: Model,
     recordings: Recordings,

@@ -1,37 +1,20 @@
 """The inputs of every command: a model, recordings, and the identification problem they pose."""
 
-import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import ParamSpec, TypeVar
-
-import torch
 
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import check_fits, outside_range
-from surgisoft.measurement.recordings.recording import Recording, load_recordings
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
-
-P, R = ParamSpec("P"), TypeVar("R")
 
 Model = ArmModel | str | Path
 """A model, or its folder."""
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
-
-
-def read_recordings(given: Recordings) -> list[Recording]:
-    """The recordings in files and folders; recordings that are open already stay as they are."""
-    items = [given] if isinstance(given, Recording | str | Path) else list(given)
-    if not any(isinstance(item, Recording) for item in items):
-        return load_recordings(items)
-    found = []
-    for item in items:
-        found += [item] if isinstance(item, Recording) else load_recordings(item)
-    return found
 
 
 def open_inputs(
@@ -44,7 +27,7 @@ def open_inputs(
     actuation that the model was fitted to.
     """
     arm = load_model(model)
-    measured = read_recordings(recordings)
+    measured = load_recordings(recordings)
     check_fits(arm.spec, measured)
     turned, notes = under_weight(arm, measured)
     return turned, measured, (*notes, *outside_range(arm.spec, measured))
@@ -69,18 +52,3 @@ def with_known_residuals(
     """The problem with the residuals of a reference, or those that its model keeps of its fit."""
     known = problem.model.training_residuals if reference is None else reference
     return problem if known is None else problem.with_reference(known)
-
-
-def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that computes on one thread of torch, so that sums round alike on any machine."""
-
-    @functools.wraps(function)
-    def computed(*args: P.args, **kwargs: P.kwargs) -> R:
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            return function(*args, **kwargs)
-        finally:
-            torch.set_num_threads(before)
-
-    return computed

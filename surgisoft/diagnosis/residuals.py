@@ -24,7 +24,7 @@ from surgisoft.diagnosis.history_features import Memory, features, memory_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
 from surgisoft.measurement.noise import hold_noise, stated_noise
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.known_error import KnownError
@@ -392,11 +392,6 @@ class Problem:
     def floor_mm(self) -> float:
         """RMS noise over all key points, mm."""
         return float(np.sqrt(np.mean(self.noise_mm**2)))
-
-    @property
-    def surrogate_mm(self) -> np.ndarray:
-        """(n,) model discrepancy of each key point, mm (`discrepancy_mm`)."""
-        return self.discrepancy_mm
 
     @property
     def residual(self) -> np.ndarray:

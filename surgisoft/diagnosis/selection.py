@@ -19,7 +19,7 @@ from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.cross_validation import CrossValidation, split_of
 from surgisoft.diagnosis.discrepancy import SIZES, Prior
-from surgisoft.diagnosis.refinement.sharpen import refined_candidates
+from surgisoft.diagnosis.estimation.effects import refined
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import (
     block_interval,
@@ -27,7 +27,7 @@ from surgisoft.diagnosis.statistics import (
     sign_flip_p_values,
     win_shares,
 )
-from surgisoft.surrogate.effects import Effect, Quantity
+from surgisoft.surrogate.effects import Effect, Quantity, hypothesis_of
 
 ASKED = CRITERIA.selection
 
@@ -118,7 +118,7 @@ class ModelSelection:
             # Beside more of an effect that the model has, one further shape of it is enough.
             own = any(candidates[way.shape].more for way in ways)
             shapes = [candidates[way.shape].effect for way in ways]
-            for some in [] if own else shapes[0].together(shapes):
+            for some in [] if own else hypothesis_of(shapes[0]).combinations(shapes):
                 if len(some) > 1:
                     ways.append(Option(name, sum((ways[i].picked for i in some), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
@@ -204,7 +204,10 @@ class ModelSelection:
         if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
             return False
         some = self.candidates[self.options[way.effect][0].shape].effect
-        return not some.needs_reversals or self._static_share(way, base) <= ASKED.most_static
+        return (
+            not hypothesis_of(some).needs_reversals
+            or self._static_share(way, base) <= ASKED.most_static
+        )
 
     def _static_share(self, way: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
@@ -624,8 +627,7 @@ def select(problem: Problem, some: list[Candidate], report: Progress) -> Selecte
     close = _close(first, named)
     if close:
         report(f"nonlinear parameters of {' and '.join(score.effect for score in close)}")
-        refined = refined_candidates(problem, selection.starts(close))
-        selection = selection.extended(refined)
+        selection = selection.extended(refined(problem, selection.starts(close)))
         first = selection.scores()
         named, following = select_effects(selection, first)
     return Selected(selection, first, named, following)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
 SAME_DEG = 5.0
@@ -65,9 +65,7 @@ def under_weight(model: ArmModel, recordings: list[Recording]) -> tuple[ArmModel
 def _without_direction(model: ArmModel) -> ArmModel:
     """The same model, whose loads may have any direction."""
     spec = replace(model.spec, gravity=None)
-    free = ArmModel(spec, model.network, dict(model.effects), model.rest_mm, model.validation)
-    free.training_residuals = model.training_residuals
-    return free.to(model.rest_mm.device).train(model.training)
+    return model.replace(spec=spec)
 
 
 def _shown(direction) -> str:

@@ -1,5 +1,7 @@
 """Scripted experiments on a scene: phases, cases, what varies, limits; tables, replays, a report.
 
-`spec` is the file, `phased` the task wrapper with the interlock, `hands` who moves each arm, `plan`
-what is to be played, `play` plays a block of episodes, `run` all of them, `results` sums up.
+`task` says what a task has to offer for experiments, `ablation` offers it for `circle_ablation`.
+`spec` is the file, `phases` the task with phases and interlock, `controllers` who moves each arm,
+`plan` the settings that the file asks for, `run` rolls them out, `results` summarises, `page` and
+`pictures` show.
 """

@@ -1,4 +1,4 @@
-"""The report of an experiment: verdict, table, what varies, first and worst episodes."""
+"""The HTML report of an experiment: summary, table, sweeps, first and worst episodes."""
 
 from __future__ import annotations
 
@@ -8,40 +8,25 @@ from pathlib import Path
 from surgisoft.agents.evaluate import RATES
 from surgisoft.agents.report import cell, episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
-from surgisoft.experiments.conditions import CONDITIONS
 from surgisoft.experiments.results import Results, SettingResult
+from surgisoft.experiments.spec import EXPERIMENT_TASK
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
 
-COLUMNS = {
-    "success": "success",
-    "completion": "share cut",
-    "beam_error_mean_mm": "beam error, mean [mm]",
-    "beam_error_p95_mm": "beam error, 95 % [mm]",
-    "healthy_mm2": "healthy tissue [mm2]",
-    "in_view": "time in sight",
-    "clearance_mm": "least clearance [mm]",
-    "time_s": "time [s]",
-    "beam_s": "beam on [s]",
-    "beam_unsafe_longest_s": "beam on while unsafe, longest [s]",
-}
-"""Numbers of the main table, in words."""
-SPREAD = ("completion", "beam_error_mean_mm", "clearance_mm", "time_s")
-"""Numbers that are drawn for every episode."""
+NUMBERS, CONDITIONS = EXPERIMENT_TASK.numbers, EXPERIMENT_TASK.conditions
 SHOWN = 4
 """Most settings of which the first episode is shown."""
 HOW = (
     "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
-    "for all else. The beam's error is how far its axis passes from its target while it is on. "
-    "Clearance, contact and success are judged by exact collision queries on the true bodies.\n\n"
+    "for all else. The beam's error is the distance of its axis from its target while it is on. "
+    "Clearance, contact and success come from exact collision checks (FCL) of the true bodies.\n\n"
     "Interlock: the beam is off in every step that begins with the lesion out of sight, with a "
-    "clearance below the limit, or after an abort. What can become unsafe within a step is stopped "
-    "at the next one; the last column of the table says how long the beam was on at the end of "
-    "unsafe steps in a row."
+    "clearance below the limit, or after an abort. A step that becomes unsafe while it runs is "
+    "stopped at its end; the last number of the table is the longest time of such steps in a row."
 )
 
 
 def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
-    """films: (setting's label, episode) -> what the endoscope saw, for episodes to show."""
+    """films: (setting's label, episode) -> film strip of the endoscope, for episodes to show."""
     sections = [_table(results), _outcomes(results)]
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))
@@ -77,7 +62,7 @@ def shown_episodes(results: Results) -> list[tuple[str, int]]:
 
 
 def verdict(results: Results) -> str:
-    """One or two sentences."""
+    """One or two sentences that state the main result."""
     settings, faults = results.settings, results.experiment.faults
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
     hits = sum(row["collided"] > 0.0 for row in results.rows)
@@ -85,7 +70,7 @@ def verdict(results: Results) -> str:
         ended = [row for row in results.rows if row["outcome"].startswith("aborted")]
         first = (
             f"After the fault {len(ended)} of {len(results.rows)} episodes were aborted, "
-            f"{sum(row['success'] for row in results.rows):.0f} were cut all the same; "
+            f"{sum(row['success'] for row in results.rows):.0f} were cut nevertheless; "
             f"the beam was on for at most {unsafe:.2g} s while it was unsafe"
         )
     elif len(settings) <= SHOWN:
@@ -135,8 +120,8 @@ def _facts(results: Results) -> list[tuple[str, str]]:
 def _table(results: Results) -> Section:
     if len(results.settings) <= SHOWN:
         return Section("Results", [Table(*turned_table(results))])
-    known = [name for name in COLUMNS if name in results.settings[0].overall]
-    header = ["setting", "episodes", *(COLUMNS[name] for name in known)]
+    known = [name for name in NUMBERS if name in results.settings[0].overall]
+    header = ["setting", "episodes", *(NUMBERS[name] for name in known)]
     rows = [
         (
             setting.label,
@@ -150,9 +135,12 @@ def _table(results: Results) -> Section:
 
 def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
     """Header and rows of the main table, a column for each setting."""
-    known = [name for name in COLUMNS if name in results.settings[0].overall]
+    known = [name for name in NUMBERS if name in results.settings[0].overall]
     rows = [
-        (COLUMNS[name], *(cell(s.overall[name], name in RATES) for s in results.settings))
+        (
+            NUMBERS[name],
+            *(cell(s.overall[name], name in RATES) for s in results.settings),
+        )
         for name in known
     ]
     return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows
@@ -184,13 +172,13 @@ def _side_by_side(results: Results) -> Section:
 
 def _spreads(results: Results) -> list[Picture]:
     drawn = []
-    for name in SPREAD:
+    for name in EXPERIMENT_TASK.per_episode:
         groups = [
             (setting.label, [row[name] for row in setting.rows])
             for setting in results.settings
             if name in setting.overall
         ]
-        picture = spread_chart(COLUMNS[name], groups, COLUMNS[name])
+        picture = spread_chart(NUMBERS[name], groups, NUMBERS[name])
         drawn += [] if picture is None else [picture]
     return drawn
 
@@ -202,8 +190,8 @@ def _sweeps(results: Results) -> list[Section]:
         if any(isinstance(value, str) for value in vary.values) or len(vary.values) < 2:
             continue
         charts = [
-            sweep_chart(vary.field, COLUMNS[name], _lines(results, vary.field, name))
-            for name in ("success", "completion", "beam_error_mean_mm", "in_view")
+            sweep_chart(vary.field, NUMBERS[name], _lines(results, vary.field, name))
+            for name in EXPERIMENT_TASK.swept
             if name in results.settings[0].overall
         ]
         sections.append(Section(f"Over {vary.field}", [Gallery(charts)]))
@@ -234,7 +222,7 @@ def _design(results: Results) -> Section:
         )
         for phase in spec.phases
     ]
-    header = ["phase", "laser arm", "endoscope arm", "beam", "goes on when", "longest"]
+    header = ["phase", "laser arm", "endoscope arm", "beam", "next phase when", "longest"]
     faults = [
         f"{fault.arm}: chamber {fault.chamber} goes to 0 kPa from {fault.at_s:g} s on"
         for fault in spec.faults

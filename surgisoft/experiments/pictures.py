@@ -1,4 +1,4 @@
-"""Pictures of an experiment's episodes: what the endoscope saw, as a strip."""
+"""Picture files of an experiment: charts of episodes, and film strips of the endoscope."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GAP_PX = 6
 
 
 def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
-    """The endoscope's pictures at `count` moments from the beam's first light to the end."""
+    """Film strip: the endoscope's pictures at `count` moments from the first beam to the end."""
     from PIL import Image
 
     from surgisoft.replay.endoscope import jpegs

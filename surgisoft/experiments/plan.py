@@ -1,4 +1,4 @@
-"""What an experiment plays: every case on every lesion with every combination of what varies."""
+"""Settings of an experiment: every case on every lesion with every combination of what varies."""
 
 from __future__ import annotations
 
@@ -8,26 +8,33 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from surgisoft.agents.on_rig import RigConfig, on_rig
-from surgisoft.config import Where
+from surgisoft.config import Where, merged, to_table
 from surgisoft.errors import InputError
-from surgisoft.experiments.controllers import PhasedAblation
-from surgisoft.experiments.spec import Case, Experiment, Lesion, Vary, merged, task_config
+from surgisoft.experiments.phases import PhasedTask
+from surgisoft.experiments.spec import (
+    EXPERIMENT_TASK,
+    Case,
+    Experiment,
+    Lesion,
+    Vary,
+    task_config,
+)
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.scene.folder import Scene, open_scene
-from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.registry import config_table, with_present_names
+from surgisoft.tasks.circle_ablation import CircleAblationConfig
+from surgisoft.tasks.registry import with_present_names
 
 Value = int | float | str
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One condition of the experiment; `repeats` episodes are played in it."""
+    """One condition of the experiment, with `repeats` episodes."""
 
     number: int
     """Its place among all."""
     case: Case
-    """Who plays, on what."""
+    """Policy and plant."""
     lesion: Lesion | None
     """Where is cut; None: the scene's own lesion."""
     values: tuple[tuple[str, Value], ...]
@@ -42,7 +49,7 @@ class Setting:
 
     @property
     def words(self) -> str:
-        """The same for a person."""
+        """The label in words."""
         parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
         return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
 
@@ -104,7 +111,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
 
 def _configured(spec: Experiment, values) -> CircleAblationConfig:
     """The task's configuration with what varies; the scene is still a folder's name."""
-    table = config_table(spec.task)
+    table = to_table(spec.task)
     for field, value in values:
         top, _, name = field.partition(".")
         if top == "task":
@@ -119,7 +126,7 @@ def _configured(spec: Experiment, values) -> CircleAblationConfig:
 
 
 def rig_config(setting: Setting, place: Where) -> RigConfig | None:
-    """The bench of a setting; None in simulation."""
+    """The rig of a setting; None in simulation."""
     varied = dict(setting.values)
     if setting.case.plant != "rig":
         return None
@@ -162,15 +169,14 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
     return moved
 
 
-def build_task(spec: Experiment, setting: Setting) -> PhasedAblation:
+def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     """The phased task of a setting, its arms on the rig where the case says so."""
     config = _configured(spec, setting.values)
     arm = setting.case.arm or config.arm
     config = dataclasses.replace(config, arm=arm, scene=spec.scene)
-    base = CircleAblation(dataclasses.replace(config, scene=scene_of(spec, setting)))
-    base.config = config
+    base = EXPERIMENT_TASK.build(config, scene_of(spec, setting))
     rig = rig_config(setting, Where(Path(spec.name)))
     varied = {f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")}
     faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
     spec = dataclasses.replace(spec, faults=faults)
-    return PhasedAblation(base if rig is None else on_rig(base, rig), spec)
+    return PhasedTask(EXPERIMENT_TASK.supervise(base if rig is None else on_rig(base, rig)), spec)

@@ -1,4 +1,4 @@
-"""What an experiment brought: tables of episodes and settings, logs of the first and the worst."""
+"""Results of an experiment: tables of episodes and settings, logs of the first and the worst."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.agents.evaluate import RATES, Summary, summary
-from surgisoft.experiments.play import Row, badness
 from surgisoft.experiments.run import log_file
-from surgisoft.experiments.spec import Experiment
+from surgisoft.experiments.spec import EXPERIMENT_TASK, Experiment
+from surgisoft.experiments.task import Row
 from surgisoft.files import write_atomically, write_json
 from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
@@ -41,17 +41,17 @@ class SettingResult:
     @property
     def worst(self) -> int:
         """Number of the worst episode."""
-        return max(self.rows, key=badness)["episode"]
+        return max(self.rows, key=EXPERIMENT_TASK.badness)["episode"]
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All of an experiment."""
+    """All results of an experiment."""
 
     experiment: Experiment
-    """What was asked for."""
+    """The experiment."""
     folder: Path
-    """Where it lies."""
+    """Its folder."""
     settings: list[SettingResult]
     """Every setting, in order."""
 
@@ -63,7 +63,7 @@ class Results:
     @property
     def worst(self) -> tuple[str, int]:
         """Label and number of the worst episode of all."""
-        row = max(self.rows, key=badness)
+        row = max(self.rows, key=EXPERIMENT_TASK.badness)
         return row["setting"], row["episode"]
 
     def log(self, label: str, episode: int) -> EpisodeLog:
@@ -72,7 +72,7 @@ class Results:
 
 
 def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
-    """The results out of every row."""
+    """Summarise the rows of all episodes."""
     varied = ["lesion", *(vary.field for vary in spec.vary)]
     found = []
     for label in dict.fromkeys(row["setting"] for row in rows):

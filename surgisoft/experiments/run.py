@@ -1,4 +1,4 @@
-"""Plays a whole experiment into a folder: block by block, over processes, resumed after a break.
+"""Runs a whole experiment into a folder: block by block, over processes, resumed after a break.
 
 The blocks, not the processes, decide what is computed together; so one process and many, a run in
 one go and one that was interrupted give the same rows.
@@ -6,27 +6,53 @@ one go and one that was interrupted give the same rows.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
-import torch
+import numpy as np
+from torch import Tensor
 
+from surgisoft.agents.evaluate import episode_table
+from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks
+from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
 from surgisoft.errors import InputError
-from surgisoft.experiments.plan import Setting, scene_of, settings
-from surgisoft.experiments.play import Row, opened, play_block
-from surgisoft.experiments.spec import FILE, Experiment, load_experiment, save_experiment
-from surgisoft.files import write_json
+from surgisoft.experiments.controllers import PhaseControllers
+from surgisoft.experiments.phases import REASONS, PhasedTask, with_phase_events
+from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
+from surgisoft.experiments.spec import (
+    EXPERIMENT_TASK,
+    FILE,
+    Experiment,
+    load_experiment,
+    save_experiment,
+)
+from surgisoft.experiments.task import Row
+from surgisoft.files import json_safe, write_json
+from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
-from surgisoft.workers import workers
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.workers import torch_threads, workers
 
-Report = Callable[[float, float, str], None]
+DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
+"""Measures of single steps whose means mean nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Results of episodes that ran side by side."""
+
+    rows: list[Row]
+    """One for each, see `Results`."""
+    logs: dict[int, EpisodeLog]
+    """Episode's number -> log: number 0, and the worst of the block."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +87,7 @@ def log_file(folder: Path, setting: str, episode: int) -> Path:
 
 
 def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bool = False) -> None:
-    """Make the folder of results, or check that this experiment goes on in it."""
+    """Make the folder of results, or check that it holds results of this experiment."""
     there = (folder / FILE).is_file()
     if there and resume and not force:
         if load_experiment(folder / FILE) != spec:
@@ -88,9 +114,9 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
 
 
 def check_playable(spec: Experiment) -> None:
-    """Raise unless every lesion lies on the organ and every driver fits its arm.
+    """Raise an InputError unless lesions lie on the organ and controllers fit their arms.
 
-    In simulation, whatever the case: what a driver sees and moves is the same on the rig.
+    Checked in simulation for every case: observations and actions are the same on the rig.
     """
     found, seen = settings(spec), set()
     for setting in {setting.lesion: setting for setting in found}.values():
@@ -104,29 +130,29 @@ def check_playable(spec: Experiment) -> None:
 
 
 def run_experiment(
-    spec: Experiment, folder: Path, processes: int = 1, report: Report | None = None
+    spec: Experiment, folder: Path, processes: int = 1, report: Progress = silent
 ) -> list[Row]:
-    """Play every block that is not there yet; all rows, in order. See `open_results`."""
-    every, told = jobs(spec), report or (lambda done, total, note: None)
+    """Run every block that has no results yet; returns all rows, in order. See `open_results`."""
+    every = jobs(spec)
     left = [job for job in every if not _is_done(folder, job)]
     total = float(sum(job.count for job in every))
     done = total - sum(job.count for job in left)
-    told(done, total, "")
+    report(done, total, "")
     if processes == 1:
-        with _one_thread():
+        with torch_threads(1):
             for job in left:
                 began = done
 
-                def within(step, steps, job=job, began=began) -> None:
-                    told(began + job.count * step / steps, total, job.setting.words)
+                def within(step, steps, note="", job=job, began=began) -> None:
+                    report(began + job.count * step / steps, total, job.setting.words)
 
-                _play(spec, folder, job, within)
+                _run_block(spec, folder, job, within)
                 done += job.count
-                told(done, total, job.setting.words)
+                report(done, total, job.setting.words)
     else:
         for job in _in_processes(spec, folder, left, processes):
             done += job.count
-            told(done, total, job.setting.words)
+            report(done, total, job.setting.words)
     return [
         json.loads(row_file(folder, job.setting, job.first + i).read_text())
         for job in every
@@ -139,9 +165,9 @@ def _is_done(folder: Path, job: Job) -> bool:
     return all(file.is_file() for file in files)
 
 
-def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
-    """Play a block; its logs are written first, then each episode's row, whole or not at all."""
-    block = play_block(spec, job.setting, job.first, job.count, progress)
+def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = silent) -> None:
+    """Run a block; its logs are written first, then each episode's row, whole or not at all."""
+    block = roll_out_block(spec, job.setting, job.first, job.count, progress)
     for number, log in block.logs.items():
         save_episode(log, log_file(folder, job.setting.label, number))
     for row in block.rows:
@@ -149,14 +175,11 @@ def _play(spec: Experiment, folder: Path, job: Job, progress=None) -> None:
 
 
 def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
-    """Play the blocks in processes of their own; each block as it is done."""
-    from concurrent.futures import as_completed
-    from concurrent.futures.process import BrokenProcessPool
-
+    """Run the blocks in worker processes; yields each block as it is done."""
     try:
         prepare = partial(register_effect_files, registered_files())
         with workers(processes, prepare) as pool:
-            waiting = {pool.submit(_play, spec, folder, job): job for job in left}
+            waiting = {pool.submit(_run_block, spec, folder, job): job for job in left}
             for future in as_completed(waiting):
                 future.result()
                 yield waiting[future]
@@ -167,12 +190,89 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
         ) from None
 
 
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread, as in the processes: the order of sums decides about last digits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+@lru_cache(maxsize=1)
+def opened(spec: Experiment, setting: Setting) -> tuple[PhasedTask, PhaseControllers]:
+    """The task of a setting and its controllers; the last one is cached."""
+    task = build_task(spec, setting)
+    return task, PhaseControllers(spec, task, setting.case.policy)
+
+
+def roll_out_block(
+    spec: Experiment,
+    setting: Setting,
+    first: int,
+    count: int,
+    progress: Progress = silent,
+) -> Block:
+    """Roll out episodes `first` to `first + count - 1` of a setting."""
+    task, controllers = opened(spec, setting)
+    checks = ExactChecks(task)
+    recorders = EpisodeRecorders(task, setting.case.policy, spec.seed, setting.case.plant)
+
+    def watch(now: Instant) -> None:
+        checks(now)
+        recorders(now)
+
+    result = rollout(task, controllers, count, spec.seed, count, progress, watch, first)
+    rows = _rows(task, setting, first, result, checks.checks())
+    worst = max(rows, key=EXPERIMENT_TASK.badness)["episode"]
+    kept = {0, worst} & {row["episode"] for row in rows}
+    logs = {n: with_phase_events(task.experiment, recorders.log(n)) for n in sorted(kept)}
+    return Block(rows, logs)
+
+
+def _rows(
+    task: PhasedTask, setting: Setting, first: int, result: Rollout, checks: list[EpisodeCheck]
+) -> list[Row]:
+    table = episode_table(task, result, checks)
+    for name in DROPPED:
+        table.pop(name, None)
+    table |= _timings(task, result)
+    about: Row = {"setting": setting.label, "case": setting.case.name}
+    about |= {"lesion": setting.lesion.name} if setting.lesion else {}
+    about |= dict(setting.values)
+    outcomes = _outcomes(task, result, checks)
+    return [
+        about
+        | {"episode": first + i, "outcome": outcomes[i]}
+        | {name: json_safe(float(values[i])) for name, values in table.items()}
+        for i in range(result.episodes)
+    ]
+
+
+def _timings(task: PhasedTask, result: Rollout) -> dict[str, np.ndarray]:
+    """How long each phase took, the beam was on, and was on at the end of an unsafe step, s."""
+    steps = result.measures["phase"]
+    found = {
+        f"{phase.name}_s": (steps == number).sum(1) * task.dt_s
+        for number, phase in enumerate(task.phases)
+    }
+    found["beam_s"] = result.measures["beam"].nansum(1) * task.dt_s
+    unsafe = result.measures["beam_unsafe"].nan_to_num(0.0) > 0.0
+    found["beam_unsafe_longest_s"] = _longest(unsafe) * task.dt_s
+    return {name: value.double().cpu().numpy() for name, value in found.items()}
+
+
+def _longest(on: Tensor) -> Tensor:
+    """(N,) int64: the most steps in a row that (N, T) bool holds."""
+    best = run = on.new_zeros(len(on)).long()
+    for column in on.T:
+        run = (run + 1) * column
+        best = best.maximum(run)
+    return best
+
+
+def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck]) -> list[str]:
+    """How each episode ended, in words."""
+    reason, where = result.end("reason").tolist(), result.end("reason_phase").tolist()
+    names, found = [phase.name for phase in task.phases], []
+    for i, check in enumerate(checks):
+        if check.contact is not None:
+            found.append(f"contact of {check.contact.between[0]}, {check.contact.between[1]}")
+        elif result.failed[i]:
+            found.append("an arm is no longer finite")
+        elif reason[i]:
+            found.append(f"aborted in {names[int(where[i])]}: {REASONS[int(reason[i])]}")
+        else:
+            found.append("done" if result.terminated[i] else "time out")
+    return found

@@ -10,25 +10,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from surgisoft.config import Rule, Where, from_table, read_toml, write_toml
+from surgisoft.config import Rule, Where, from_table, merged, read_toml, to_table, write_toml
 from surgisoft.errors import InputError
-from surgisoft.experiments.conditions import CONDITIONS
+from surgisoft.experiments.ablation import ABLATION
 from surgisoft.scene.spec import Length, Point
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import config_table, with_present_names
+from surgisoft.tasks.registry import with_present_names
 
 FORMAT = 1
 """Version of the file's format."""
 FILE = "experiment.toml"
 """Name of the exact configuration in a folder of results."""
-TASK = "circle_ablation"
-"""The task that phases are laid over."""
-HANDS = ("hold", "rest", "scripted", "policy")
-"""Who may move an arm beside the drivers that the file names."""
+EXPERIMENT_TASK = ABLATION
+"""The task that experiments are made with."""
+TASK = EXPERIMENT_TASK.name
+"""Its name in the registry."""
+CONTROLLERS = ("hold", "rest", "scripted", "policy")
+"""Controllers of an arm beside those that the file defines."""
 PLANTS = ("simulation", "rig")
 """What the arms are."""
 SCRIPTED, NOMINAL = "scripted", "nominal"
-"""The task's solver, which knows the true state; and the same that believes the scene's mounts."""
+"""The task's expert, which knows the true state; the one that assumes the scene's mounts."""
 
 Name = Annotated[
     str,
@@ -59,12 +61,12 @@ class Phase:
     timeout_s: Positive
     """Longest time in this phase, s."""
     laser: Name = "hold"
-    """Who moves the laser arm: hold, rest, scripted, policy, or a driver's name."""
+    """Controller of the laser arm: hold, rest, scripted, policy, or one of `drivers`."""
     endoscope: Name = "hold"
-    """Who moves the endoscope arm."""
+    """Controller of the endoscope arm."""
     beam: bool = False
     """Whether the beam may be on; the interlock holds besides."""
-    until: Annotated[str, _one_of(CONDITIONS)] = "never"
+    until: Annotated[str, _one_of(EXPERIMENT_TASK.conditions)] = "never"
     """The condition to go on to the next phase."""
     within: Annotated[float, Rule("a number from -1 to 1000", lambda v: -1.0 <= v <= 1e3)] = -1.0
     """The condition's number, in its own unit; -1: the one it has by itself."""
@@ -75,8 +77,8 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class DriverSpec:
-    """A driver of one's own for an arm: a pressure schedule or waypoints."""
+class ControllerSpec:
+    """A user-defined controller of an arm: a pressure schedule or waypoints."""
 
     name: Name
     """By which phases call it."""
@@ -96,11 +98,11 @@ class Case:
     plant: Annotated[str, _one_of(PLANTS)] = PLANTS[0]
     """`simulation`: the arm models; `rig`: each arm on the virtual rig."""
     policy: str = SCRIPTED
-    """Who acts in phases that say `policy`: scripted, nominal, or a training run's folder."""
+    """Policy of phases that say `policy`: scripted, nominal, or a training run's folder."""
     hidden: tuple[str, ...] = ()
     """On the rig: hidden effects, NAME or NAME:STRENGTH."""
     specimen: Seed = 0
-    """On the rig: which arm was cast."""
+    """On the rig: seed of the virtual robot."""
     arm: str = ""
     """Arm model of both arms: default or a folder; without it the scene's."""
 
@@ -173,15 +175,15 @@ class Experiment:
     seed: Seed = 0
     """Of all episodes; each condition has the same ones."""
     together: Count = 8
-    """Episodes played at once: the unit of parallel work and of going on after a break."""
+    """Episodes that run side by side: the unit of parallel work and of resuming."""
     cases: tuple[Case, ...] = (Case(PLANTS[0]),)
     """What is compared side by side."""
     lesions: tuple[Lesion, ...] = ()
     """Where to cut; none: the scene's own lesion."""
     vary: tuple[Vary, ...] = ()
     """What takes several values."""
-    drivers: tuple[DriverSpec, ...] = ()
-    """Schedules and waypoints that phases name."""
+    drivers: tuple[ControllerSpec, ...] = ()
+    """User-defined controllers that phases name."""
     faults: tuple[Fault, ...] = ()
     """What breaks."""
     limits: Limits = field(default_factory=Limits)
@@ -195,7 +197,7 @@ class Experiment:
 
 
 def load_experiment(path: str | Path) -> Experiment:
-    """Read an experiment's file; whatever is wrong with it is one line."""
+    """Read an experiment's file; an InputError names file, line and field of what is wrong."""
     path = Path(path)
     table, where = read_toml(path)
     own = table.pop("task", {})
@@ -206,7 +208,7 @@ def load_experiment(path: str | Path) -> Experiment:
             raise (where / "task" / name).error(
                 "does not belong here", "the scene at the top, the arm in a case"
             )
-    plain = config_table(CircleAblationConfig()) | {"scene": ""}
+    plain = to_table(CircleAblationConfig()) | {"scene": ""}
     task = task_config(merged(plain, with_present_names(CircleAblationConfig(), own)), where)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
@@ -224,16 +226,9 @@ def task_config(table: dict, where: Where) -> CircleAblationConfig:
         ) from None
 
 
-def merged(base: Any, changes: Any) -> Any:
-    """A table with the fields of another one changed, at whatever depth they are."""
-    if not (isinstance(base, dict) and isinstance(changes, dict)):
-        return changes
-    return base | {key: merged(base.get(key), value) for key, value in changes.items()}
-
-
 def save_experiment(spec: Experiment, path: Path) -> None:
     """Write the exact configuration, with every default; loading it gives an equal one."""
-    table = _without_none(config_table(spec))
+    table = _without_none(to_table(spec))
     for name in ("scene", "arm"):
         table["task"].pop(name, None)
     folder = path.parent.resolve()
@@ -255,7 +250,7 @@ def _without_none(value: Any) -> Any:
 
 
 def _absolute(spec: Experiment, where: Where) -> Experiment:
-    """The same with absolute paths, each of which is there."""
+    """The experiment with absolute paths; raises an InputError for one that does not exist."""
     home = where.path.resolve().parent
 
     def there(text: str, place: Where, what: str) -> str:
@@ -273,7 +268,7 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
             arm = there(arm, place / "arm", "default, or an arm model's folder")
         return dataclasses.replace(case, policy=policy, arm=arm)
 
-    def of_driver(i: int, driver: DriverSpec) -> DriverSpec:
+    def of_driver(i: int, driver: ControllerSpec) -> ControllerSpec:
         if not driver.schedule:
             return driver
         place = where / "drivers" / i / "schedule"
@@ -288,7 +283,7 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
 
 
 def _check_whole(spec: Experiment, where: Where) -> None:
-    """What only several fields together can break."""
+    """Raise an InputError for fields that do not fit each other."""
     for name in ("phases", "cases", "lesions", "drivers"):
         _check_names(getattr(spec, name), where / name)
     for name in ("phases", "cases"):
@@ -297,8 +292,10 @@ def _check_whole(spec: Experiment, where: Where) -> None:
     own = [driver.name for driver in spec.drivers]
     for i, driver in enumerate(spec.drivers):
         place = where / "drivers" / i
-        if driver.name in HANDS:
-            raise (place / "name").error(f"got '{driver.name}'", f"none of {', '.join(HANDS)}")
+        if driver.name in CONTROLLERS:
+            raise (place / "name").error(
+                f"got '{driver.name}'", f"none of {', '.join(CONTROLLERS)}"
+            )
         if bool(driver.schedule) == bool(driver.waypoints):
             raise place.error("got both or neither", "either a schedule or waypoints")
         times = [row[0] for row in driver.waypoints]
@@ -306,9 +303,9 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             raise (place / "waypoints").error(f"times {times}", "times that rise from 0 s")
     for i, phase in enumerate(spec.phases):
         for arm in ("laser", "endoscope"):
-            if getattr(phase, arm) not in (*HANDS, *own):
+            if getattr(phase, arm) not in (*CONTROLLERS, *own):
                 raise (where / "phases" / i / arm).error(
-                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*HANDS, *own))}"
+                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*CONTROLLERS, *own))}"
                 )
     known = [phase.name for phase in spec.phases]
     if spec.limits.retreat not in ("", *known):

@@ -1,4 +1,4 @@
-"""Recordings as the tensors that arm models are fitted to and judged on."""
+"""Recordings as the tensors that arm models are fitted to and evaluated on."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.noise import known_noise
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History, pack
 
@@ -46,8 +46,8 @@ def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
 def history_of(recordings: list[Recording], actuation: str = "measured") -> History:
     """All runs of all recordings as one padded history.
 
-    A continuous run begins where its first measured actuation says; a settled one at rest, from
-    where its first point was approached.
+    A continuous run begins where its first measured actuation says; one of steady-state points
+    begins at rest, from where its first point was approached.
     """
     times, pressures, points, warmth, stood = [], [], [], [], []
     for recording in recordings:
@@ -79,9 +79,9 @@ def actuation_noise(recording: Recording, actuation: str = "measured") -> np.nda
     from those differences that are small beside the chamber's range. Robust by the median.
     """
     signal = actuation_of(recording, actuation)
-    answer = np.zeros(recording.chambers)
+    noise = np.zeros(recording.chambers)
     if actuation == "commanded":
-        return answer
+        return noise
     inside = np.diff(recording.run) == 0
     steps = np.diff(signal, axis=0)
     span = np.ptp(signal, axis=0)
@@ -92,8 +92,8 @@ def actuation_noise(recording: Recording, actuation: str = "measured") -> np.nda
             rest = inside & (np.abs(steps[:, chamber]) < BAND_SHARE[1] * span[chamber])
         if rest.sum() >= 10:
             # 1.4826: from the median absolute deviation to the standard deviation (normal noise).
-            answer[chamber] = 1.4826 * np.median(np.abs(steps[rest, chamber])) / np.sqrt(2)
-    return answer
+            noise[chamber] = 1.4826 * np.median(np.abs(steps[rest, chamber])) / np.sqrt(2)
+    return noise
 
 
 def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpec:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 LEAST_HOLD_S = 1.0
 """Shortest hold whose scatter is taken for noise, s."""
@@ -30,7 +30,7 @@ def stated_noise(recordings: list[Recording]) -> float | None:
 
 
 def hold_noise(recordings: list[Recording]) -> float | None:
-    """The same from the scatter in holds; None where there are too few.
+    """Standard deviation of one coordinate of a key point in holds, mm; None for too few holds.
 
     The scatter (after a straight line is taken out) misses noise slower than a hold.
     """
@@ -47,15 +47,15 @@ def _hold_variances(recording: Recording) -> list[float]:
     still = (np.abs(np.diff(signal, axis=0)) <= 1e-3 * np.where(span > 0, span, 1)).all(1)
     still &= np.diff(recording.run) == 0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
-    answer = []
+    found = []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         begin = (begin + end + 1) // 2
         time = recording.t_s[begin : end + 1]
         if len(time) >= LEAST_HOLD_ROWS and time[-1] - time[0] >= LEAST_HOLD_S:
             value = _scatter(time, recording.key_points_mm[begin : end + 1])
             if value is not None:
-                answer.append(value)
-    return answer
+                found.append(value)
+    return found
 
 
 def _scatter(time: np.ndarray, points: np.ndarray) -> float | None:

@@ -8,6 +8,8 @@ ROLE_COLOURS = {
     "support": (128, 136, 146),
 }
 """A body by its role."""
+ROLE_NAMES = {"organ": "red-brown", "keep-out": "olive green", "support": "grey"}
+"""Words for those colours."""
 ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196), "arm": (236, 226, 208)}
 """A soft body by its arm's name."""
 BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196, 132, 56)}
@@ -17,9 +19,9 @@ LESION_COLOUR = (214, 172, 118)
 LESION_TINT = 0.35
 """How far tissue inside the ring goes from the organ's colour to the lesion's."""
 PLAN_COLOUR = (255, 214, 64)
-"""Where something should be: ring, path, target."""
+"""Reference: ring, path, target."""
 REAL_COLOUR = (70, 225, 240)
-"""Where it is."""
+"""Actual path."""
 BEAM_COLOUR = (80, 255, 120)
 """The aiming beam is green, as in the endoscope's picture: red is lost on an organ."""
 CONE_COLOUR = (90, 200, 250)
@@ -36,7 +38,7 @@ SERIES = (
     (150, 150, 250),
     (200, 200, 200),
 )
-"""Lines of a plot, told apart by colour-blind eyes too (Okabe & Ito 2008), brightened for black."""
+"""Lines of a plot: safe for colour-blind viewers (Okabe & Ito 2008), lighter for black."""
 
 BLANCHED = (204, 186, 172)
 """Tissue at the threshold of ablation."""
@@ -45,7 +47,7 @@ CHARRED = (26, 20, 18)
 
 
 def series_colour(number: int) -> tuple[int, int, int]:
-    """The colour of a plot's line by its number; they come round."""
+    """The colour of a plot's line by its number, cyclic."""
     return SERIES[number % len(SERIES)]
 
 

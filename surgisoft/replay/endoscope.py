@@ -1,4 +1,4 @@
-"""What the endoscope saw: JPEG pictures drawn from an episode's log, and the camera's place."""
+"""Endoscope pictures rendered from an episode's log as JPEG, and the pose of the camera."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 from scipy.spatial import cKDTree
 
+from surgisoft.progress import Progress, silent
 from surgisoft.replay.colours import CONE_COLOUR, LESION_TINT
 from surgisoft.replay.recording import Columns
 from surgisoft.scene import frames
@@ -38,7 +39,11 @@ SAMPLE_MM = 0.4
 
 
 def log_camera(
-    columns: Columns, log: EpisodeLog, rows: np.ndarray, looks: np.ndarray, report=None
+    columns: Columns,
+    log: EpisodeLog,
+    rows: np.ndarray,
+    looks: np.ndarray,
+    report: Progress = silent,
 ) -> None:
     """The camera's pose in the log's `rows`, and its picture in `looks`."""
     arm, half = log.arms[ENDOSCOPE], 0.5 * log.camera.fov_rad
@@ -63,7 +68,7 @@ def log_camera(
     columns.send(f"{CAMERA}/picture", looks, shown)
 
 
-def jpegs(log: EpisodeLog, rows: np.ndarray, report=None) -> list[bytes]:
+def jpegs(log: EpisodeLog, rows: np.ndarray, report: Progress = silent) -> list[bytes]:
     """The endoscope's round picture in each of the log's `rows`, as JPEG files."""
     from PIL import Image
 
@@ -82,8 +87,7 @@ def jpegs(log: EpisodeLog, rows: np.ndarray, report=None) -> list[bytes]:
         file = io.BytesIO()
         Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
         files.append(file.getvalue())
-        if report is not None:
-            report(len(files), len(rows), "endoscope")
+        report(len(files), len(rows), "endoscope")
     return files
 
 

@@ -1,4 +1,4 @@
-"""How a replay is laid out: the scene large, the endoscope's picture and the plots beside it."""
+"""Layout of a replay: the scene large, the endoscope's picture and the plots beside it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from surgisoft.tasks.world.scene import ENDOSCOPE
 SCENE = "Scene"
 """Name of the 3D view."""
 TRAIL = "/path/real"
-"""What is shown from the start up to the present, not only as it is now."""
+"""Entity that is shown from the start up to the present, not only as it is now."""
+LEGEND = "/legend"
+"""Text that explains the colours of the 3D view."""
 
 
 def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint:
@@ -27,7 +29,9 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
     pairs = [cells[i : i + 2] for i in range(0, len(cells), 2)]
     rows = [pair[0] if len(pair) == 1 else rrb.Horizontal(*pair) for pair in pairs]
     shares = [1.5 if log.camera is not None and i == 0 else 1.0 for i in range(len(rows))]
-    left = rrb.Vertical(_scene(log), _events(), row_shares=[4.5, 1])
+    legend = rrb.TextDocumentView(origin=LEGEND, name="Colours")
+    below = rrb.Horizontal(_events(), legend, column_shares=[3, 2])
+    left = rrb.Vertical(_scene(log), below, row_shares=[4.0, 1])
     right = rrb.Vertical(*rows, row_shares=shares)
     return rrb.Blueprint(
         rrb.Horizontal(left, right, column_shares=[1.15, 1.0]),
@@ -82,7 +86,7 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
     ]
     return rrb.Spatial3DView(
         origin="/",
-        contents=["+ /**", f"- {CAMERA}/picture", "- /plots/**", "- /events"],
+        contents=["+ /**", f"- {CAMERA}/picture", "- /plots/**", "- /events", f"- {LEGEND}"],
         name=SCENE,
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=not log.bodies),

@@ -1,15 +1,15 @@
-"""An episode's log as a Rerun recording: everything that happened, in 3D and in plots."""
+"""An episode's log as a Rerun recording: scene in 3D, plots, endoscope pictures, events."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
+from surgisoft.progress import Progress, silent
 from surgisoft.replay.bodies import log_arm
 from surgisoft.replay.colours import (
     BEAM_COLOUR,
@@ -18,12 +18,13 @@ from surgisoft.replay.colours import (
     PLAN_COLOUR,
     REAL_COLOUR,
     ROLE_COLOURS,
+    ROLE_NAMES,
     paler,
     tissue_colours,
 )
 from surgisoft.replay.dosed_surface import dosed_surface
 from surgisoft.replay.endoscope import PICTURES_HZ, log_camera
-from surgisoft.replay.episode_blueprint import TRAIL, episode_blueprint
+from surgisoft.replay.episode_blueprint import LEGEND, TRAIL, episode_blueprint
 from surgisoft.replay.plots import plots_of
 from surgisoft.replay.recording import Columns, new_recording
 from surgisoft.replay.shapes import creased
@@ -69,12 +70,12 @@ def write_replay(
     log: EpisodeLog,
     path: str | Path,
     pictures_hz: float = PICTURES_HZ,
-    report: Callable[[float, float, str], None] | None = None,
+    report: Progress = silent,
 ) -> Replay:
     """Write the log as an .rrd file that opens by itself with a fitting layout.
 
-    `pictures_hz` endoscope pictures are drawn a second, which is nearly all that writing costs;
-    `report` is told (pictures drawn, pictures to draw, note).
+    pictures_hz: endoscope pictures for each second of the episode, which take nearly all of the
+    time. report: called with pictures drawn and to draw.
     """
     began, path = time.perf_counter(), Path(path)
     plots = plots_of(log)
@@ -95,6 +96,8 @@ def write_replay(
         for line in (line for plot in plots for line in plot.lines):
             columns.plot(line)
         _log_events(recording, log)
+        text = rr.TextDocument(legend(log), media_type="text/markdown")
+        recording.log(LEGEND, text, static=True)
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(log.time_s[-1]), cost)
 
@@ -148,7 +151,7 @@ def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) ->
 
 
 def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
-    """What is asked for once; the way that was gone, piece by piece; both points as they move."""
+    """The reference path once; the actual path, piece by piece; both points as they move."""
     closed = np.vstack((log.path_mm, log.path_mm[:1]))
     planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
     if planned:
@@ -180,7 +183,7 @@ def _unbroken(points_mm: np.ndarray) -> list[np.ndarray]:
 
 
 def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: float) -> None:
-    """Rings around where a whole body's points (R, k, 3) should be, a little wider than it."""
+    """Rings around the reference points (R, k, 3) of a whole body, a little wider than it."""
     count = targets.shape[1]
     turn = 2.0 * np.pi * np.arange(RING_CORNERS + 1) / RING_CORNERS
     flat = np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), axis=1)
@@ -206,6 +209,22 @@ def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     spots = rr.Points3D.columns(positions=ends[:, 1], radii=np.where(on, 0.8, 0.3))
     columns.recording.log("/beam/hit", rr.Points3D.from_fields(colors=BEAM_COLOUR), static=True)
     columns.send("/beam/hit", rows, spots)
+
+
+def legend(log: EpisodeLog) -> str:
+    """Markdown that names the colours of the 3D view, as far as the log has what they stand for."""
+    rows = [
+        ("yellow", "reference: path and target", True),
+        ("cyan", "actual path, while the beam is on" if log.beam else "actual path", True),
+        ("green line", "beam; thick while it is on", log.beam is not None),
+        ("blue lines", "field of view of the endoscope's camera", log.camera is not None),
+        ("pale, then black", "tissue below and above the dose of ablation", log.dose is not None),
+        ("white points", "key points as measured by the cameras", log.on == "rig"),
+    ]
+    lines = [f"- **{colour}**: {meaning}" for colour, meaning, shown in rows if shown]
+    roles = {body.role for body in log.bodies}
+    lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
+    return "\n".join(lines) + "\n"
 
 
 def _log_events(recording, log: EpisodeLog) -> None:

@@ -1,4 +1,4 @@
-"""Which plots a replay has, and their lines."""
+"""The plots of a replay and their lines."""
 
 from __future__ import annotations
 
@@ -11,10 +11,19 @@ from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import ArmLog
 
-SHARES = ("completion", "visited", "view_fraction")
+SHARES = ("completion", "visited", "view_fraction", "safe")
 """Measures that run from 0 to 1 together."""
-SHOWN_ELSEWHERE = ("success", "collided", "clearance_mm")
-"""Measures that events or another plot show."""
+SHOWN_ELSEWHERE = (
+    "success",
+    "collided",
+    "clearance_mm",
+    "phase",
+    "reason",
+    "reason_phase",
+    "beam",
+    "beam_unsafe",
+)
+"""Measures that events or another plot show; the last ones are those of experiments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +31,7 @@ class Line:
     """One line of a plot."""
 
     entity: str
-    """Where it is in the recording."""
+    """Its entity in the recording."""
     name: str
     """Its name in the legend."""
     values: np.ndarray
@@ -42,7 +51,7 @@ class Plot:
     lines: tuple[Line, ...]
     """Its lines."""
     legend: str | None = None
-    """The corner of the legend; None: the title says it all."""
+    """The corner of the legend; None: the title suffices."""
     group: str = ""
     """Plots of one group share a place as tabs."""
 
@@ -57,7 +66,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     others = {name: values for name, values in log.measures.items() if name not in taken}
     made = [Plot("Path error (mm)", _lines("error", errors), _corner(errors, "righttop"))]
     for name, arm in log.arms.items():
-        made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm)))
+        made.append(Plot(f"Pressure of {name} (kPa)", _pressures(name, arm), "righttop"))
     if shares:
         title = "Done, in sight (share)"
         made.append(Plot(title, _lines("share", shares), "rightbottom"))
@@ -73,7 +82,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
 
 
 def _corner(series: Mapping[str, np.ndarray], corner: str) -> str | None:
-    """A legend only where there is something to tell apart."""
+    """A legend where there is more than one line."""
     return corner if len(series) > 1 else None
 
 
@@ -85,13 +94,13 @@ def _lines(group: str, series: Mapping[str, np.ndarray]) -> tuple[Line, ...]:
 
 
 def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
-    """Each chamber's pressure, and thinner and darker what was commanded."""
+    """Each chamber's pressure, and its command, thinner and darker."""
     lines = []
     for i in range(arm.pressure_kPa.shape[1]):
         where, colour = f"/plots/pressure/{name}", series_colour(i)
         command, pressure = arm.command_kPa[:, i], arm.pressure_kPa[:, i]
-        lines.append(Line(f"{where}/c{i + 1}", f"c{i + 1}", command, paler(colour), 1.0))
-        lines.append(Line(f"{where}/p{i + 1}", f"p{i + 1}", pressure, colour))
+        lines.append(Line(f"{where}/c{i + 1}", f"command {i + 1}", command, paler(colour), 1.0))
+        lines.append(Line(f"{where}/p{i + 1}", f"chamber {i + 1}", pressure, colour))
     return tuple(lines)
 
 

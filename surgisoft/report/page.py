@@ -25,7 +25,7 @@ class Page:
     title: str
     """What was examined."""
     verdict: str
-    """The answer in one or two sentences: it stands on top."""
+    """The main result in one or two sentences, at the top of the page."""
     parts: Sequence[Part]
     """What follows, in order."""
     about: str = ""

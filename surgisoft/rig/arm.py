@@ -229,7 +229,7 @@ def tips_along(robot: Robot, loads: Loads, path: np.ndarray) -> np.ndarray:
 
 
 def no_equilibrium() -> InputError:
-    """The answer to loads that the rod cannot balance."""
+    """The error for loads that the rod cannot balance."""
     return InputError(
         "the virtual arm found no equilibrium: its loads are beyond what it can carry; "
         "use a lighter payload or a weaker effect"

@@ -1,24 +1,22 @@
-"""Drive a rig through a protocol: the same for the virtual rig and for a bench."""
+"""Collection of recordings: drive any rig, real or virtual, through a protocol."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress, silent
 from surgisoft.rig.interface import Rig, Sample
 
 
-def collect(
-    rig: Rig, protocol: Protocol, progress: Callable[[int, int], None] | None = None
-) -> Recording:
-    """Take a recording by commanding and reading, one sample after the other.
+def collect(rig: Rig, protocol: Protocol, progress: Progress = silent) -> Recording:
+    """Record a protocol on any object that satisfies `Rig`, sample after sample.
 
     progress: called with the number of samples done and to do.
     """
     check_fits(rig, protocol)
-    report = progress or (lambda done, total: None)
     per_run = [commands for _, commands in runs_of(protocol, rig.period_s)]
     total, done = sum(map(len, per_run)), 0
     samples: list[Sample] = []
@@ -35,7 +33,7 @@ def collect(
                 taken = rig.read()
             samples.append(taken)
             done += 1
-            report(done, total)
+            progress(done, total)
     start = samples[0].t_s
     temperatures = [s.temp_C for s in samples]
     return describe(
@@ -50,7 +48,7 @@ def collect(
 
 
 def check_fits(rig: Rig, protocol: Protocol) -> None:
-    """Say so when the protocol is for another rig."""
+    """Raise an InputError unless the rig can run the protocol."""
     if protocol.chambers != rig.chambers:
         raise InputError(
             f"protocol '{protocol.name}' commands {protocol.chambers} chambers, "

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from surgisoft.measurement.recordings.recording import ArmInfo
+from surgisoft.measurement.recordings import ArmInfo
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ code, no formulas.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -14,7 +13,8 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import ArmInfo, Recording
+from surgisoft.measurement.recordings import ArmInfo, Recording
+from surgisoft.progress import Progress, silent
 from surgisoft.rig import bench
 from surgisoft.rig.arm import (
     STANDARD_GRAVITY,
@@ -203,15 +203,12 @@ class VirtualRig:
         )
         return sample, Truth(frame.centres, frame.clean, frame.chamber)
 
-    def record(
-        self, protocol: Protocol, progress: Callable[[int, int], None] | None = None
-    ) -> tuple[Recording, Truth]:
+    def record(self, protocol: Protocol, progress: Progress = silent) -> tuple[Recording, Truth]:
         """Take a recording in compiled code, sample by sample equal to what `collect` takes.
 
         progress: called with the number of samples done and to do.
         """
         check_fits(self, protocol)
-        report = progress or (lambda done, total: None)
         runs = [commands for _, commands in runs_of(protocol, self.period_s)]
         total, done = sum(map(len, runs)), 0
         parts: list[Part] = []
@@ -221,7 +218,7 @@ class VirtualRig:
             for first in range(0, len(rows), size):
                 parts.append(self._part(protocol, rows[first : first + size]))
                 done += len(parts[-1].t_s)
-                report(done, total)
+                progress(done, total)
         t_s, commanded = (np.concatenate([part[k] for part in parts]) for k in range(2))
         columns = zip(*(part.frames for part in parts), strict=True)
         frames = bench.Frames(*(np.concatenate(column) for column in columns))

@@ -137,7 +137,8 @@ class AblationMap:
         )
         empty = [torch.zeros(size, device=self.device) for size in sizes]
         ring = torch.zeros(count, dtype=torch.int64, device=self.device) if ring is None else ring
-        return AblationState(*empty, *self._beam(point_mm, direction, on), ring)
+        sums = dict(zip(_SUMS, empty, strict=True))
+        return AblationState(**sums, **self._last(*self._beam(point_mm, direction, on)), ring=ring)
 
     def reset(
         self, state: AblationState, mask, point_mm, direction, on, in_place=False, ring=None
@@ -148,10 +149,10 @@ class AblationMap:
         """
         new = self._beam(point_mm, direction, on)
         old = (state.last_point_mm, state.last_direction, state.last_on)
-        beam = [
+        beam = (
             torch.where(mask.reshape(-1, *[1] * (o.ndim - 1)), n, o)
             for n, o in zip(new, old, strict=True)
-        ]
+        )
         kept = [getattr(state, name) for name in _SUMS]
         if in_place:
             for tensor in kept:
@@ -159,7 +160,8 @@ class AblationMap:
         else:
             kept = [_pick(mask, 0.0, tensor) for tensor in kept]
         ring = torch.zeros_like(state.ring) if ring is None else ring
-        return AblationState(*kept, *beam, torch.where(mask, ring, state.ring))
+        sums = dict(zip(_SUMS, kept, strict=True))
+        return AblationState(**sums, **self._last(*beam), ring=torch.where(mask, ring, state.ring))
 
     def advance(
         self, state: AblationState, point_mm, direction, on, power_w, dt_s: float, in_place=False
@@ -180,14 +182,19 @@ class AblationMap:
         before = torch.where(state.last_on[:, None], state.last_direction, aim)
         after = torch.where(on[:, None], aim, state.last_direction)
         middle = torch.nn.functional.normalize(before + after, dim=1)
-        tensors = (state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j)
+        tensors = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
         if not in_place:
-            tensors = tuple(t.clone() for t in tensors)
+            tensors = [t.clone() for t in tensors]
         deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
         dose, peak, band, area, joule = deposit(began, ended, middle, energy, state.ring, *tensors)
         return AblationState(
             dose, peak, band, area, joule, state.delivered_j + energy, point, aim, on, state.ring
         )
+
+    @staticmethod
+    def _last(point_mm, direction, on) -> dict[str, torch.Tensor]:
+        """The beam as the fields of a state."""
+        return {"last_point_mm": point_mm, "last_direction": direction, "last_on": on}
 
     def _beam(self, point_mm, direction, on):
         """The beam's end as float32, direction and flag; where either is not finite it is off."""

@@ -1,7 +1,7 @@
 """Make a scene from mesh files: read, repair, place the lesion, find mounts, write the folder."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
+from surgisoft.progress import Progress, silent
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
@@ -49,8 +50,6 @@ COARSE_RING = 36
 """Ring points while mounts are searched."""
 CROSSING = "surfaces cross, the outermost counts; faces buried inside"
 """How a body is told of whose surface crosses itself."""
-
-Report = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class NoMounts(InputError):
         self.notes = notes
 
 
-def prepare(request: Request, report: Report = lambda done, total, note: None) -> Prepared:
+def prepare(request: Request, report: Progress = silent) -> Prepared:
     """Read and repair every file; an InputError says why one cannot be used."""
     for role in request.roles:
         if role not in ROLES:
@@ -128,7 +127,8 @@ def prepare(request: Request, report: Report = lambda done, total, note: None) -
     if request.unit is not None and request.unit not in MM_PER_UNIT:
         raise unknown_name("unit", request.unit, MM_PER_UNIT)
     notes: list[str] = []
-    names, roles, meshes, scales = [], [], [], []
+    names: list[str] = []
+    roles, meshes, scales = [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         tell = partial(_tell, report, i, len(request.meshes), path.name)
         tell("reading")
@@ -191,7 +191,7 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[tuple[str, Mesh]]:
     return found
 
 
-def _tell(report: Report, number: int, count: int, name: str, what: str) -> None:
+def _tell(report: Progress, number: int, count: int, name: str, what: str) -> None:
     """What is done to file `number` of `count`; reading takes the first 5 % of the way."""
     report(5.0 * number / count, 100, f"{name}: {what}")
 
@@ -252,7 +252,7 @@ def author(
     reaches: dict[str, ArmReach],
     mounts: dict[str, MountSpec],
     name: str,
-    report: Report = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> Authored:
     """The whole way from mesh files to a checked scene; nothing is written.
 
@@ -279,7 +279,7 @@ def author(
             request.camera,
             request.limits,
             {tool: mount.shaft_mm for tool, mount in mounts.items()},
-            lambda done, total, note, span=span: report(
+            lambda done, total, note="", span=span: report(
                 span[0] + span[1] * done / total / 2, 100, note
             ),
         )
@@ -344,6 +344,7 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
 
 
 def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
+    assert check.work is not None, "a scene that was chosen has its arms at work"
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"

@@ -6,7 +6,9 @@ Closed forms for capsules against rays and against each other; numpy and torch a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -152,7 +154,7 @@ def chain_normal(point_mm, centreline_mm, segment):
     start = segment[..., None, None]
     if isinstance(point_mm, torch.Tensor):
         start = start.expand(*segment.shape, 1, 3)
-        take = torch.take_along_dim
+        take: Callable[..., Any] = torch.take_along_dim
     else:
         take = np.take_along_axis
     a = take(centreline_mm, start, -2)[..., 0, :]

@@ -1,12 +1,12 @@
 """Judge a whole scene with the referee: meshes, lesion, both arms at rest and at work, the view."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
@@ -33,8 +33,6 @@ VIEW_EVERY = 3
 """The view is looked at with the beam on every third ring point: 15 degrees of the ring."""
 PLANNING_NODES = 150_000
 """Nodes of the distance fields for planning: coarse, since near the surface distances are exact."""
-
-Report = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class SceneCheck:
 
 def sentence(check: SceneCheck) -> str:
     """The verdict in one sentence."""
-    if check.good:
+    if check.good and check.work is not None:
         return (
             f"The scene is ready: the laser reaches {100 * check.work.covered:.0f} % of the ring, "
             f"the endoscope sees {100 * check.work.view.min():.0f} % of it, nothing comes closer "
@@ -107,7 +105,7 @@ def held_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, Held]:
 def check_scene(
     scene: Scene,
     reaches: dict[str, ArmReach],
-    report: Report = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> SceneCheck:
     """Everything a task relies on, decided by FCL on the meshes themselves.
 
@@ -123,7 +121,7 @@ def check_scene(
     return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
 
 
-def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Report) -> Work:
+def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Progress) -> Work:
     """The laser once around the ring beside the endoscope that looks at it."""
     limits, ring = scene.spec.limits, scene.ring
     cut = cut_ring(arms["laser"], ring, scene.spec.laser)

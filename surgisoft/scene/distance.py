@@ -124,7 +124,7 @@ def _exact(
     `best` is an upper bound of it to begin with. The segment that may come nearest goes first.
     """
     count = len(lows)
-    first = np.argmin(lows)
+    first = int(np.argmin(lows))
     for n in range(count):
         k = (first + n) % count
         if lows[k] < best and best > 0.0:

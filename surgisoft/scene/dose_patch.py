@@ -105,7 +105,10 @@ def cut_patches(
 
     As `cut_patch`; the rings lie near one another and have as many stations as the longest one.
     """
-    rings = [tuple(np.asarray(part, float) for part in ring) for ring in rings]
+    rings = [
+        (np.asarray(ring, float), np.asarray(normals, float), np.asarray(centre, float))
+        for ring, normals, centre in rings
+    ]
     for ring, normals, _ in rings:
         if ring.ndim != 2 or len(ring) < 3 or ring.shape != normals.shape:
             raise InputError(
@@ -138,8 +141,8 @@ def cut_patches(
                 "dose patch: stretches of the ring have no surface below them; move it"
             )
         shared = (points, normals, areas, faces)
-        own = (one.offset[chosen], station, zone, stations, one.length)
-        patches.append(DosePatch(*shared, *own, float(spacing_mm), buckets))
+        place = (one.offset[chosen], station, zone)
+        patches.append(DosePatch(*shared, *place, stations, one.length, float(spacing_mm), buckets))
     return tuple(patches)
 
 
@@ -308,7 +311,8 @@ def _fill_buckets(points: np.ndarray, cell: float) -> tuple[np.ndarray, Buckets]
     """The order (P,) that sorts points (P, 3) mm by bucket, and the buckets then."""
     origin = points.min(axis=0) - 1e-6
     index = np.floor((points - origin) / cell).astype(np.int64)
-    shape = tuple(int(n) for n in index.max(axis=0) + 1)
+    last = index.max(axis=0)
+    shape = (int(last[0]) + 1, int(last[1]) + 1, int(last[2]) + 1)
     flat = np.ravel_multi_index(tuple(index.T), shape)
     order = np.argsort(flat, kind="stable")
     starts = np.searchsorted(flat[order], np.arange(int(np.prod(shape)) + 1))

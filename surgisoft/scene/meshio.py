@@ -3,6 +3,7 @@
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def _load(path: Path) -> tuple[list[Part], int]:
     """Parts with faces, and the number of points in parts that have none."""
     import trimesh
 
-    options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+    options: dict[str, Any] = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
     try:
         scene = trimesh.load_scene(path, process=False, **options)
         order = {name: i for i, name in enumerate(scene.geometry)}

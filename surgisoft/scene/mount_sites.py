@@ -4,13 +4,14 @@ Mounts are drawn from how the arm stands at work: from where the beam comes, how
 the arm is bent then and to which side. Each is judged by the batched engine.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from surgisoft.progress import Progress
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
@@ -39,8 +40,6 @@ NEAR_RAD, NEAR_MM = np.radians(12.0), 6.0
 """How far from the best such a mount is tried at first: about the lesion (rad), along it (mm)."""
 COMFORT_MM = 10.0
 """Clearance beyond this is worth nothing more (mm)."""
-
-Report = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +78,7 @@ class LookSite:
     """Higher is better."""
 
 
-def directions_around(normal: np.ndarray, tilts_rad: Sequence[float], turns: int) -> np.ndarray:
+def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int) -> np.ndarray:
     """(D, 3) unit vectors at each tilt from `normal`, `turns` of them around; tilt 0 once."""
     frame = frames.rotation_from_z(normal)
     around = 2.0 * np.pi * np.arange(turns) / turns
@@ -127,7 +126,7 @@ def judge_lasers(
     laser: LaserSpec,
     limits: LimitsSpec,
     shaft_mm: float,
-    report: Report,
+    report: Progress,
 ) -> list[LaserSite]:
     """Laser mounts, best first; also those that cover only part of the ring."""
     low, high = laser.standoff_mm
@@ -143,7 +142,7 @@ def judge_lasers(
     return _best_first(judge, poses, ring, lambda site: site.good.all(), report, "laser mounts")
 
 
-def _best_first(judge, poses, ring: Ring, enough, report: Report, note: str) -> list:
+def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -> list:
     """Judge every pose; while none is enough, try around the best ones. Best first.
 
     The tries around a pose turn it about the lesion and move it along the line of sight, at random
@@ -232,7 +231,7 @@ def judge_looks(
     camera: CameraSpec,
     limits: LimitsSpec,
     shaft_mm: float,
-    report: Report,
+    report: Progress,
 ) -> list[LookSite]:
     """Endoscope mounts, best first."""
     radius = np.linalg.norm(ring.points_mm - ring.centre_mm, axis=1).max()

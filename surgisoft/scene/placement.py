@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from surgisoft.progress import Progress, silent
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
 from surgisoft.scene.distance import chains_apart
@@ -16,7 +17,6 @@ from surgisoft.scene.mount_sites import (
     COMFORT_MM,
     LaserSite,
     LookSite,
-    Report,
     judge_lasers,
     judge_looks,
     sees,
@@ -72,7 +72,7 @@ def find_mounts(
     camera: CameraSpec,
     limits: LimitsSpec,
     shafts_mm: dict[str, float],
-    report: Report = lambda done, total, note: None,
+    report: Progress = silent,
 ) -> tuple[list[Pair], Shortfall | None]:
     """Pairs of mounts, best first; or none and what was lacking.
 

@@ -108,6 +108,7 @@ def _join(vertices, faces, size, log):
             best = (open_edges, base, cleaned, counts, len(vertices) - len(used_indices(label)[0]))
         if open_edges == 0:
             break
+    assert best is not None, "the loop runs at least once"
     _, base, cleaned, counts, joined = best
     log["duplicate vertices joined"] = joined
     log["degenerate faces removed"], log["duplicate faces removed"] = counts
@@ -183,8 +184,8 @@ def _pairs(faces, vertices=None):
         for i in np.flatnonzero(count > 2):
             half_edges = order[start[i] : start[i] + count[i]]
             pairs.append(_around_edge(vertices, faces, half_edges, forward))
-    pairs = np.concatenate(pairs)
-    return pairs, forward[pairs[:, 0]] == forward[pairs[:, 1]]
+    paired = np.concatenate(pairs)
+    return paired, forward[paired[:, 0]] == forward[paired[:, 1]]
 
 
 def _around_edge(vertices, faces, half_edges, forward):

@@ -17,6 +17,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.mesh import ROLES
+from surgisoft.scene.packaged import packaged_scene
 
 FORMAT = 1
 FILE = "scene.toml"
@@ -210,14 +211,17 @@ class SceneSpec:
 
 
 def spec_path(path: str | Path) -> Path:
-    """The scene file of a scene folder (or the file itself)."""
-    path = Path(path)
+    """The scene file of a scene folder, of a packaged scene's name, or the file itself."""
+    path = packaged_scene(path)
     return path / FILE if path.is_dir() else path
 
 
 def load_spec(path: str | Path) -> SceneSpec:
-    """Read `scene.toml` (or a folder that holds one); every bad field is one line."""
-    path = Path(path)
+    """Read `scene.toml`, a folder that holds one, or a packaged scene by its name.
+
+    Every bad field is an error of one line.
+    """
+    path = packaged_scene(path)
     if not path.exists():
         raise InputError(f"{path}: there is no such scene; expected a folder with {FILE}")
     if path.is_dir() and not (path / FILE).exists():

@@ -8,17 +8,18 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as safetensors_bytes
 
 from surgisoft import __version__
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import make_effect, register_effect_files
+from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
 from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
 from surgisoft.surrogate.known_error import KnownError
-from surgisoft.surrogate.model import ArmModel, arm_facts
+from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 
 FORMAT = 1
@@ -29,9 +30,6 @@ DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "def
 
 OWN_FILES = ("config.json", "weights.safetensors", "report.json", KNOWN_ERROR)
 """What a model's folder is made of; a replaced model leaves other files where they are."""
-
-ON_WALL_LINES = ("rate_dependence", "softening", "stiffening")
-"""Effects whose parameters meant something else before their wall lines could stand in a ring."""
 
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
@@ -46,6 +44,26 @@ def _network_config(network) -> dict:
         if type(network) is kind:
             return {"kind": name, **{field: getattr(network, field) for field in fields}}
     raise TypeError(f"no checkpoint format for {type(network).__name__}")
+
+
+def _validation_config(validation: Validation) -> dict:
+    """A validation as it stands in the file: what is not known is left out."""
+    known = {name: value for name, value in asdict(validation).items() if value is not None}
+    return known if validation.rmse_mm is not None else {}
+
+
+def _opened(
+    folder: Path, name: str, facts: ArmFacts, arguments: dict, version: int | None
+) -> Effect:
+    """An effect of a file whose arguments and parameters were written by `version` of its class."""
+    kind = effect_class(name)
+    try:
+        arguments = kind.migrated(arguments, version)
+    except InputError as error:
+        raise InputError(
+            f"{folder}: effect '{name}' cannot be opened: {error}; fit or amend the model again"
+        ) from error
+    return kind(facts, **arguments)
 
 
 def claim_folder(folder: str | Path, force: bool = False) -> Path:
@@ -81,12 +99,14 @@ def save_model(
         "arm": asdict(model.spec),
         "network": _network_config(model.network),
         "effects": {name: effect.config() for name, effect in model.effects.items()},
+        "effect_versions": {name: effect.version for name, effect in model.effects.items()},
         "effect_files": files_of(model.effects),
-        "validation": model.validation,
+        "validation": _validation_config(model.validation),
     }
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
-        save_file(weights, fresh / "weights.safetensors")
+        # Not by `save_file`, which makes a file that only its owner can read.
+        (fresh / "weights.safetensors").write_bytes(safetensors_bytes(weights))
         (fresh / "config.json").write_text(json.dumps(config, indent=2) + "\n")
         if report is not None:
             (fresh / "report.json").write_text(json.dumps(report, indent=2) + "\n")
@@ -140,19 +160,20 @@ def load_model(
         if kind not in NETWORKS:
             raise unknown_name("network", kind, NETWORKS)
         check_files(config.get("effect_files", {}), str(folder))
-        for name, arguments in config["effects"].items():
-            if name.split("#")[0] in ON_WALL_LINES and "ring" not in arguments:
-                raise InputError(
-                    f"{folder}: its {name} was fitted by an earlier surgisoft, whose parameters "
-                    "meant something else; fit or amend the model again"
-                )
         facts = arm_facts(spec, weights["rest_mm"])
+        versions = config.get("effect_versions", {})
         effects = {
-            name: make_effect(name, facts, **arguments)
+            name: _opened(folder, name, facts, arguments, versions.get(name))
             for name, arguments in config["effects"].items()
         }
+        validation = dict(config["validation"])
+        points = tuple(validation.pop("per_key_point_mm", ()))
         model = ArmModel(
-            spec, NETWORKS[kind][0](low, high, **network), effects, None, config["validation"]
+            spec,
+            NETWORKS[kind][0](low, high, **network),
+            effects,
+            None,
+            Validation(per_key_point_mm=points, **validation),
         )
         model.load_state_dict(weights)
     except InputError:

@@ -1,16 +1,17 @@
-"""What a recording excites: which inputs of a model it can support.
+"""Fit a model by forward selection: pressure, then effects with memory, then directions.
 
-A network cannot tell an input's effect from the pressure's where the pressure already says what
-that input is. After a plain traverse of the pressure cube the slow chamber has only ever risen:
-its direction is a constant, its memory a function of its pressure. And where a chamber has only
-ever swept its whole range, nothing says what a small reversal does.
+First the excitation of the recordings decides which inputs they can identify. A network cannot
+separate an input from the pressure where the input is a function of the pressure. After a plain
+traverse of the pressure cube the slow chamber has only ever risen: its direction is a constant, its
+memory a function of its pressure. And where a chamber has only ever swept its whole range, the data
+does not show what a small reversal does.
 """
 
 import copy
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 import torch
@@ -19,13 +20,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import known_effects, make_effect
+from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
+from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
     CHECK_EVERY,
     Data,
@@ -100,7 +101,7 @@ def excitation(
 ) -> list[ChamberExcitation]:
     """What a history excites, one answer a chamber; low, high, band (m,) in the arm's unit."""
     rest = torch.zeros_like(low).clamp(low, high)
-    _, direction = directions.trace(history.pressure, band, rest)
+    _, direction = direction_scan(history.pressure, band, rest)
     pressure = history.rows(history.pressure)
     span = (high - low).where(high > low, torch.ones_like(low))
     scaled = ((pressure - low) / span).double().numpy()
@@ -223,7 +224,7 @@ class FitResult:
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
     known: KnownError | None = None
-    """Where the model is off on the rows that it was fitted to and judged on."""
+    """Training residuals: those on the rows that the model was fitted to and validated on."""
 
     def report(self) -> dict:
         """What happened, for a JSON file beside the model."""
@@ -250,10 +251,10 @@ class FitResult:
         lines += [f"note: {warning}" for warning in self.warnings]
         error = self.model.validation
         points = " ".join(
-            "-" if value is None else f"{value:.4f}" for value in error["per_key_point_mm"]
+            "-" if value is None else f"{value:.4f}" for value in error.per_key_point_mm
         )
         lines.append(
-            f"held-out RMSE {error['rmse_mm']:.4f} mm over {error['rows']} rows; "
+            f"held-out RMSE {error.rmse_mm:.4f} mm over {error.rows} rows; "
             f"key points base to tip: {points} mm"
         )
         return lines
@@ -287,11 +288,11 @@ def fit(
             _stage(candidate, name, epochs, config, data, result, progress)
         rows = data.judging_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
-    if data.judge.noise_mm is not None:
-        result.model.validation["noise_mm"] = data.judge.noise_mm
-    if not math.isfinite(result.model.validation["rmse_mm"]):
+    validation = replace(result.model.validation, noise_mm=data.judge.noise_mm)
+    result.model.validation = validation
+    if not math.isfinite(validation.rmse_mm):
         raise InputError("the fit did not come to a finite error; check the recordings' key points")
-    for number, value in enumerate(result.model.validation["per_key_point_mm"]):
+    for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
             result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
@@ -323,7 +324,7 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
     predicted, measured = held_rows(model, data)
     model.validation = validated_error(measured, predicted)
     result.model = model
-    result.stages.append(StageReport("recurrent", model.validation["rmse_mm"], epochs, 0.0, True))
+    result.stages.append(StageReport("recurrent", model.validation.rmse_mm, epochs, 0.0, True))
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
@@ -362,7 +363,7 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
 
 
 def _stages(config: FitConfig) -> list[str]:
-    """Names of the stages: with memory in place, a direction has to earn its place last."""
+    """Names of the stages in order; the direction comes last, after the effects with memory."""
     if config.network == "constant_curvature":
         return ["constant curvature"]
     names = ["pressure", *config.effects]
@@ -372,7 +373,7 @@ def _stages(config: FitConfig) -> list[str]:
 
 
 def _stage_epochs(name: str, stages: list[str], config: FitConfig) -> int:
-    """Epochs of a stage: the richest has most, those that lead to it few."""
+    """Epochs of a stage: the last has most, those that lead to it few."""
     share = 1.0
     if name in config.effects:
         share = EFFECT_SHARE
@@ -387,13 +388,13 @@ class _Support:
 
     chambers: list[ChamberExcitation]
     judged_inside: bool
-    """Whether the judging data reverses inside the range in every chamber."""
+    """Whether the validation data reverses inside the range in every chamber."""
 
     def use(self, name: str) -> Tensor:
         """(m,) 1 for each chamber whose direction or memory may be used, else 0.
 
         A memory needs inner reversals to be learned. A direction that was only seen in full
-        sweeps may still be right: that is left to judging data which has inner reversals.
+        sweeps may still be right: validation data with inner reversals decides.
         """
         lenient = name == "direction" and self.judged_inside
         return torch.tensor(
@@ -405,7 +406,7 @@ def _possible(result: FitResult, name: str, config: FitConfig, support: _Support
     """Whether the recordings support a stage in any chamber; notes those that they do not."""
     if name in ("pressure", "constant curvature") or not config.check_excitation:
         return True
-    if name != "direction" and not known_effects()[name].needs_reversals:
+    if name != "direction" and not hypothesis_of(known_effects()[name]).needs_reversals:
         return True
     use = support.use(name)
     for chamber, used in zip(support.chambers, use, strict=True):
@@ -428,11 +429,10 @@ def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, tr
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
     grown = copy.deepcopy(model)
     if name == "direction":
-        grown.network = grown.network.with_directions(use)
-        return grown
+        return grown.replace(network=grown.network.with_directions(use))
     effect = make_effect(name, model.facts)
     effect.use_chambers(use)
-    return ArmModel(spec, grown.network, {**grown.effects, name: effect})
+    return grown.replace(effects={**grown.effects, name: effect})
 
 
 def _stage(
@@ -440,8 +440,8 @@ def _stage(
 ) -> None:
     """Train one stage and keep it if held-out data rewards it.
 
-    What it is held against is the simpler model trained just as long: a gain must come from what
-    was added, not from the training.
+    It is compared with the simpler model trained for the same number of epochs, so that a gain must
+    come from the addition and not from the training.
     """
     begin = time.perf_counter()
     done = train_model(candidate, data, name, epochs, config, result.loss, progress)
@@ -465,7 +465,7 @@ def _stage(
 
 
 def _square(model: ArmModel, data: Data) -> Tensor:
-    """(S, n, 3) squared error in mm^2 on the judging rows; NaN where missing."""
+    """(S, n, 3) squared error in mm^2 on the validation rows; NaN where missing."""
     rows = data.judging_rows(model)
     return (model_rows(model, rows) - rows.target).square()
 

@@ -1,4 +1,4 @@
-"""Actuation and shape over time, as tensors: what models are fitted to and judged on."""
+"""Actuation and key points over time, as tensors: what models are fitted to and validated on."""
 
 from dataclasses import dataclass
 
@@ -72,7 +72,7 @@ class History:
         )
 
     def to(self, device) -> "History":
-        """The same on another device."""
+        """This history on another device."""
         return History(
             self.t_s.to(device),
             self.pressure.to(device),

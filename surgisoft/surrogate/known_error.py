@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from surgisoft.surrogate.history import History
@@ -49,7 +49,7 @@ class KnownError:
 
     def save(self, folder: Path) -> None:
         """Write it into a model's folder."""
-        save_file(asdict(self), folder / FILE)
+        (folder / FILE).write_bytes(save(asdict(self)))
 
     @classmethod
     def load(cls, folder: Path) -> "KnownError | None":

@@ -1,14 +1,14 @@
-"""The arm model: line effects -> material effects -> network -> body effects -> sensor effects."""
+"""The arm model: a network between line and material effects in front, body and sensor behind."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate import direction as directions
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.chain import Chain, Taps
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
@@ -19,28 +19,29 @@ if TYPE_CHECKING:
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
 share of its range."""
-STOOD_S = 10.0
-"""Time for which an arm has stood where a run begins away from rest, s."""
-NETWORK = "network"
-"""Key of a remembering network's state in `ArmState.memory`."""
+
+Network = HawNN | ConstantCurvature | RecurrentArm
+"""What may stand in the middle of the chain."""
 
 
 @dataclass(frozen=True)
-class Trace:
-    """What the network and the material effects see in each row of a history."""
+class Validation:
+    """Error of a model on the validation rows of its fit."""
 
-    pressure: Tensor
-    """(R, T, m) chamber pressure, after the line effects."""
-    direction: Tensor
-    """(R, T, m) direction of change."""
-    memory: dict[str, Tensor]
-    """(R, T, ...) memory of each line and material effect."""
+    rmse_mm: float | None = None
+    """RMSE of the distance of all key points, mm; None where the model was never validated."""
+    per_key_point_mm: tuple[float | None, ...] = ()
+    """RMSE of each key point's distance, base to tip, mm; None where it was never measured."""
+    rows: int = 0
+    """Number of validation rows."""
+    noise_mm: float | None = None
+    """Standard deviation of one coordinate of the key points in those rows, mm, where known."""
 
 
 class ArmModel(nn.Module):
-    """Batched, differentiable arm: `step` for worlds, `predict` for whole recordings.
+    """Batched, differentiable arm: `step` advances worlds, `predict` takes whole recordings.
 
-    Both are built from the same `advance`, `scan` and `apply` of each part and agree.
+    Both walk the same `Chain` and agree.
     """
 
     training_residuals: "KnownError | None" = None
@@ -49,19 +50,19 @@ class ArmModel(nn.Module):
     def __init__(
         self,
         spec: ArmSpec,
-        network: HawNN | ConstantCurvature | RecurrentArm,
+        network: Network,
         effects: dict[str, Effect] | None = None,
         rest_mm: Tensor | None = None,
-        validation: dict | None = None,
+        validation: Validation | None = None,
     ):
-        """`rest_mm` (n, 3): key points at rest, base frame; `validation`: the validated error."""
+        """`rest_mm` (n, 3): key points at rest, mm, base frame."""
         super().__init__()
         effects = effects or {}
         order = sorted(effects, key=lambda name: STAGES.index(effects[name].stage))
         self.spec = spec
         self.network = network
         self.effects = nn.ModuleDict({name: effects[name] for name in order})
-        self.validation = dict(validation or {})
+        self.validation = validation or Validation()
         rest = torch.zeros(spec.key_points, 3) if rest_mm is None else rest_mm.float()
         self.register_buffer("rest_mm", rest)
         self.register_buffer("band", torch.tensor(spec.band, dtype=torch.float32))
@@ -71,6 +72,36 @@ class ArmModel(nn.Module):
         self.register_buffer("idle", idle, persistent=False)
         self.register_buffer("rest", torch.tensor(spec.rest, dtype=torch.float32))
 
+    def replace(
+        self,
+        *,
+        spec: ArmSpec | None = None,
+        network: Network | None = None,
+        effects: dict[str, Effect] | None = None,
+        rest_mm: Tensor | None = None,
+        validation: Validation | None = None,
+    ) -> "ArmModel":
+        """A model with some parts replaced; it shares all others with this one.
+
+        Training residuals belong to the network and effects that were fitted together: a model
+        with another network or other effects has none.
+        """
+        fresh = ArmModel(
+            spec or self.spec,
+            network or self.network,
+            dict(self.effects) if effects is None else effects,
+            self.rest_mm if rest_mm is None else rest_mm,
+            validation or self.validation,
+        )
+        if network is None and effects is None:
+            fresh.training_residuals = self.training_residuals
+        return fresh.to(self.rest_mm.device).train(self.training)
+
+    @property
+    def chain(self) -> Chain:
+        """The links of this model."""
+        return Chain(self.network, self.effects, self.rest, self.band, self.still, self.idle)
+
     @property
     def facts(self) -> ArmFacts:
         """What effects may know of this arm, on the CPU."""
@@ -79,10 +110,6 @@ class ArmModel(nn.Module):
     def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
         """The effects of one stage, by name, in order."""
         return [(name, effect) for name, effect in self.effects.items() if effect.stage == stage]
-
-    def chambers(self, pressure: Tensor) -> Tensor:
-        """Chamber pressure (..., m) with the still chambers at where they stood."""
-        return torch.where(self.still, self.idle, pressure)
 
     @property
     def remembers(self) -> bool:
@@ -100,21 +127,7 @@ class ArmModel(nn.Module):
         """
         if pressure is None:
             pressure = self.rest.expand(batch, -1)
-        memory = {}
-        signal = pressure
-        for stage in ("line", "material"):
-            for name, effect in self.stage(stage):
-                memory[name] = effect.rest(signal)
-                signal = effect.apply(signal, memory[name])
-            signal = self.chambers(signal)
-        if self.remembers:
-            memory[NETWORK] = self.network.rest(pressure)
-        if self.stage("body") or self.stage("sensor"):
-            points = self._network(signal, torch.zeros_like(pressure), memory)
-            for name, effect in self.stage("body") + self.stage("sensor"):
-                memory[name] = effect.rest(points)
-                points = effect.apply(points, memory[name])
-        return ArmState(pressure, pressure, torch.zeros_like(pressure), memory)
+        return self.chain.at_rest(pressure)[0]
 
     def first_pressure(self, history: History) -> Tensor:
         """(R, m) actuation at which each run begins, in the arm's unit.
@@ -133,75 +146,11 @@ class ArmModel(nn.Module):
     def first_state(self, pressure: Tensor) -> ArmState:
         """(R) arms before the first row of runs that begin at `first_pressure`, (R, m).
 
-        Nobody knows how such an arm came there. It is taken to have come straight from rest and to
-        have stood for STOOD_S: lags and oscillations have died away, the material remembers.
+        The recording does not tell how such an arm came there. The arm is taken to have come
+        straight from rest and to have stood for `STOOD_S`: lags and oscillations have died away,
+        the material remembers.
         """
-        return self.before(pressure)[0]
-
-    def before(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
-        """The same, and what an effect added behind the others of each stage sees there.
-
-        (R, m) for line and material, (R, n, 3) in mm for body and sensor.
-        """
-        state = self.initial_state(len(pressure))
-        seen = self._seen_at_rest(state)
-        away = (pressure != self.rest).any(-1)
-        if not away.any():
-            return state, seen
-        memory, there, signal = dict(state.memory), {}, pressure
-        for name, effect in self.stage("line"):
-            memory[name] = effect.rest(signal)
-            signal = effect.apply(signal, memory[name])
-        there["line"] = signal = self.chambers(signal)
-        context = Context(pressure.new_full((len(pressure),), STOOD_S), None, None, signal)
-        anchor, direction = directions.advance(state.anchor, state.direction, signal, self.band)
-        for name, effect in self.stage("material"):
-            memory[name], signal = effect.step(memory[name], signal, context)
-        hidden = memory
-        if self.remembers:
-            hidden = {NETWORK: self.network.advance(memory[NETWORK], signal, direction)}
-        points = self._network(signal, direction, hidden)
-        for stage in ("body", "sensor"):
-            for name, effect in self.stage(stage):
-                memory[name] = effect.rest(points)
-                points = effect.apply(points, memory[name])
-            there[stage] = points
-        for stage, signal in there.items():
-            seen[stage] = signal.where(away.view(-1, *[1] * (signal.ndim - 1)), seen[stage])
-        return state.where(away, ArmState(pressure, anchor, direction, memory)), seen
-
-    def first_memory(self, effect: Effect, seen: Tensor, signal: Tensor, first: Tensor) -> Tensor:
-        """Memory before the first row of an effect that is added behind the others of its stage.
-
-        seen: what `before` says of its stage; signal (R, ...): what it sees in the first row;
-        first (R, m): `first_pressure`.
-        """
-        memory = effect.rest(seen)
-        away = (first != self.rest).any(-1)
-        if effect.stage != "material" or not away.any():
-            return memory
-        context = Context(first.new_full((len(first),), STOOD_S), None, None, self.chambers(first))
-        stood = effect.advance(memory, signal, context)
-        return stood.where(away.view(-1, *[1] * (memory.ndim - 1)), memory)
-
-    def _seen_at_rest(self, state: ArmState) -> dict[Stage, Tensor]:
-        """What an effect added behind the others of each stage sees of arms at rest."""
-        seen, signal = {}, state.pressure
-        for stage in ("line", "material"):
-            for name, effect in self.stage(stage):
-                signal = effect.apply(signal, state.memory[name])
-            seen[stage] = signal = self.chambers(signal)
-        points = self._network(signal, torch.zeros_like(signal), state.memory)
-        for stage in ("body", "sensor"):
-            for name, effect in self.stage(stage):
-                points = effect.apply(points, state.memory[name])
-            seen[stage] = points
-        return seen
-
-    def _network(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
-        if self.remembers:
-            return self.network(pressure, direction, memory[NETWORK])
-        return self.network(pressure, direction)
+        return self.chain.standing(pressure)[0]
 
     def step(
         self,
@@ -217,64 +166,26 @@ class ArmModel(nn.Module):
         """
         pressure = state.pressure + dp
         dt = torch.as_tensor(dt, dtype=pressure.dtype, device=pressure.device).expand(len(pressure))
-        memory = dict(state.memory)
-        context = Context(dt, None, temperature_C)
+        return self.chain.step(state, pressure, Context(dt, None, temperature_C))
 
-        def advance(stage: Stage, signal: Tensor) -> Tensor:
-            for name, effect in self.stage(stage):
-                memory[name], signal = effect.step(memory[name], signal, context)
-            return signal
+    def trace(self, history: History) -> Taps:
+        """What the network and the effects in front of it see in each row of a history.
 
-        chamber = self.chambers(advance("line", pressure))
-        context = replace(context, pressure=chamber)
-        anchor, direction = directions.advance(state.anchor, state.direction, chamber, self.band)
-        effective = advance("material", chamber)
-        if self.remembers:
-            memory[NETWORK] = self.network.advance(memory[NETWORK], effective, direction)
-        points = advance("sensor", advance("body", self._network(effective, direction, memory)))
-        return ArmState(pressure, anchor, direction, memory), points
-
-    def trace(self, history: History) -> Trace:
-        """What `shape` needs in each row; every run starts from `first_pressure`."""
-        context = context_of(history)
-        start = self.first_state(self.first_pressure(history)).memory
-        memory, signal = {}, history.pressure
-        for name, effect in self.stage("line"):
-            memory[name] = effect.scan(start[name], signal, context)
-            signal = effect.apply(signal, memory[name])
-        chamber = signal = self.chambers(signal)
-        _, direction = directions.trace(chamber, self.band, self.rest)
-        for name, effect in self.stage("material"):
-            memory[name] = effect.scan(start[name], signal, context)
-            signal = effect.apply(signal, memory[name])
-        return Trace(chamber, direction, memory)
-
-    def effective(self, pressure: Tensor, memory: dict[str, Tensor]) -> Tensor:
-        """Effective actuation (..., m) from chamber pressure (..., m) and memories."""
-        for name, effect in self.stage("material"):
-            pressure = effect.apply(pressure, memory[name])
-        return pressure
+        Every run starts from `first_pressure`.
+        """
+        chain = self.chain
+        return chain.scan(history, self.first_pressure(history), chain.inner)
 
     def shape(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
-        """Key points (..., n, 3) in mm before body and sensor effects, of a static network."""
-        return self.network(self.effective(pressure, memory), direction)
+        """Key points (..., n, 3) in mm before body and sensor effects, of a static network.
+
+        Chamber pressure and direction (..., m) and memories are those of rows of a `trace`.
+        """
+        return self.chain.hold(pressure, direction, memory)
 
     def predict(self, history: History) -> Tensor:
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
-        trace = self.trace(history)
-        if self.remembers:
-            effective = self.effective(trace.pressure, trace.memory)
-            hidden = self.network.scan(effective, trace.direction)
-            points = self.network(effective, trace.direction, hidden)
-        else:
-            points = self.shape(trace.pressure, trace.direction, trace.memory)
-        outer = self.stage("body") + self.stage("sensor")
-        if outer:
-            context = replace(context_of(history), pressure=trace.pressure)
-            start = self.first_state(self.first_pressure(history)).memory
-            for name, effect in outer:
-                points = effect.apply(points, effect.scan(start[name], points, context))
-        return points
+        return self.chain.scan(history, self.first_pressure(history)).behind["sensor"]
 
     def summary(self) -> str:
         """One line: inputs, network, effects."""
@@ -294,8 +205,3 @@ def arm_facts(spec: ArmSpec, rest_mm: Tensor) -> ArmFacts:
     return ArmFacts(
         low, high, rest, rest_mm, spec.gravity, spec.length_mm, spec.unit, spec.temperature_C
     )
-
-
-def context_of(history: History) -> Context:
-    """(R, T) times and temperatures of a history, for the effects' memories."""
-    return Context(history.dt_s, history.t_s.float(), history.temperature_C)

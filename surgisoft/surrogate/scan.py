@@ -1,4 +1,8 @@
-"""Recurrences along recordings as plain compiled loops, for processors and without gradients."""
+"""Recurrences along recordings: play operators, linear lags, nonlinear lags, directions of change.
+
+Each solves y[t] = f(y[t - 1], u[t]) for whole runs (R, T, ...): on a processor and without
+gradients as a plain compiled loop, otherwise as a parallel scan that can be differentiated.
+"""
 
 from __future__ import annotations
 
@@ -174,3 +178,29 @@ def follow(
             if bool(settled.all()):
                 break
     return solve(lagged.detach())
+
+
+def direction_step(
+    anchor: Tensor, direction: Tensor, pressure: Tensor, band: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Confirmed actuation and direction of change (B, m) after a new actuation (B, m).
+
+    The direction is +1 for rising, -1 for falling actuation (Chen et al. 2025, eq. 1) and keeps its
+    last value while the actuation rests. A sensor never rests quite, so a move counts only once it
+    leaves a dead band around the last confirmed one: a play operator of half width `band` (m,),
+    whose motion gives the sign. Before the first confirmed move the direction is 0.
+    """
+    moved = anchor.clamp(pressure - band, pressure + band)
+    sign = (moved - anchor).sign()
+    return moved, sign.where(sign != 0, direction)
+
+
+def direction_scan(pressure: Tensor, band: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Confirmed actuation and direction of change (R, T, m) along actuations (R, T, m).
+
+    `direction_step` over whole runs, each of which starts from rest (m,) without a direction.
+    """
+    start = rest.expand(len(pressure), -1)
+    anchor = clamp_scan(pressure - band, pressure + band, start)
+    sign = anchor.diff(dim=1, prepend=start.unsqueeze(1)).sign()
+    return anchor, last_nonzero(sign)

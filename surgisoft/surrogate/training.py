@@ -1,4 +1,4 @@
-"""Rows of histories: what a static model sees in each, which are held out, and their error."""
+"""Training of a model: rows of histories, held-out rows, and Adam with memories through windows."""
 
 import copy
 import math
@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.effects import Context, Stage
+from surgisoft.surrogate.chain import Scanning, Signal, Taps
+from surgisoft.surrogate.effects import Context
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.model import ArmModel, Trace
+from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.networks import RecurrentArm, range_weights, weighted_mse
 
 HOLD_BLOCKS = 20
@@ -62,26 +63,26 @@ def measured_rows(history: History) -> Tensor:
 
 @dataclass(frozen=True)
 class Data:
-    """What a model is fitted to and what judges it."""
+    """Training and validation data of a fit."""
 
     train: History
     """Histories to fit to."""
     valid: History | None
-    """Histories that judge; None: the rows of `train` in `held` do."""
+    """Validation histories; None: the rows of `train` in `held` validate."""
     held: Tensor | None
     """(R, T) rows of `train` that are held out; None with a validation history."""
 
     @classmethod
     def split(cls, train: History, valid: History | None, seed: int) -> "Data":
-        """Judge by a validation history, or by held-out runs or blocks without one."""
+        """Validate on a validation history, or on held-out runs or blocks without one."""
         return cls(train, valid, hold_out(train, seed) if valid is None else None)
 
     @property
     def judge(self) -> History:
-        """The history that the judging rows are part of."""
+        """The history that the validation rows are part of."""
         return self.train if self.valid is None else self.valid
 
-    def fitted_rows(self, model: ArmModel, trace: Trace | None = None) -> Rows:
+    def fitted_rows(self, model: ArmModel, trace: Taps | None = None) -> Rows:
         """The rows to fit to, as the model sees them."""
         rows = make_rows(model, self.train, trace)
         if self.held is None:
@@ -89,7 +90,7 @@ class Data:
         return rows.take(~self.train.rows(self.held)[measured_rows(self.train)])
 
     def judging_rows(self, model: ArmModel) -> Rows:
-        """The rows that judge, as the model sees them."""
+        """The validation rows, as the model sees them."""
         if self.valid is not None:
             return make_rows(model, self.valid)
         held = self.train.rows(self.held)[measured_rows(self.train)]
@@ -104,7 +105,7 @@ class Data:
 
 
 def make_rows(
-    model: ArmModel, history: History, trace: Trace | None = None, block_rows: int = 25
+    model: ArmModel, history: History, trace: Taps | None = None, block_rows: int = 25
 ) -> Rows:
     """The measured rows of a history as the model sees them."""
     if trace is None:
@@ -137,16 +138,11 @@ def model_rows(model: ArmModel, rows: Rows) -> Tensor:
         )
 
 
-def validated_error(target: Tensor, predicted: Tensor) -> dict:
-    """Held-out error: RMSE of each key point's distance and of all, mm; and the number of rows."""
+def validated_error(target: Tensor, predicted: Tensor) -> Validation:
+    """Validation error of predicted against measured key points, both (S, n, 3) in mm."""
     square = (predicted - target).square().sum(-1)
-    return {
-        "rmse_mm": math.sqrt(float(square.nanmean())),
-        "per_key_point_mm": [
-            None if math.isnan(x) else math.sqrt(x) for x in square.nanmean(0).tolist()
-        ],
-        "rows": len(target),
-    }
+    points = [None if math.isnan(x) else math.sqrt(x) for x in square.nanmean(0).tolist()]
+    return Validation(math.sqrt(float(square.nanmean())), tuple(points), len(target))
 
 
 def normalise(network: nn.Module, history: History) -> None:
@@ -194,13 +190,13 @@ MEMORY_RATE = 10.0
 def train(
     model: ArmModel, data: Data, name: str, epochs: int, config, losses: list, progress
 ) -> int:
-    """Adam with a cosine schedule; the model ends as its best running average on judging rows.
+    """Adam with a cosine schedule; the model ends as its running average of least validation error.
 
     Memories are trained in the stages of effects only. Appends (name, epoch, training loss,
-    judging loss) to `losses`; returns the epochs done.
+    validation loss) to `losses`; returns the epochs done.
     """
     every = [p for effect in model.effects.values() for p in effect.memory_parameters()]
-    every += [p for _, effect in model.stage("line") for p in effect.strengths().values()]
+    every += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
     mine = {id(p) for p in every}
     deep = every if name in model.effects else []
     flat = [p for p in model.parameters() if id(p) not in mine]
@@ -250,7 +246,7 @@ def train(
     return epoch
 
 
-def _trace(model: ArmModel, data: Data) -> Trace:
+def _trace(model: ArmModel, data: Data) -> Taps:
     with torch.no_grad():
         return model.trace(data.train)
 
@@ -283,7 +279,7 @@ class _Through:
             ]
         )
 
-    def steps(self, trace: Trace) -> None:
+    def steps(self, trace: Taps) -> None:
         """A few steps, each through some windows that begin with the memory of the trace."""
         order = torch.randperm(len(self.starts), generator=self.generator)
         for number in range(MEMORY_STEPS):
@@ -299,29 +295,22 @@ class _Through:
             None if room is None else room[rows, columns],
         )
 
-    def _step(self, trace: Trace, starts: Tensor) -> None:
+    def _step(self, trace: Taps, starts: Tensor) -> None:
         last = trace.pressure.shape[1] - 1
         rows = starts[:, :1]
         columns = starts[:, 1:] + torch.arange(self.window)
         inside = columns <= last
         columns = columns.clamp(max=last)
         context = self._context(rows, columns)
-        rest = self.model.first_state(self.first[starts[:, 0]]).memory
-        first = starts[:, 1] == 0
-        memory = {}
-
-        def along(stage: Stage, signal: Tensor) -> Tensor:
-            for name, effect in self.model.stage(stage):
-                before = trace.memory[name][starts[:, 0], (starts[:, 1] - 1).clamp(min=0)]
-                begin = first.view(-1, *[1] * (before.ndim - 1))
-                start = torch.where(begin, rest[name], before)
-                memory[name] = effect.scan(start, signal, context)
-                signal = effect.apply(signal, memory[name])
-            return signal
-
-        chamber = self.model.chambers(along("line", self.history.pressure[rows, columns]))
-        along("material", chamber)
-        points = self.model.shape(chamber, trace.direction[rows, columns], memory)
+        chain = self.model.chain
+        rest = chain.standing(self.first[starts[:, 0]])[0].memory
+        first, start = starts[:, 1] == 0, {}
+        for name, memory in trace.memory.items():
+            before = memory[starts[:, 0], (starts[:, 1] - 1).clamp(min=0)]
+            start[name] = torch.where(first.view(-1, *[1] * (before.ndim - 1)), rest[name], before)
+        mode = Scanning(start, context, direction=trace.direction[rows, columns])
+        signal = chain.walk(Signal(self.history.pressure[rows, columns]), mode, chain.inner)
+        points = chain.hold(signal.pressure, signal.direction, mode.memory)
         wanted = torch.where(inside[..., None, None], self.targets[rows, columns], torch.nan)
         loss = weighted_mse(points.flatten(0, 1), wanted.flatten(0, 1), self.weights)
         self.optimiser.zero_grad(set_to_none=True)
@@ -350,7 +339,7 @@ BURN_IN = 32
 def train_recurrent(
     model: ArmModel, data: Data, epochs: int, rate: float, seed: int, progress=None
 ) -> tuple[list[tuple[str, int, float, float]], int]:
-    """Adam on windows; ends as the best on judging rows. Returns (losses, epochs done)."""
+    """Adam on windows; ends as the best on the validation rows. Returns (losses, epochs done)."""
     train = data.train
     generator = torch.Generator().manual_seed(seed)
     network: RecurrentArm = model.network
@@ -403,14 +392,14 @@ def train_recurrent(
 
 
 def held_rows(model: ArmModel, data: Data) -> tuple[Tensor, Tensor]:
-    """(predicted, measured) key points (S, n, 3) in mm on the judging rows."""
+    """(predicted, measured) key points (S, n, 3) in mm on the validation rows."""
     mask = data.judge.valid if data.held is None else data.held
     with torch.no_grad():
         return model.predict(data.judge)[mask], data.judge.key_points[mask]
 
 
 def held_error(model: ArmModel, data: Data, weights: Tensor) -> float:
-    """Weighted MSE in mm^2 on the judging rows."""
+    """Weighted MSE in mm^2 on the validation rows."""
     predicted, measured = held_rows(model, data)
     return float(weighted_mse(predicted, measured, weights))
 

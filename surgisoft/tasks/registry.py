@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from surgisoft.config import Where, from_table, read_toml
+from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Task, TaskSpec
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
@@ -69,22 +69,13 @@ def config_of(task: str) -> Any:
     return spec_of(task).config
 
 
-def config_table(config: Any) -> Any:
-    """A configuration as dicts, lists, numbers and text, for JSON; a path becomes text."""
-    if dataclasses.is_dataclass(config):
-        return {f.name: config_table(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    if isinstance(config, tuple):
-        return [config_table(item) for item in config]
-    return str(config) if isinstance(config, Path) else config
-
-
 def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
     """The named task's configuration with the fields of a table changed; `file` is for errors.
 
     Names that a field had in earlier versions are accepted, see `with_present_names`.
     """
     own = config_of(task)
-    whole = _merged(config_table(own), with_present_names(own, table))
+    whole = merged(to_table(own), with_present_names(own, table))
     try:
         return from_table(type(own), whole, Where(file, text))
     except InputError as error:
@@ -126,10 +117,10 @@ def with_present_names(config: Any, table: Any) -> Any:
         if name in former:
             for part in reversed(former[name].split(".")):
                 value = {part: value}
-            moved = _merged(moved, value)
+            moved = merged(moved, value)
         else:
             result[name] = value
-    result = _merged(moved, result)
+    result = merged(moved, result)
     known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     return {
         name: with_present_names(known[name], value)
@@ -150,9 +141,3 @@ def _with_fields(config: Any, values: dict[str, Any]) -> tuple[Any, set[str]]:
             changes[field.name], inner = _with_fields(part, values)
             found |= inner
     return dataclasses.replace(config, **changes), found
-
-
-def _merged(base: Any, changes: Any) -> Any:
-    if not (isinstance(base, dict) and isinstance(changes, dict)):
-        return changes
-    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}

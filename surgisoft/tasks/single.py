@@ -1,6 +1,7 @@
 """Tasks of one agent as Gymnasium Env and VectorEnv: adapters over a batch.
 
-Importing this module registers `surgisoft/NAME-v0` for `gymnasium.make` and `gymnasium.make_vec`.
+`import surgisoft` registers them as `surgisoft/NAME-v0` for `gymnasium.make` and
+`gymnasium.make_vec`.
 The id `surgisoft.tasks.single:surgisoft/NAME-v0` imports the module by itself.
 """
 
@@ -16,13 +17,11 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from surgisoft.environments import register
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.numpy_adapter import NumpyAdapter, entropy_seed
-from surgisoft.tasks.registry import TASKS, make_with
-
-ONE_ARM = tuple(name for name, spec in TASKS.items() if len(spec.agents) == 1)
-"""Names of the tasks of one agent."""
+from surgisoft.tasks.registry import make_with
 
 
 def _adapter(
@@ -148,10 +147,4 @@ class BatchedEnv(VectorEnv):
         )
 
 
-for _name in ONE_ARM:
-    gymnasium.register(
-        f"surgisoft/{_name}-v0",
-        entry_point=SingleEnv,
-        vector_entry_point=BatchedEnv,
-        kwargs={"task": _name},
-    )
+register()

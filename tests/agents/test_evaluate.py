@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from surgisoft.agents.evaluate import bootstrap, episode_table, summary
-from surgisoft.agents.referee import Contact, Verdict
+from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
 from surgisoft.cli import run
 from surgisoft.tasks.circle_ablation import CircleAblation
@@ -85,8 +85,8 @@ def test_the_referee_overrules_the_batched_path():
         clearance_mm=[[5.0, 2.0, 3.0], [4.0, 6.0, NAN]],
         collided=[[0.0, 0.0, 0.0], [0.0, 0.0, NAN]],
     )
-    hit = Verdict(Contact(0.1, ("laser", "liver")), -0.5, 4, 1, 2.5, 0, 0.0)
-    free = Verdict(None, 3.5, 3, 0, 0.0, 0, 0.0)
+    hit = EpisodeCheck(Contact(0.1, ("laser", "liver")), -0.5, 4, 1, 2.5, 0, 0.0)
+    free = EpisodeCheck(None, 3.5, 3, 0, 0.0, 0, 0.0)
     table = episode_table(CircleAblation(), played, [hit, free])
     assert table["success"].tolist() == [0.0, 1.0]
     assert table["collided"].tolist() == [1.0, 0.0]

@@ -59,11 +59,11 @@ def test_policies_see_measurements_and_errors_are_those_of_the_true_body(task):
     play = Episodes(on_rig(task, RigConfig(settle_s=0.5), watched))
     state = play.seeded(3, 1)
     plant = state.world.arms["arm"].plant
-    (rig,) = plant.rigs.things
+    (rig,) = plant.rigs.items
     before, time_s = plant.target_kPa, rig.time_s
     state, _ = play.step(state, {"arm": torch.tensor([[1.0, -9.0, 0.5]])})
     part, limit = state.world.arms["arm"], task.arm.pneumatics.step_kPa
-    assert part.plant.rigs.things == (rig,)
+    assert part.plant.rigs.items == (rig,)
     assert rig.time_s - time_s == pytest.approx(task.dt_s)
     change = part.plant.target_kPa - before
     torch.testing.assert_close(change, torch.tensor([[1.0, -limit, 0.5]]), atol=1e-5, rtol=0)
@@ -93,7 +93,7 @@ def test_memory_is_constant_over_episodes():
     state = play.seeded(1, 2)
     for _ in range(40):
         state = play.reset(state, torch.tensor([True, False]))
-    kept = state.world.arms["arm"].plant.rigs.things
+    kept = state.world.arms["arm"].plant.rigs.items
     gc.collect()
     assert set(alive) == set(kept)
     assert most <= 5
@@ -103,13 +103,13 @@ def test_a_reset_and_a_choice_of_rows_keep_each_episodes_rig():
     brief = track_circle(TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.1)))
     play = Episodes(on_rig(brief, RigConfig(settle_s=0.05)))
     state = play.seeded(1, 3)
-    first = state.world.arms["arm"].plant.rigs.things
+    first = state.world.arms["arm"].plant.rigs.items
     state = play.reset(state, torch.tensor([False, True, False]))
-    second = state.world.arms["arm"].plant.rigs.things
+    second = state.world.arms["arm"].plant.rigs.items
     assert (second[0], second[2]) == (first[0], first[2])
     assert second[1] is not first[1]
     chosen = rows(state, torch.tensor([2, 0])).world.arms["arm"]
-    assert chosen.plant.rigs.things == (first[2], first[0])
+    assert chosen.plant.rigs.items == (first[2], first[0])
 
 
 def test_task_and_world_have_the_same_arm(task):
@@ -153,7 +153,7 @@ def test_each_arm_of_a_task_is_on_a_rig_of_its_own():
     for _ in range(3):
         state, outcome = Episodes(moved).step(state, drawn)
     laser, endoscope = (state.world.arms[name].plant for name in ("laser", "endoscope"))
-    assert laser.rigs.things[0] is not endoscope.rigs.things[0]
+    assert laser.rigs.items[0] is not endoscope.rigs.items[0]
     assert not torch.allclose(laser.target_kPa, endoscope.target_kPa)
     assert outcome.measures["clearance_mm"].isfinite().all()
     laser = state.world.arms["laser"]

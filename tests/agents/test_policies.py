@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from surgisoft.agents.policies import Random, open_driver
+from surgisoft.agents.policies import Random, open_policy
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_task
@@ -16,7 +16,7 @@ def task():
 
 
 def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
-    driver, state = open_driver("random", task), Episodes(task).seeded(5, 4)
+    driver, state = open_policy("random", task), Episodes(task).seeded(5, 4)
     together = driver.act(task, state, {})["arm"]
     for i in range(4):
         one = rows(state, torch.tensor([i]))
@@ -26,7 +26,7 @@ def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
 def test_scripted_is_the_tasks_own_solver(task):
     play = Episodes(task)
     state = play.seeded(5, 4)
-    action = open_driver("scripted", task).act(task, state, play.observe(state))
+    action = open_policy("scripted", task).act(task, state, play.observe(state))
     assert torch.equal(action["arm"], task.script(state)["arm"])
 
 
@@ -50,5 +50,5 @@ def test_random_fills_the_pumps_range_evenly_and_anew_each_step(task):
 @pytest.mark.parametrize("name", ["skripted", "runs/nowhere"])
 def test_what_drives_nothing_is_one_line(name, task):
     with pytest.raises(InputError, match="scripted") as error:
-        open_driver(name, task)
+        open_policy(name, task)
     assert name in str(error.value)

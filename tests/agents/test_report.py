@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.agents.report_charts import _broken, _plane
+from surgisoft.agents.report_charts import broken_at_jumps, path_plane
 from surgisoft.cli import run
 from tests.report.browser import chromium, look
 
@@ -12,7 +12,7 @@ def test_the_plane_of_a_tilted_circle_shows_a_circle():
     turn = np.linspace(0.0, 2.0 * np.pi, 90)
     flat = 7.0 * np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), 1)
     tilt, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-    middle, plane = _plane(flat[:-1] @ tilt.T + 5.0)
+    middle, plane = path_plane(flat[:-1] @ tilt.T + 5.0)
     assert middle == pytest.approx([5.0] * 3, abs=1e-9)
     assert plane.T @ plane == pytest.approx(np.eye(2), abs=1e-9)
     seen = (flat @ tilt.T) @ plane
@@ -21,7 +21,7 @@ def test_the_plane_of_a_tilted_circle_shows_a_circle():
 
 def test_lines_break_where_the_target_jumps():
     points = np.array([[0.0, 0.0], [1.0, 0.0], [9.0, 0.0], [9.5, 0.0]])
-    broken = _broken(points)
+    broken = broken_at_jumps(points)
     assert np.flatnonzero(np.isnan(broken[:, 0])).tolist() == [2]
     assert len(broken) == 5
 

@@ -48,7 +48,8 @@ def test_trains_and_says_what_stands(tmp_path, capsys):
         ([*SMALL, "--preset", "nope"], "unknown preset 'nope': known are fast, paper"),
         ([*SMALL, "--scene", "x"], "this task has no scene"),
         ([*SMALL, "--arm", "nowhere"], "no arm model there"),
-        ([*SMALL, "--minutes", "-1"], "minutes is -1"),
+        (["--task", "track_circle", "--minutes", "-1"], "minutes is -1"),
+        ([*SMALL, "--minutes", "1"], "give one of them"),
         ([*SMALL, "--device", "abacus"], "abacus"),
         ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
         (["--resume", "nowhere"], "no training run there"),
@@ -85,7 +86,7 @@ def test_two_processes_learn_one_policy(tmp_path):
         [
             sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2",
             "--master-addr", "127.0.0.1", "--master-port", str(port),
-            "-m", "surgisoft.cli", "train", *SMALL, "-o", str(folder),
+            "-m", "surgisoft", "train", *SMALL, "-o", str(folder),
         ],
         env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
 from surgisoft.agents.presets import PRESETS, Plan, Preset, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
-from surgisoft.agents.selection import better, judge
+from surgisoft.agents.selection import evaluate_checkpoint, is_better
 from surgisoft.agents.training import Training, resume, train_new
 from surgisoft.errors import InputError
 from surgisoft.tasks.registry import config_of, make_task, with_fields
@@ -134,7 +134,7 @@ def test_both_agents_learn_at_once(ablation):
     for agent, ppo in training.agents.items():
         assert widths[agent] == training.seen[agent].shape[1]
         assert ppo.critic.obs_dim == sum(widths.values()), "the critic sees the joint state"
-    turn = training.turn()
+    turn = training.iterate()
     assert set(turn.gathered.rewards) == {"laser", "endoscope"}
     for agent, ppo in training.agents.items():
         pairs = zip(before[agent], ppo.actor.parameters(), strict=True)
@@ -158,7 +158,7 @@ def test_a_run_opens_from_its_folder_alone(ablation, tmp_path):
         own = again.world.arms[name].model.state_dict()
         for key, value in arm.model.state_dict().items():
             assert torch.equal(value, own[key])
-    found, _ = judge(again, LearnedPolicy(moved, again), 1)
+    found, _ = evaluate_checkpoint(again, LearnedPolicy(moved, again), 1)
     assert found == pytest.approx(run.load(BEST)["evaluation"], nan_ok=True)
 
 
@@ -170,17 +170,20 @@ def test_the_best_checkpoint_is_the_best_by_evaluation(run):
     best = run.load(BEST)
     assert best["iteration"] == min(found, key=found.get)
     task = run.task()
-    best, _ = judge(task, LearnedPolicy(run.path, task, "best"), 2)
+    best, _ = evaluate_checkpoint(task, LearnedPolicy(run.path, task, "best"), 2)
     assert best["error_mm"] == min(found.values())
-    assert judge(task, LearnedPolicy(run.path, task, "last"), 2)[0]["error_mm"] == found[4]
+    assert (
+        evaluate_checkpoint(task, LearnedPolicy(run.path, task, "last"), 2)[0]["error_mm"]
+        == found[4]
+    )
 
 
 def test_success_counts_before_error():
-    assert better({"success": 1.0, "error_mm": 0.5}, {"success": 0.9, "error_mm": 0.1})
-    assert not better({"success": 0.9, "error_mm": 0.1}, {"success": 1.0, "error_mm": 0.5})
-    assert better({"error_mm": 0.1}, {"error_mm": 0.2})
-    assert not better({"error_mm": float("nan")}, {"error_mm": 0.2})
-    assert better({"error_mm": 0.1}, None)
+    assert is_better({"success": 1.0, "error_mm": 0.5}, {"success": 0.9, "error_mm": 0.1})
+    assert not is_better({"success": 0.9, "error_mm": 0.1}, {"success": 1.0, "error_mm": 0.5})
+    assert is_better({"error_mm": 0.1}, {"error_mm": 0.2})
+    assert not is_better({"error_mm": float("nan")}, {"error_mm": 0.2})
+    assert is_better({"error_mm": 0.1}, None)
 
 
 def test_it_learns(tmp_path):
@@ -197,7 +200,7 @@ def test_it_learns(tmp_path):
     plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=50_000)
     run = trained(tmp_path / "learns", plan)
     learned = run.load(BEST)["evaluation"]["error_mm"]
-    random = judge(run.task(), Random(), 8)[0]["error_mm"]
+    random = evaluate_checkpoint(run.task(), Random(), 8)[0]["error_mm"]
     assert random > 10.0
     assert learned < 0.1 * random
 

@@ -7,7 +7,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.ppo import algorithm_config, gather, make_ppo
+from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo
 from surgisoft.agents.presets import Preset
 from surgisoft.agents.vec_env import STATE, JointEnv, OneAgentEnv
 from surgisoft.errors import InputError
@@ -67,7 +67,7 @@ def test_stored_observations_are_those_before_the_step(task):
     agents = make_ppo(env, preset, Processes())
     seen = env.get_observations()
     first = seen["arm"].clone()
-    gather(env, agents, seen, 6)
+    collect_rollout(env, agents, seen, 6)
     stored = agents["arm"].storage
     assert torch.equal(stored.observations["arm"][0], first)
     assert not torch.equal(stored.observations["arm"][1], first)

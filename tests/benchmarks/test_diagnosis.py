@@ -17,9 +17,16 @@ from benchmarks.diagnosis.experiment import Settled
 from benchmarks.diagnosis.robots import bent, record, record_experiment
 from benchmarks.diagnosis.study import Outcome, read_outcomes, run, run_case, to_amend
 from benchmarks.diagnosis.table import calibration_error, markdown
-from surgisoft.diagnosis.design.next_experiment import Pair, Recommendation, effect_left, rivals_of
+from surgisoft.diagnosis.design.next_experiment import Pair, Recommendation
 from surgisoft.diagnosis.design.schedules import SETUPS, schedule
-from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict, diagnose
+from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
+    ErrorLevels,
+    Verdict,
+    diagnose,
+    effect_left,
+    rivals_of,
+)
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, default_arm
 
@@ -62,8 +69,8 @@ def test_robots_of_known_truth(folder, case, kind, effects):
 def test_a_bent_surrogate_has_the_wanted_error():
     model = default_arm()
     worse = bent(model, 0, 0.3, seed=4)
-    assert worse.validation["rmse_mm"] == pytest.approx(0.3, rel=0.05)
-    assert model.validation["rmse_mm"] < 0.15
+    assert worse.validation.rmse_mm == pytest.approx(0.3, rel=0.05)
+    assert model.validation.rmse_mm < 0.15
 
 
 def test_correlated_noise_is_stated():

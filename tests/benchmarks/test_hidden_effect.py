@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.cache import Kept, Meter, digest, model_digest
+from benchmarks.cache import Cache, digest, model_digest
 from benchmarks.hidden_effect import policies as hidden_effect_drivers
 from benchmarks.hidden_effect import study as hidden_effect
 from benchmarks.hidden_effect.rates import trails_s
@@ -15,7 +15,8 @@ from benchmarks.hidden_effect.study import MODELS, Outcome, StudyConfig, run, wo
 from benchmarks.hidden_effect.table import draw, markdown
 from surgisoft.cli import run as run_command
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.measurement.recordings import load_recording
+from surgisoft.progress import Stages
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, save_model
 
@@ -33,16 +34,16 @@ def test_a_result_is_made_once_for_each_origin(tmp_path):
         made.append(value)
         return {"value": value}
 
-    kept = Kept(tmp_path)
+    kept = Cache(tmp_path)
     for _ in range(2):
         assert kept.values("a/b", {"x": 1}, lambda: make(1)) == {"value": 1}
-        assert Kept(tmp_path).values("a/b", {"x": 2}, lambda: make(2)) == {"value": 2}
+        assert Cache(tmp_path).values("a/b", {"x": 2}, lambda: make(2)) == {"value": 2}
     assert made == [1, 2]
 
 
 def test_a_result_that_fails_leaves_nothing(tmp_path):
     with pytest.raises(ZeroDivisionError):
-        Kept(tmp_path).values("a/b", {}, lambda: 1 / 0)
+        Cache(tmp_path).values("a/b", {}, lambda: 1 / 0)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
@@ -60,7 +61,7 @@ def test_digests_know_order_free_content_and_weights(tmp_path):
 
 def test_the_bar_runs_through_stages_without_going_back():
     seen = []
-    meter = Meter(lambda done, total, note: seen.append((done, total, note)), 30.0)
+    meter = Stages(lambda done, total, note: seen.append((done, total, note)), 30.0)
     first = meter.stage(10, "a")
     first(1, 2, "half")
     second = meter.stage(20, "b")
@@ -71,7 +72,7 @@ def test_the_bar_runs_through_stages_without_going_back():
 
 
 def test_a_changed_bench_is_the_rig_with_that_change(tmp_path):
-    bench = Bench(Kept(tmp_path), 3, (("creep", 1.0),), 400)
+    bench = Bench(Cache(tmp_path), 3, (("creep", 1.0),), 400)
     protocol = make_protocol("mixed", VirtualRig(3).limits, 400, seed=5)
     came = bench.record(protocol, 7, "known_mass")
     expected, _ = VirtualRig(3, payload_g=2.0, take=7, hidden=[("creep", 1.0)]).record(protocol)

@@ -1,6 +1,8 @@
 """The commands as a newcomer types them; and every wrong turn in one line."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -120,7 +122,7 @@ def _options():
     """(command, option) of every command but the long studies."""
     from typer.main import get_command
 
-    from surgisoft.cli import app, commands  # noqa: F401
+    from surgisoft.cli import with_commands
 
     def walk(path, command):
         if hasattr(command, "commands"):
@@ -131,7 +133,11 @@ def _options():
                 if option.opts[0].startswith("-"):
                     yield " ".join(path), option
 
-    return [pair for pair in walk((), get_command(app)) if not pair[0].startswith("benchmark")]
+    return [
+        pair
+        for pair in walk((), get_command(with_commands()))
+        if not pair[0].startswith("benchmark")
+    ]
 
 
 def test_one_name_means_one_thing_in_every_command():
@@ -150,3 +156,86 @@ def test_every_option_of_many_values_says_so():
     assert {name for _, option in several for name in option.opts} == MANY
     for command, option in several:
         assert option.metavar.endswith("..."), f"{option.opts} of {command}"
+
+
+def test_python_runs_the_package_as_the_command(capsys):
+    """`python -m surgisoft`, as torchrun starts it."""
+    command = [sys.executable, "-m", "surgisoft", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert run(["--version"]) == 0
+    assert done.stdout == capsys.readouterr().out
+
+
+def test_old_names_of_options_still_work_and_are_not_shown(tmp_path, capsys):
+    old = ["collect", "walk", "--points", "12", "--specimen", "3", "--take=2"]
+    new = ["collect", "walk", "--points", "12", "--robot-seed", "3", "--trial", "2"]
+    for name, arguments in (("old", old), ("new", new)):
+        assert run([*arguments, "-o", str(tmp_path / f"{name}.csv")]) == 0
+    one, other = ((tmp_path / f"{name}.csv").read_bytes() for name in ("old", "new"))
+    assert one == other
+    wrong = ["evaluate", "scripted", "--task", "track_circle", "--trust", "0.5"]
+    assert run(wrong) == 2
+    assert "--observer-gain" in capsys.readouterr().err
+    shown = {name for _, option in _options() for name in option.opts}
+    assert {"--robot-seed", "--trial", "--observer-gain"} <= shown
+    assert not {"--specimen", "--take", "--trust"} & shown
+    # A study has options of its own.
+    assert spread(["benchmark", "x", "--specimen", "1"])[2] == "--specimen"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "compare nowhere x.csv",
+        "compare default x.csv",
+        "diagnose default x.csv",
+        "improve default x.csv -o new",
+        "amend default --effect creep --data x.csv -o new",
+        "next-experiment nowhere",
+        "fit x.csv -o new",
+        "scene new nope.stl -o new",
+    ],
+)
+def test_a_missing_file_is_told_before_pytorch_is_loaded(command, tmp_path):
+    code = (
+        "import sys; from surgisoft.cli import run;"
+        "code = run(sys.argv[1:]); print(code, 'torch' in sys.modules)"
+    )
+    words = [sys.executable, "-c", code, *command.split()]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.split() == ["2", "False"], done.stderr
+
+
+def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypatch):
+    """A closed pipe, as `| head` leaves it, loses no file."""
+
+    def closed(*_, **__):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("builtins.print", closed)
+    monkeypatch.setattr("os.dup2", lambda *_: None)
+    files = [tmp_path / name for name in ("a.json", "page", "a.rrd")]
+    options = zip(("--json", "--report", "--replay"), map(str, files), strict=True)
+    arguments = ["compare", str(lab / "arm"), str(lab / "test.parquet")]
+    assert run([*arguments, *(word for pair in options for word in pair)]) == 0
+    assert all(path.exists() for path in files)
+
+
+def test_compare_says_the_next_command(lab, tmp_path, capsys):
+    file = tmp_path / "c.json"
+    arguments = ["compare", str(lab / "arm"), str(lab / "test.parquet"), "--json", str(file)]
+    assert run(arguments) == 0
+    said = f"surgisoft diagnose {lab / 'arm'} {lab / 'test.parquet'}" in capsys.readouterr().out
+    assert said == bool(json.loads(file.read_text())["explainable"])
+
+
+def test_packaged_names_work_anywhere(tmp_path, monkeypatch, capsys):
+    """As after `pip install`: no folder of the repository is here."""
+    monkeypatch.chdir(tmp_path)
+    assert run(["experiment", "check", "liver"]) == 0
+    assert "2 settings, 32 episodes" in capsys.readouterr().out
+    assert run(["experiment", "list", "phantom_liver"]) == 0
+    listed = capsys.readouterr().out
+    assert run(["experiment", "list"]) == 0
+    assert capsys.readouterr().out == listed
+    assert run(["scene", "show", "phantom_liver", "--save", "x.rrd"]) == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN

@@ -15,10 +15,10 @@ from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import Recording, load_recording, save_recording
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
-from tests.diagnosis.test_refine import TRUTHS, bare_arm, measured_on
+from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on
 
 
 @pytest.fixture(scope="module")

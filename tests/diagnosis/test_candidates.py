@@ -7,7 +7,7 @@ import torch
 from surgisoft.diagnosis.candidates import candidates, with_effect
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import EFFECTS, make_effect
@@ -70,7 +70,7 @@ def test_more_of_an_effect_is_its_own_share(problem):
     model = problem.model
     with torch.no_grad():
         trace = model.trace(problem.history)
-        push = model.effective(trace.pressure, trace.memory) - trace.pressure
+        push = trace.behind["material"] - trace.pressure
         more = model.network(trace.pressure + 1.1 * push, trace.direction)
         same = model.network(trace.pressure + push, trace.direction)
         change = problem.rows(more - same).numpy()
@@ -87,7 +87,7 @@ def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
     assert max(widths.values()) < 0.02
     creep = make_effect("creep", problem.model.facts)
     with torch.no_grad():
-        next(iter(creep.strengths().values())).fill_(0.1)
+        next(iter(creep.amplitudes().values())).fill_(0.1)
     fresh = with_effect(problem.model, "creep", creep)
     assert [c.more for c in candidates(problem.with_model(fresh), ["creep"])] == [True]
 

@@ -11,7 +11,7 @@ from surgisoft.diagnosis.pages.pictures import draw_all
 from surgisoft.diagnosis.residuals import noise_of, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of, outside_range
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN

@@ -10,7 +10,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis.compare import compare, time_shift
 from surgisoft.diagnosis.error_axes import bands
 from surgisoft.diagnosis.residuals import problem_of
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from tests.diagnosis.synthetic import NOISE_MM, POINTS, recording, still_model, walk
 from tests.report.browser import chromium, look

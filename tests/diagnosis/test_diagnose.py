@@ -11,7 +11,7 @@ from surgisoft.cli import run
 from surgisoft.diagnosis.diagnose import diagnose, within_the_discrepancy
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
 

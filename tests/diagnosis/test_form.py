@@ -6,6 +6,7 @@ import pytest
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.diagnosis.selection import ModelSelection, RelaxedFit, relaxed_fit
+from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import recording, still_model, walk
 
 ROWS = 4000
@@ -15,7 +16,7 @@ PRESSURE = walk(ROWS)
 def shifted(size_mm: np.ndarray):
     """A selection for an arm whose whole body is measured size_mm (S,) aside."""
     model = still_model()
-    model.validation = {"rmse_mm": 0.1, "per_key_point_mm": [0.1, 0.1, 0.1], "rows": ROWS}
+    model.validation = Validation(0.1, (0.1, 0.1, 0.1), ROWS)
     problem = problem_of(model, [recording(size_mm, PRESSURE)])
     selection = ModelSelection.of(problem, candidates(problem, ["misalignment"]))
     return selection, selection.scores()

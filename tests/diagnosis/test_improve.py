@@ -10,9 +10,9 @@ from surgisoft.diagnosis import improve as loop
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
 from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
-from tests.diagnosis.test_refine import TRUTHS, bare_arm, measured_on, with_truth
+from tests.diagnosis.test_estimation import TRUTHS, bare_arm, measured_on, with_truth
 
 
 def said(kind: str, *effects: str) -> Diagnosis:

@@ -33,10 +33,9 @@ from surgisoft.diagnosis.design.schedules import (
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
-from surgisoft.surrogate.model import ArmModel
 
 
 @pytest.fixture(scope="module")
@@ -175,10 +174,9 @@ def test_more_time_never_tells_less(arm):
 
 
 def test_where_gravity_is_not_known_no_bench_is_turned(arm):
-    from surgisoft.surrogate.model import ArmModel
 
     spec = replace(arm.spec, gravity=None)
-    free = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    free = arm.replace(spec=spec)
     limits = limits_within(spec.low, spec.high)
     question = pose_question(free, None, ["payload", "gain_mismatch"])
     plans = make_plans(question, limits, 8.0, tuple(SETUPS))
@@ -187,10 +185,9 @@ def test_where_gravity_is_not_known_no_bench_is_turned(arm):
 
 def test_no_chamber_leaves_what_was_recorded_of_it(arm, lagging):
     """Chamber 2 stood at 3 kPa and chamber 3 moved by 2 kPa, whatever the model's scale is."""
-    from surgisoft.surrogate.model import ArmModel
 
     spec = replace(arm.spec, idle=(None, 3.0, None))
-    shy = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    shy = arm.replace(spec=spec)
     measured = lagging.measured.copy()
     measured[:, 2] = 5.0 + 2.0 * (measured[:, 2] - measured[:, 2].min()) / np.ptp(measured[:, 2])
     still = replace(lagging, measured=measured)
@@ -257,7 +254,7 @@ def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):
 )
 def test_a_bench_is_spoken_of_in_its_own_words(arm, unit, said):
     spec = replace(arm.spec, unit=unit)
-    other = ArmModel(spec, arm.network, dict(arm.effects), arm.rest_mm, arm.validation)
+    other = arm.replace(spec=spec)
     answer = propose(other, ["line_lag", "creep"], minutes=6.0, settings=(AS_IT_STANDS,))
     assert f"each from a {said}" in answer.steps[-1]
     assert answer.protocol.unit == unit

@@ -7,8 +7,9 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.cross_validation import FITTED
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
 from tests.diagnosis.test_cross_validation import cross_validated
 
@@ -31,7 +32,7 @@ def measured(seed, shifted_mm=0.0):
 @pytest.fixture(scope="module")
 def model():
     model = still_model()
-    model.validation = {"rmse_mm": 1.5, "per_key_point_mm": [0.5, 1.0, 2.0], "rows": ROWS}
+    model.validation = Validation(1.5, (0.5, 1.0, 2.0), ROWS)
     return model
 
 

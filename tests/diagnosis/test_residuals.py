@@ -7,6 +7,7 @@ from surgisoft.diagnosis.residuals import model_discrepancy, problem_of
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.noise import known_noise
 from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import NOISE_MM, recording, resting_together, still_model, walk
 
 VALIDATED = [0.5, 1.0, 2.0]
@@ -14,7 +15,7 @@ VALIDATED = [0.5, 1.0, 2.0]
 
 def validated_model(**more):
     model = still_model()
-    model.validation = {"rmse_mm": 1.3, "per_key_point_mm": VALIDATED, "rows": 100, **more}
+    model.validation = Validation(1.3, tuple(VALIDATED), 100, **more)
     return model
 
 
@@ -57,7 +58,7 @@ def test_a_fit_keeps_the_noise_that_its_recordings_state_or_show_in_holds():
     quick = FitConfig(hidden=(8,), epochs=10, inputs="pressure")
     for one in (stated, held):
         found = fit(history_of([one]), None, arm_spec([one]), quick).model
-        assert found.validation["noise_mm"] == pytest.approx(known_noise([one]))
+        assert found.validation.noise_mm == pytest.approx(known_noise([one]))
     assert known_noise([recording(np.zeros(300), walk(300, seed=1)[:, :1], noise_mm=None)]) is None
 
 

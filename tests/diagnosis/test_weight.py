@@ -13,7 +13,7 @@ from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
-from surgisoft.measurement.recordings.recording import save_recording
+from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 

@@ -1,4 +1,4 @@
-"""Phases, interlock, faults and hands, held against hand-made states and the energy delivered."""
+"""Phases, interlock, faults and controllers, against hand-made states and the energy delivered."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,17 +8,15 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
+from surgisoft.experiments.ablation import AblationSupervision
 from surgisoft.experiments.controllers import (
-    CLOSE,
-    LATE,
-    LOST,
-    PhasedAblation,
     Schedule,
     Waypoints,
-    _between,
+    interpolated,
 )
+from surgisoft.experiments.phases import CLOSE, LATE, LOST, PhasedTask
 from surgisoft.experiments.plan import settings
-from surgisoft.experiments.play import play_block
+from surgisoft.experiments.run import roll_out_block
 from surgisoft.experiments.spec import Fault, load_experiment
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
@@ -39,7 +37,7 @@ def base(spec):
 @pytest.fixture(scope="module")
 def cutting(spec, base):
     """The phased task, and two of its episodes in the phase with the beam, all well."""
-    task = PhasedAblation(base, spec)
+    task = PhasedTask(AblationSupervision(base), spec)
     state = Episodes(task).seeded(0, 2)
     state = replace(state, goal=replace(state.goal, phase=state.goal.phase + 1))
     return task, _with(state, fraction=1.0, clearance=20.0)
@@ -70,17 +68,21 @@ def test_the_interlock_lets_the_beam_on_only_when_all_is_well(cutting):
 
 def test_an_experiment_cannot_loosen_the_scene_s_clearance(cutting, spec, base):
     loose = replace(spec, limits=replace(spec.limits, clearance_mm=-5.0))
-    assert PhasedAblation(base, loose).clear_mm == base.spec.limits.clearance_mm
+    assert PhasedTask(AblationSupervision(base), loose).clear_mm == base.spec.limits.clearance_mm
     strict = replace(spec, limits=replace(spec.limits, clearance_mm=7.0))
     _, state = cutting
-    assert not PhasedAblation(base, strict).released(_with(state, clearance=6.9)).any()
+    assert (
+        not PhasedTask(AblationSupervision(base), strict)
+        .released(_with(state, clearance=6.9))
+        .any()
+    )
 
 
 def _walk(task, state, steps, **world):
     """The progress after so many steps in which the world stays as it is told."""
     for _ in range(steps):
-        after = _with(replace(state, goal=state.goal.cut), **world)
-        state = replace(state, goal=task._further(state.goal, after))
+        after = _with(replace(state, goal=state.goal.goal), **world)
+        state = replace(state, goal=task.progressed(state.goal, after))
     return state.goal
 
 
@@ -104,7 +106,9 @@ def test_phases_go_on_by_their_time_and_view_lost_aborts(cutting):
 def test_an_abort_retreats_and_then_ends(cutting, base, spec):
     third = replace(spec.phases[0], name="out", until="never", timeout_s=0.2)
     limits = replace(spec.limits, retreat="out")
-    task = PhasedAblation(base, replace(spec, phases=(*spec.phases, third), limits=limits))
+    task = PhasedTask(
+        AblationSupervision(base), replace(spec, phases=(*spec.phases, third), limits=limits)
+    )
     goal = _walk(task, cutting[1], 5, fraction=0.0, clearance=20.0)
     assert goal.phase.tolist() == [2, 2]
     state = replace(cutting[1], goal=goal)
@@ -116,7 +120,7 @@ def test_an_abort_retreats_and_then_ends(cutting, base, spec):
 
 def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
     look = replace(spec.phases[0], until="centred", within=1000.0, hold_s=0.2, timeout_s=9.0)
-    task = PhasedAblation(base, replace(spec, phases=(look, spec.phases[1])))
+    task = PhasedTask(AblationSupervision(base), replace(spec, phases=(look, spec.phases[1])))
     state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
     good, bad = {"fraction": 1.0, "clearance": 20.0}, {"fraction": 0.5, "clearance": 20.0}
     goal = _walk(task, state, 1, **good)
@@ -131,7 +135,7 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
     text = TINY.replace("time_s = 0.5", "time_s = 3.4\nview_lost_s = 0.3") + FAULT
     text = text.replace("timeout_s = 0.3", "timeout_s = 1.5")
     spec = load_experiment(write(tmp_path, text))
-    block = play_block(spec, settings(spec)[0], 0, 1)
+    block = roll_out_block(spec, settings(spec)[0], 0, 1)
     log, row = block.logs[0], block.rows[0]
     seen = log.view_fraction >= log.limits["view_fraction"]
     lost = int(np.flatnonzero(seen)[-1]) + 1
@@ -142,6 +146,12 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
     assert not log.beam.on[lost + 1 :].any()
     assert log.arms["endoscope"].pressure_kPa[-1, 2] == pytest.approx(0.0, abs=4.0)
     assert row["outcome"] == "aborted in cut: lesion out of sight"
+    events = [(event.time_s, event.text) for event in log.events]
+    assert (1.7, "fault: chamber 3 of endoscope goes to 0 kPa") in events
+    texts = [text for _, text in events]
+    assert [text for text in texts if text.startswith("phase ")] == ["phase look", "phase cut"]
+    (aborted,) = [at for at, text in events if text == "aborted: lesion out of sight"]
+    assert aborted == pytest.approx(0.1 * lost + 0.3, abs=0.11)
     assert row["beam_unsafe_longest_s"] <= 0.1 + 1e-6
     assert row["beam_s"] == pytest.approx(0.1 * log.beam.on.sum(), abs=1e-3)
 
@@ -149,20 +159,20 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
 def test_a_fault_needs_a_chamber_that_is_there(spec, base):
     wrong = replace(spec, faults=(Fault("laser", 1.0, 4),))
     with pytest.raises(InputError, match="chamber 4 of arm 'laser', expected 1 to 3"):
-        PhasedAblation(base, wrong)
+        PhasedTask(AblationSupervision(base), wrong)
 
 
 def test_values_between_rows_are_linear():
     times = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
     values = torch.tensor([[0.0], [10.0], [0.0]])
     at = torch.tensor([0.0, 1.5, 2.0, 3.0, 9.0])
-    assert _between(times, values, at)[:, 0].tolist() == [0.0, 5.0, 10.0, 5.0, 0.0]
-    assert _between(times[:1], values[1:2], at)[:, 0].tolist() == [10.0] * 5
+    assert interpolated(times, values, at)[:, 0].tolist() == [0.0, 5.0, 10.0, 5.0, 0.0]
+    assert interpolated(times[:1], values[1:2], at)[:, 0].tolist() == [10.0] * 5
 
 
 def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, tmp_path):
     long = replace(spec.phases[0], until="never", timeout_s=9.0)
-    task, state = PhasedAblation(base, replace(spec, phases=(long,))), cutting[1]
+    task, state = PhasedTask(AblationSupervision(base), replace(spec, phases=(long,))), cutting[1]
     state = replace(state, goal=replace(state.goal, phase=state.goal.phase * 0))
     file = tmp_path / "press.csv"
     file.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1.0,5,0,0\n")
@@ -170,10 +180,9 @@ def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, 
     point = task.base.centre_mm(state)[0]
     way = Waypoints([(0.0, *point.tolist())])
     for _ in range(12):
-        seen = play.observe(state)
         actions = {
-            "laser": way(task, "laser", state, seen),
-            "endoscope": hand(task, "endoscope", state, seen),
+            "laser": way(task, "laser", state),
+            "endoscope": hand(task, "endoscope", state),
         }
         state, _ = play.step(state, actions)
     command = state.world.arms["endoscope"].command

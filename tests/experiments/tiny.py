@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from surgisoft.tasks.world.scene import PHANTOM
+from surgisoft.scene.packaged import PHANTOM
 
 TINY = """
 name = "tiny"

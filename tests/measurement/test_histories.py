@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from surgisoft.measurement.histories import history_of
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 
 def recording(name: str, temperature=None) -> Recording:

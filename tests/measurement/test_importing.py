@@ -11,10 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.config import read_toml
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.convert import import_files
-from surgisoft.measurement.importing.map_file import parse_map
+from surgisoft.measurement.importing import import_files, load_map
 
 NAMES = ["t", "u1", "u2", "x", "y", "z"]
 BASE = """
@@ -48,7 +46,7 @@ def text(values, separator=",", header=NAMES, end="\n", decimal=".", before=()):
 def spec(tmp_path, content):
     path = tmp_path / "map.toml"
     path.write_text(content)
-    return parse_map(*read_toml(path))
+    return load_map(str(path))
 
 
 def imported(tmp_path, files, content=BASE, name="x"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing import import_files
 
 from .test_importing import spec, text, written
 

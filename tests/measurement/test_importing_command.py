@@ -2,14 +2,13 @@
 
 import dataclasses
 import re
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.measurement.importing.map_file import load_map
+from surgisoft.measurement.importing import load_map
 from surgisoft.measurement.importing.spec import (
     ActuationMap,
     BaseMap,
@@ -20,8 +19,8 @@ from surgisoft.measurement.importing.spec import (
     RunsMap,
     TimeMap,
 )
-from surgisoft.measurement.recordings.recording import load_recording
-from surgisoft.measurement.recordings.sidecar import parse_sidecar
+from surgisoft.measurement.recordings import load_recording
+from surgisoft.measurement.recordings.sidecar import read_sidecar
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -140,7 +139,8 @@ def test_every_shipped_map_is_valid():
 def test_examples_of_the_documentation_are_valid(tmp_path):
     blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
     sidecar, example = blocks
-    assert parse_sidecar(tomllib.loads(sidecar), "docs")["noise_mm"] == 0.08
+    (tmp_path / "sidecar.toml").write_text(sidecar)
+    assert read_sidecar(tmp_path / "sidecar.toml")["noise_mm"] == 0.08
     (tmp_path / "map.toml").write_text(example)
     assert load_map(str(tmp_path / "map.toml")).time.unit == "ms"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.convert import import_files
+from surgisoft.measurement.importing import import_files
 
 from .test_importing import spec, text, written
 
@@ -228,7 +228,7 @@ def test_settled_points_are_the_means_of_their_rows(tmp_path):
     np.testing.assert_allclose(recording.measured[:, 0], [2, 12.5, 8])
     np.testing.assert_allclose(recording.t_s, [0, 3.5, 5.5])
     np.testing.assert_allclose(recording.key_points_mm[:, 0, 0], [3, 4, 0])  # NaN is left out
-    assert "7 rows averaged into 3 settled points" in part.notes[-1]
+    assert "7 rows averaged into 3 steady-state points" in part.notes[-1]
 
 
 def test_frozen_rows_are_left_out_when_asked(tmp_path):

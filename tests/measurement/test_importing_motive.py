@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgisoft.config import read_toml
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.convert import import_files
-from surgisoft.measurement.importing.map_file import READY_MAPS, load_map, parse_map
+from surgisoft.measurement.importing import READY_MAPS, import_files, load_map
 
 from .motive import MOUNT, arm, export, markers_on, to_room
 
@@ -202,7 +200,7 @@ unit = "kPa"
 def by_map(tmp_path, text, files):
     path = tmp_path / "map.toml"
     path.write_text(MAP + text)
-    (part,) = import_files(files, parse_map(*read_toml(path)), "x")
+    (part,) = import_files(files, load_map(str(path)), "x")
     return part.recording
 
 
@@ -281,7 +279,7 @@ def test_take_and_log_are_told_apart_by_content(tmp_path):
     assert imported([log, take(tmp_path / "z_take.csv")])[0].key_points == PLANES
     with pytest.raises(InputError, match=r"no file for \[file.log\]"):
         imported([tmp_path / "z_take.csv"])
-    with pytest.raises(InputError, match=r"no file for \[file.take\].*is a Motive export"):
+    with pytest.raises(InputError, match=r"no file for \[file.take\].*is a Motive CSV export"):
         imported([log])
 
 

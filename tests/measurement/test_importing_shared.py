@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surgisoft.measurement.importing.convert import import_files
-from surgisoft.measurement.importing.map_file import load_map
+from surgisoft.measurement.importing import import_files, load_map
 from surgisoft.measurement.importing.timing import body_lead, held_period_s
-from surgisoft.measurement.recordings.quality import find_oddities
-from surgisoft.measurement.recordings.recording import load_recording, save_recording
+from surgisoft.measurement.recordings import find_warnings, load_recording, save_recording
 
 MAPS = Path(__file__).resolve().parents[2] / "docs" / "examples" / "maps"
 
@@ -124,7 +122,7 @@ def test_frozen_pressures_of_april_are_found_and_none_in_january(shared):
     spec = load_map(str(MAPS / "asu_two_segment.toml"))
     for path in asu(shared):
         (part,) = import_files([path], spec, None)
-        frozen = [o.text for o in find_oddities(part.recording) if "frozen" in o.text]
+        frozen = [o.text for o in find_warnings(part.recording) if "frozen" in o.text]
         assert len(frozen) == path.name.startswith("apr_4"), path.name
         if frozen:
             assert "p1_psi, p2_psi, p3_psi, p4_psi, p5_psi, p6_psi repeat bit-equal" in frozen[0]

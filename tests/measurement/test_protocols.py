@@ -196,8 +196,8 @@ def test_schedule_file(tmp_path):
     ("text", "says"),
     [
         ("t_s,c1_kPa\n0,1\n", "1 rows, a schedule needs at least two"),
-        ("t_s,c1_kPa\n0,1\n1,x\n", "row 3, column c1_kPa is 'x', expected a number"),
-        ("t_s,c1_kPa\n0,1\n1\n", "row 3 has 1 cells, the header has 2"),
+        ("t_s,c1_kPa\n0,1\n1,x\n", "line 3, column 'c1_kPa': got 'x', expected a number"),
+        ("t_s,c1_kPa\n0,1\n1\n", "line 3: 1 cells, expected 2 as in the header"),
         ("t_s,c1_kPa\n0,1\n0,2\n", "time does not increase at row 2"),
         ("t_s,c1_kPa,c1_kPa\n0,1,1\n1,2,2\n", "column c1_kPa appears twice"),
         ("t_s,c1_kPa,c2_psi\n0,1,1\n1,2,2\n", "commands in kPa, psi, expected one unit"),
@@ -221,5 +221,5 @@ def test_bad_names_and_sizes_get_one_line(tmp_path):
         make_protocol("gird", LIMITS)
     with pytest.raises(InputError, match="--points is 3, expected at least 10"):
         make_protocol("grid", LIMITS, 3)
-    with pytest.raises(InputError, match="cannot read the schedule"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_schedule(tmp_path / "none.csv")

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings.quality import summary
-from surgisoft.measurement.recordings.recording import (
+from surgisoft.measurement.recordings import (
     ArmInfo,
     Recording,
     check_rows,
@@ -19,6 +18,7 @@ from surgisoft.measurement.recordings.recording import (
     load_recording,
     load_recordings,
     save_recording,
+    summary,
 )
 
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)

@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings.recording import load_recording, load_recordings
+from surgisoft.measurement.recordings import load_recording, load_recordings
 
 HEAD = "t_s,p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm"
 ROW = "0,1,2,3,4"
@@ -52,9 +52,9 @@ ROWS = [
     ("0,1,2,3,4\n1,1,2,lost,4\n", "line 3, column 'k0_y_mm': got 'lost', expected a number"),
     ("0,1,2,3,4\n1,1_0,2,3,4\n", "line 3, column 'p1_kPa': got '1_0', expected a number"),
     ("0,1,2,3,4\n1,0x10,2,3,4\n", "line 3, column 'p1_kPa': got '0x10', expected a number"),
-    ("0,1,2,3,4\n1,1,2,3\n", "line 3: 4 cells, expected 5 as in line 1"),
+    ("0,1,2,3,4\n1,1,2,3\n", "line 3: 4 cells, expected 5 as in the header"),
     ('0,1,2,3,4\n1,"1,5",2,3,4\n', "line 3, column 'p1_kPa': got '1,5', expected a number"),
-    ("# a comment\n0,1,2,3,4\n", "line 2: 1 cells, expected 5 as in line 1"),
+    ("# a comment\n0,1,2,3,4\n", "line 2: 1 cells, expected 5 as in the header"),
     ("0,,2,3,4\n1,,2,3,4\n", "line 2, column 'p1_kPa': the actuation is missing in every row"),
     ("0,1,,,\n1,1,,3,\n", "every key point is missing in every row"),
     ("", "the table is empty, expected at least one row of numbers"),
@@ -69,16 +69,31 @@ RUNS = [
 ]
 
 SIDECARS = [
-    ("[arm]\nlenght_mm = 70", "[arm]: unknown field 'lenght_mm', expected one of length_mm"),
-    ("[robot]\nlength_mm = 70", "unknown section 'robot', expected one of arm, gravity, recording"),
-    ("arm = 70", "arm is 70, expected a section [arm]"),
-    ("[arm]\nlength_mm = -70", "[arm] length_mm: got -70, expected a positive number"),
-    ("[arm]\nlength_mm = '70'", "[arm] length_mm: got '70', expected a positive number"),
-    ("[gravity]\ndirection = [0, 0, 9.81]", "[gravity] direction: length 9.81, expected a unit"),
-    ("[gravity]\ndirection = [0, 1]", "[gravity] direction: got [0, 1], expected three numbers"),
-    ("[recording]\nkind = 'static'", "kind: got 'static', expected one of continuous, settled"),
-    ("[recording]\nnoise_mm = nan", "noise_mm: got nan, expected a number >= 0"),
-    ("[recording]\nnote = 3", "note: got 3, expected a text"),
+    ("[arm]\nlenght_mm = 70", ":2: arm.lenght_mm: unknown field (did you mean 'length_mm'?)"),
+    (
+        "[robot]\nlength_mm = 70",
+        ":1: robot: unknown field; expected one of arm, gravity, rec",
+    ),
+    ("arm = 70", ":1: arm: got integer 70; expected a table [arm]"),
+    ("[arm]\nlength_mm = -70", ":2: arm.length_mm: got integer -70; expected a number > 0"),
+    ("[arm]\nlength_mm = '70'", ":2: arm.length_mm: got text '70'; expected a number > 0"),
+    (
+        "[gravity]\ndirection = [0, 0, 9.81]",
+        ":2: gravity.direction: got a list [0, 0, 9.81]; expected t",
+    ),
+    (
+        "[gravity]\ndirection = [0, 1]",
+        ":2: gravity.direction: got a list [0, 1]; expected three numb",
+    ),
+    (
+        "[recording]\nkind = 'static'",
+        ":2: recording.kind: got text 'static'; expected one of co",
+    ),
+    (
+        "[recording]\nnoise_mm = nan",
+        ":2: recording.noise_mm: got nan; expected a finite number",
+    ),
+    ("[recording]\nnote = 3", ":2: recording.note: got integer 3; expected text"),
     ("[recording\n", "not valid TOML"),
 ]
 
@@ -166,7 +181,7 @@ def test_parquet_column_of_texts(tmp_path):
     ("name", "content", "expected"),
     [
         ("bad.csv", b"", "the file is empty"),
-        ("bad.csv", b"\x89PNG\r\n\x1a\n\0\0\0", "not text in UTF-8"),
+        ("bad.csv", b"\x89PNG\r\n\x1a\n\0\0\0", "not a text file"),
         ("bad.csv", b"\xff\xfet\0_\0s\0", "not a text file"),
         ("bad.csv", b"\xe9t\xe9,p1\n", "not text in UTF-8"),
         ("bad.parquet", b"", "not a readable Parquet file"),
@@ -196,3 +211,18 @@ def test_what_is_no_file(tmp_path):
         load_recording(tmp_path)
     with pytest.raises(InputError, match="no recording given"):
         load_recordings([])
+
+
+def test_one_unusual_cell_far_down_is_read_with_its_neighbours(tmp_path):
+    path = tmp_path / "long.csv"
+    rows = np.column_stack([np.arange(60_000.0), np.zeros((60_000, 4))])
+    lines = [",".join(f"{x:.6f}" for x in row) for row in rows]
+    lines[50_000] = lines[50_000].replace(",0.000000", ", 7. ", 1)
+    path.write_text("\n".join([HEAD, *lines]))
+    assert path.stat().st_size > 2**21
+    measured = load_recording(path, lambda _: None).measured[:, 0]
+    assert np.flatnonzero(measured).tolist() == [50_000]
+    assert measured[50_000] == 7.0
+    lines[59_000] = "59000,1,2,3"
+    path.write_text("\n".join([HEAD, *lines]))
+    assert "long.csv, line 59002: 4 cells, expected 5 as in the header" in error_of(path)

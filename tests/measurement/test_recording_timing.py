@@ -6,7 +6,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
 from surgisoft.measurement.importing.timing import body_lead, held_period_s, released
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 RATE_HZ = 50
 

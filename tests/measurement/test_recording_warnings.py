@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.measurement.recordings.quality import find_oddities, key_point_jumps, spikes
-from surgisoft.measurement.recordings.recording import Recording, load_recordings, save_recording
+from surgisoft.measurement.recordings import Recording, load_recordings, save_recording
+from surgisoft.measurement.recordings.quality import find_warnings, key_point_jumps, spikes
 
 RATE_HZ = 20.0
 
@@ -76,7 +76,7 @@ CLEAN = {
 @pytest.mark.parametrize("kind", CLEAN)
 @given(seed=st.integers(0, 2**32))
 def test_no_false_alarm(kind, seed):
-    assert find_oddities(CLEAN[kind](seed)) == []
+    assert find_warnings(CLEAN[kind](seed)) == []
 
 
 @pytest.mark.parametrize("with_command", [True, False])
@@ -85,12 +85,12 @@ def test_frozen_channel_is_found_with_its_place(with_command, seed, start, lengt
     clean = slow_and_noisy(seed)
     reading = clean.measured.copy()
     reading[start : start + length, 1] = reading[start, 1]
-    found = find_oddities(
+    found = find_warnings(
         dataclasses.replace(
             clean, measured=reading, commanded=clean.commanded if with_command else None
         )
     )
-    assert [oddity.sample for oddity in found] == [start]
+    assert [warning.sample for warning in found] == [start]
     seconds = clean.t_s[start + length - 1] - clean.t_s[start]
     assert found[0].text == (
         f"p2_kPa repeat bit-equal for {length} rows ({seconds:.3g} s) while other signals move; "
@@ -102,8 +102,8 @@ def test_channels_that_freeze_together_are_one_finding():
     clean = slow_and_noisy(1)
     reading = clean.measured.copy()
     reading[400:600] = reading[400]
-    found = find_oddities(dataclasses.replace(clean, measured=reading))
-    assert [oddity.sample for oddity in found] == [400]
+    found = find_warnings(dataclasses.replace(clean, measured=reading))
+    assert [warning.sample for warning in found] == [400]
     assert found[0].text.startswith("p1_kPa, p2_kPa repeat bit-equal for 200 rows")
 
 
@@ -111,7 +111,7 @@ def test_reading_that_ignores_its_command_is_frozen():
     clean = without_noise(3)
     reading = clean.measured.copy()
     reading[:, 1] = reading[0, 1]
-    assert "p2_kPa" in find_oddities(dataclasses.replace(clean, measured=reading))[0].text
+    assert "p2_kPa" in find_warnings(dataclasses.replace(clean, measured=reading))[0].text
 
 
 @given(seed=st.integers(0, 2**32), start=st.integers(100, 900), length=st.integers(60, 250))
@@ -119,9 +119,9 @@ def test_frozen_key_point_is_found(seed, start, length):
     clean = slow_and_noisy(seed)
     points = clean.key_points_mm.copy()
     points[start : start + length, 2] = points[start, 2]
-    found = find_oddities(dataclasses.replace(clean, key_points_mm=points))
-    frozen = [oddity for oddity in found if "frozen" in oddity.text]
-    assert [oddity.sample for oddity in frozen] == [start]
+    found = find_warnings(dataclasses.replace(clean, key_points_mm=points))
+    frozen = [warning for warning in found if "frozen" in warning.text]
+    assert [warning.sample for warning in frozen] == [start]
     assert frozen[0].text.startswith(f"key point k2 repeats bit-equal for {length} rows")
 
 
@@ -129,7 +129,7 @@ def test_fixed_base_and_slow_motion_capture_are_not_frozen():
     clean = slow_and_noisy(5)
     points = clean.key_points_mm[np.arange(1200) // 6 * 6]  # a new frame every sixth row
     points[:, 0] = 0.0
-    assert find_oddities(dataclasses.replace(clean, key_points_mm=points)) == []
+    assert find_warnings(dataclasses.replace(clean, key_points_mm=points)) == []
 
 
 @given(
@@ -168,8 +168,8 @@ def test_jump_of_a_settled_point_is_found(seed, row):
     clean = settled(seed)
     points = clean.key_points_mm.copy()
     points[row, 2] += [0, 45, 0]
-    found = find_oddities(dataclasses.replace(clean, key_points_mm=points))
-    assert [oddity.sample for oddity in found] == [row]
+    found = find_warnings(dataclasses.replace(clean, key_points_mm=points))
+    assert [warning.sample for warning in found] == [row]
     assert "key point k2 jumps" in found[0].text
 
 
@@ -178,7 +178,7 @@ def test_lost_key_points_are_no_jump():
     points = clean.key_points_mm.copy()
     points[300:420, 1] = np.nan
     points[::7, 2] = np.nan
-    assert find_oddities(dataclasses.replace(clean, key_points_mm=points)) == []
+    assert find_warnings(dataclasses.replace(clean, key_points_mm=points)) == []
 
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 5])
@@ -186,7 +186,7 @@ def test_few_samples_are_no_trouble(samples):
     t = np.arange(samples) * 1.0
     points = np.random.default_rng(0).normal(size=(samples, 2, 3))
     for kind in ("continuous", "settled"):
-        assert find_oddities(Recording("x", t, np.ones((samples, 1)), points, kind=kind)) == []
+        assert find_warnings(Recording("x", t, np.ones((samples, 1)), points, kind=kind)) == []
 
 
 def test_loader_names_line_and_channel(tmp_path):

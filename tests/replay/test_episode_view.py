@@ -2,6 +2,7 @@
 
 import io
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from surgisoft.replay.colours import (
 )
 from surgisoft.replay.dosed_surface import dosed_surface
 from surgisoft.replay.endoscope import CAMERA, PIXELS
-from surgisoft.replay.episode_view import write_replay
+from surgisoft.replay.episode_view import legend, write_replay
+from surgisoft.replay.plots import plots_of
 from surgisoft.replay.screenshot import take_screenshot
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
@@ -274,3 +276,19 @@ def test_a_log_becomes_a_replay_by_command(tmp_path, capsys):
     assert time.perf_counter() - began < 20.0
     assert "MB a minute" in capsys.readouterr().out
     assert "/arms/arm/key_points" in entities(tmp_path / "log.rrd")
+
+
+def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):
+    (text,) = column(replay.path, "/legend", "TextDocument:text")[-1]
+    assert "beam; thick" in text
+    assert "olive green" in text
+    assert "white points" not in text
+    lone = legend(replace(log, beam=None, camera=None, dose=None, bodies=(), on="rig"))
+    assert "beam" not in lone
+    assert "white points" in lone
+
+
+def test_pressure_lines_are_named(log):
+    (laser,) = (plot for plot in plots_of(log) if plot.title == "Pressure of laser (kPa)")
+    assert laser.legend
+    assert [line.name for line in laser.lines[:2]] == ["command 1", "chamber 1"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.measurement.recordings.recording import load_recording
+from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig.hidden import HIDDEN
 
 
@@ -69,7 +69,7 @@ def test_lists(capsys):
         (["mixed", "--payload-g", "99"], "payload is 99.0 g"),
         (["mixed", "--gravity", "0", "0", "0"], "gravity is [0.0, 0.0, 0.0]"),
         (["mixed", "--noise-scale", "-1"], "noise scale is -1.0"),
-        (["none.csv"], "cannot read the schedule"),
+        (["none.csv"], "cannot be read"),
     ],
 )
 def test_bad_input_is_one_line_exit_2_and_nothing_written(tmp_path, capsys, args, says):

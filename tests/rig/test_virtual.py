@@ -9,7 +9,7 @@ import pytest
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, make_protocol
-from surgisoft.measurement.recordings.recording import ArmInfo, load_recordings, save_recording
+from surgisoft.measurement.recordings import ArmInfo, load_recordings, save_recording
 from surgisoft.rig import Sample, VirtualRig, VirtualRigConfig, collect
 from surgisoft.rig.hidden import HIDDEN
 

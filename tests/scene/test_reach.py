@@ -11,7 +11,8 @@ from surgisoft.scene.reach import ArmReach, aim, nearest_commands
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
-from surgisoft.surrogate.reach import constant_curvature_table, model_table
+from surgisoft.surrogate.reach import model_table
+from tests.scene.arc_table import constant_curvature_table
 
 LENGTH_MM = 70.0
 TABLE = constant_curvature_table(LENGTH_MM)

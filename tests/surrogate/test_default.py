@@ -33,7 +33,7 @@ def test_its_folder_says_how_well_it_was_validated():
     folder = files("surgisoft") / "assets" / "default_arm"
     report = json.loads((folder / "report.json").read_text())
     kept = [stage["valid_rmse_mm"] for stage in report["stages"] if stage["kept"]]
-    assert default_arm().validation["rmse_mm"] == kept[-1] < 0.2
+    assert default_arm().validation.rmse_mm == kept[-1] < 0.2
     assert "surgisoft fit" in (folder / "SOURCE.md").read_text()
 
 
@@ -50,5 +50,5 @@ def test_where_its_network_is_off_comes_with_it():
     """The residual on rows of its fit, as large as what it was validated to."""
     known, model = load_known_error("default"), default_arm()
     size = known.residual_mm.square().sum(-1).mean().sqrt().item()
-    assert 0.03 < size < 1.5 * model.validation["rmse_mm"]
+    assert 0.03 < size < 1.5 * model.validation.rmse_mm
     assert known.actuation.shape[1] == model.spec.chambers

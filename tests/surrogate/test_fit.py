@@ -43,7 +43,7 @@ def test_memory_beats_direction_beats_pressure(walks):
     assert errors[1] < 0.8 * errors[2]
     removed = (errors[2] ** 2 - errors[0] ** 2) / (errors[2] ** 2 - NOISE**2)
     assert removed > 0.9
-    assert full.model.validation["rmse_mm"] == pytest.approx(
+    assert full.model.validation.rmse_mm == pytest.approx(
         np.sqrt(3) * rmse(full.model, valid), rel=1e-5
     )
 
@@ -173,7 +173,7 @@ def test_recurrent_baseline_takes_runs_of_one_row():
     rng = np.random.default_rng(9)
     short = history([walk(1, rng) for _ in range(60)])
     result = fit(short, None, SPEC, FitConfig(network="recurrent", epochs=2))
-    assert np.isfinite(result.model.validation["rmse_mm"])
+    assert np.isfinite(result.model.validation.rmse_mm)
 
 
 def test_effects_are_refused_where_they_would_be_ignored(walks):

@@ -215,11 +215,20 @@ def test_rest_is_zero_or_the_nearest_end():
 
 
 @pytest.mark.parametrize("name", ["rate_dependence", "softening", "stiffening"])
-def test_an_effect_whose_parameters_meant_something_else_is_told(tmp_path, name):
-    save_model(model(effects=(name,)), tmp_path / "arm")
-    assert name in load_model(tmp_path / "arm").effects
-    config = json.loads((tmp_path / "arm" / "config.json").read_text())
-    config["effects"][name].pop("ring")
-    (tmp_path / "arm" / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InputError, match=f"its {name} was fitted by an earlier"):
-        load_model(tmp_path / "arm")
+def test_an_effect_of_another_version_is_migrated_or_refused(tmp_path, name):
+    folder = tmp_path / "arm"
+    save_model(model(effects=(name,)), folder)
+    config = json.loads((folder / "config.json").read_text())
+
+    def opened(**changes):
+        (folder / "config.json").write_text(json.dumps(config | changes))
+        return load_model(folder).effects
+
+    assert config.pop("effect_versions") == {name: 2}
+    assert name in opened()  # written before versions were kept, but with all arguments of now
+    with pytest.raises(InputError, match=f"effect '{name}' cannot be opened.*another meaning"):
+        opened(effects={name: {}})
+    with pytest.raises(InputError, match=f"effect '{name}' cannot be opened.*another meaning"):
+        opened(effect_versions={name: 1})
+    with pytest.raises(InputError, match=r"version 3 .*expected at most 2"):
+        opened(effect_versions={name: 3})

@@ -4,8 +4,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surgisoft.surrogate.direction import advance, trace
-from surgisoft.surrogate.scan import clamp_scan, last_nonzero, linear_scan, play_scan
+from surgisoft.surrogate.scan import (
+    clamp_scan,
+    direction_scan,
+    direction_step,
+    last_nonzero,
+    linear_scan,
+    play_scan,
+)
 
 
 def walk(steps: int, seed: int, chambers: int = 2, runs: int = 2) -> torch.Tensor:
@@ -54,7 +60,7 @@ def test_last_nonzero_by_hand():
 
 def test_direction_keeps_its_value_while_the_pressure_rests():
     pressure = torch.tensor([0.0, 0.0, 3.0, 3.0, 3.05, 2.95, 3.0, 1.0, 1.0]).view(1, -1, 1)
-    _, direction = trace(pressure, torch.tensor([0.2]), torch.zeros(1))
+    _, direction = direction_scan(pressure, torch.tensor([0.2]), torch.zeros(1))
     assert direction.flatten().tolist() == [0, 0, 1, 1, 1, 1, 1, -1, -1]
 
 
@@ -62,10 +68,10 @@ def test_direction_keeps_its_value_while_the_pressure_rests():
 def test_direction_steps_as_it_traces(steps, seed):
     pressure, band = walk(steps, seed), torch.tensor([0.3, 0.6])
     rest = torch.tensor([0.5, -1.0])
-    anchors, directions = trace(pressure, band, rest)
+    anchors, directions = direction_scan(pressure, band, rest)
     anchor, direction = rest.expand(2, 2), torch.zeros(2, 2)
     for t in range(steps):
-        anchor, direction = advance(anchor, direction, pressure[:, t], band)
+        anchor, direction = direction_step(anchor, direction, pressure[:, t], band)
         assert torch.equal(anchor, anchors[:, t])
         assert torch.equal(direction, directions[:, t])
 

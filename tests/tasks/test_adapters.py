@@ -11,21 +11,22 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import surgisoft
+from surgisoft.environments import ONE_AGENT
 from surgisoft.errors import InputError
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Referee
+from surgisoft.scene.packaged import PHANTOM
 from surgisoft.scene.refereed import RefereedScene
 from surgisoft.tasks.parallel import parallel_env
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS
-from surgisoft.tasks.single import ONE_ARM, BatchedEnv, SingleEnv
+from surgisoft.tasks.single import BatchedEnv, SingleEnv
 from surgisoft.tasks.track import TrackConfig
-from surgisoft.tasks.world.scene import PHANTOM
 
 SHORT = TrackConfig(FollowConfig(loop_s=1.0, approach_s=0.5))
 every_task = pytest.mark.parametrize("name", TASKS)
-one_arm = pytest.mark.parametrize("name", ONE_ARM)
+one_arm = pytest.mark.parametrize("name", ONE_AGENT)
 
 
 @every_task

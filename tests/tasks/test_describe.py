@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from surgisoft.environments import ONE_AGENT
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.describe import describe, renewed
 from surgisoft.tasks.numpy_adapter import NumpyAdapter
 from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
-from surgisoft.tasks.single import ONE_ARM
 from surgisoft.tasks.world.arm import Randomisation
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
@@ -80,4 +80,4 @@ def test_the_docs_hold_the_present_reference():
 
 
 def test_the_tasks_of_one_agent_follow_from_the_registry():
-    assert set(TASKS) - set(ONE_ARM) == {"circle_ablation"}
+    assert set(TASKS) - set(ONE_AGENT) == {"circle_ablation"}

@@ -33,7 +33,7 @@ from surgisoft.diagnosis.discrepancy import body_covariance, kernel
 from surgisoft.diagnosis.residuals import noise_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects import ArmFacts, Effect, known_effects, make_effect
 from surgisoft.surrogate.history import History, pack
@@ -310,9 +310,9 @@ def _slopes(design: Design, signal: Signals, effect: Effect, columns: np.ndarray
 
     columns: (S, n, 3, K) change with each of its amplitudes.
     """
-    strengths = torch.cat([p.flatten() for p in effect.strengths().values()]).numpy()
+    strengths = torch.cat([p.flatten() for p in effect.amplitudes().values()]).numpy()
     now, answer = columns @ strengths, []
-    for name, parameter in effect.shapes().items():
+    for name, parameter in effect.nonlinear_parameters().items():
         for i, value in enumerate(parameter.flatten().tolist()):
             other = copy.deepcopy(effect)
             step = SHAPE_STEP * max(1.0, abs(value))
@@ -643,7 +643,7 @@ def uncertainty_of(
     points, length = model.spec.key_points, length_of(model)
     if noise_mm is None:
         noise_mm = np.full(points, CAMERA_SHARE * length)
-    validated = [value or 0.0 for value in model.validation.get("per_key_point_mm", [])]
+    validated = [value or 0.0 for value in model.validation.per_key_point_mm]
     surrogate = np.array(validated or [0.05 * length] * points)
     return Uncertainty(
         np.asarray(noise_mm, float),

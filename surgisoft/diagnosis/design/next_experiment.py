@@ -56,23 +56,23 @@ from surgisoft.diagnosis.design.schedules import (
     words_for,
 )
 from surgisoft.diagnosis.effect_knowledge import gravity_load, knowledge_of
+from surgisoft.diagnosis.estimation.effects import with_fitted
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
     identification_problem,
-    on_one_thread,
     open_inputs,
 )
-from surgisoft.diagnosis.refinement.sharpen import with_fitted
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import Protocol
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import Effect, known_effects, make_effect
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
 
 # Competing effects and what is known of them -----------------------------------------------------
 
@@ -243,7 +243,7 @@ def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> l
         if best is None or gains[best] < CLEAR:
             continue
         effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
-        for parameter in effect.strengths().values():
+        for parameter in effect.amplitudes().values():
             part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
             parameter.data.copy_(part.view_as(parameter))
             first += parameter.numel()
@@ -453,7 +453,7 @@ def _own_weight(question: Question, design: Design, setting: Setup) -> tuple[np.
     load = make_effect(name, replace(model.facts, gravity=tuple(float(v) for v in pull)))
     known = knowledge_of(name)
     amplitude = known.tip_mass if setting.payload_g else known.own_weight
-    column = list(load.strengths()).index(amplitude)
+    column = list(load.amplitudes()).index(amplitude)
     motion = columns_on(design, [Shape(name, load)])[0][..., column : column + 1]
     uncertainty = question.uncertainty
     change = float(np.linalg.norm(pull))
@@ -602,7 +602,7 @@ class Recommendation:
         }
 
 
-@on_one_thread
+@torch_threads(1)
 def next_experiment(
     model: Model,
     recordings: Recordings = (),

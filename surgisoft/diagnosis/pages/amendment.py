@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Track
+from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import Improvement, Round
-from surgisoft.diagnosis.refinement.intervals import Parameter, values_text
 from surgisoft.report import Facts, Page, Picture, Section, Table, Text
 from surgisoft.report.charts import BLUE, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED

@@ -1,1 +1,18 @@
-"""Conversion of raw laboratory files into recordings."""
+"""Import of a laboratory's own files as recordings, by a map file (docs/recordings.md)."""
+
+from surgisoft.measurement.importing.convert import Imported, import_files
+from surgisoft.measurement.importing.raw import RawTable, Reader
+from surgisoft.measurement.importing.readers import READERS
+from surgisoft.measurement.importing.ready_maps import READY_MAPS
+from surgisoft.measurement.importing.spec import ImportMap, load_map
+
+__all__ = [
+    "READERS",
+    "READY_MAPS",
+    "ImportMap",
+    "Imported",
+    "RawTable",
+    "Reader",
+    "import_files",
+    "load_map",
+]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.map_file import SECONDS_PER
+from surgisoft.measurement.importing.raw import Column, FileRole, RawTable
 from surgisoft.measurement.importing.rotation import between
-from surgisoft.measurement.importing.spec import Column, FileRole, ImportMap
-from surgisoft.measurement.importing.tables import RawTable
+from surgisoft.measurement.importing.spec import ImportMap
+from surgisoft.measurement.importing.units import SECONDS_PER
 
 SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""
@@ -127,31 +127,34 @@ def join(
 
     `held` ones are not interpolated; `turns` are the quaternions among them, by role.
     """
-    main_role, *others = spec.files
-    main = tables[main_role.name]
+    main_role, *_ = spec.file
+    others = {name: role for name, role in spec.file.items() if name != main_role}
+    others = {name: role for name, role in others.items() if needed.get(name)}
+    main = tables[main_role]
     values = {name: tables[name].numbers(columns) for name, columns in needed.items() if columns}
-    count = len(values[main_role.name]) if main_role.name in values else None
+    count = len(values[main_role]) if main_role in values else None
     t_s = main_times(main, spec, count)
     rows = np.arange(len(t_s))
     notes = [f"{table.path}: {note}" for table in tables.values() for note in table.notes]
     picks: dict[str, np.ndarray] = {}
     keep = np.ones(len(rows), bool)
-    for role in (role for role in others if role.name in values and role.join == "rows"):
-        picks[role.name] = rows - role.offset_rows
-        keep &= _paired(role, tables[role.name], main, len(rows), len(values[role.name]), notes)
-    columns = _columns(main_role.name, needed, values, rows)
-    for role in (role for role in others if role.name in values):
+    for name, role in others.items():
         if role.join == "rows":
-            pick = np.clip(picks[role.name], 0, len(values[role.name]) - 1)
-            columns |= _columns(role.name, needed, values, pick)
+            picks[name] = rows - role.offset_rows
+            keep &= _paired(role, tables[name], main, len(rows), len(values[name]), notes)
+    columns = _columns(main_role, needed, values, rows)
+    for name, role in others.items():
+        if role.join == "rows":
+            pick = np.clip(picks[name], 0, len(values[name]) - 1)
+            columns |= _columns(name, needed, values, pick)
         else:
-            names, table = needed[role.name], tables[role.name]
-            held_here = [(role.name, column) in held for column in names]
-            turned = [[names.index(c) for c in turn] for turn in turns.get(role.name, [])]
-            matched, inside = _by_time(role, table, t_s, values[role.name], held_here, turned)
-            columns |= _columns(role.name, needed, {role.name: matched}, rows)
+            wanted, table = needed[name], tables[name]
+            held_here = [(name, column) in held for column in wanted]
+            turned = [[wanted.index(c) for c in turn] for turn in turns.get(name, [])]
+            matched, inside = _by_time(role, table, t_s, values[name], held_here, turned)
+            columns |= _columns(name, needed, {name: matched}, rows)
             keep &= inside
-            _note_time_join(role, tables[role.name], main, inside, notes)
+            _note_time_join(role, table, main, inside, notes)
     keep &= (rows + 1 >= spec.rows.first) & (rows + 1 <= (spec.rows.last or len(rows)))
     if not keep.any():
         raise InputError(

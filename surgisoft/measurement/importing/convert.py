@@ -1,4 +1,4 @@
-"""Somebody else's files into recordings, as a map says.
+"""Turns a laboratory's own files into recordings, as a map says.
 
 The steps: every file gets its role, files that belong together form a set, a set's files are joined
 to one row a sample, positions are brought into the arm's base frame, rows are tidied, and the sets
@@ -15,14 +15,14 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.align import Joined, join
-from surgisoft.measurement.importing.map_file import factor
-from surgisoft.measurement.importing.motive import is_motive, motive_table
 from surgisoft.measurement.importing.points import (
-    key_point_maps,
+    key_points_of,
     needed_columns,
     quaternions,
     read_points,
 )
+from surgisoft.measurement.importing.raw import Column, RawTable
+from surgisoft.measurement.importing.readers import AUTO, open_raw, reader
 from surgisoft.measurement.importing.rows import (
     Draft,
     point_numbers,
@@ -33,14 +33,12 @@ from surgisoft.measurement.importing.rows import (
 )
 from surgisoft.measurement.importing.spec import (
     ActuationMap,
-    Column,
-    ContextMap,
-    FileRole,
+    ContextSource,
     ImportMap,
 )
-from surgisoft.measurement.importing.tables import RawTable, parquet_table, text_table
 from surgisoft.measurement.importing.timing import timing_notes
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.importing.units import factor
+from surgisoft.measurement.recordings import Recording
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 
@@ -73,22 +71,23 @@ def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path
 
     A role with one file serves every set.
     """
-    by_role: dict[str, list[Path]] = {role.name: [] for role in spec.files}
+    by_role: dict[str, list[Path]] = {name: [] for name in spec.file}
     for path in _files(paths, spec):
-        by_role[_role_of(path, spec).name].append(path)
-    main = by_role[spec.files[0].name]
+        by_role[_role_of(path, spec)].append(path)
+    main = by_role[spec.main]
     needed = {s.file for s in (spec.measured, spec.commanded, spec.key_points) if s}
-    for role in spec.files:
-        count = len(by_role[role.name])
-        if count == 0 and (role is spec.files[0] or role.name in needed):
+    for name, role in spec.file.items():
+        count = len(by_role[name])
+        if count == 0 and (name == spec.main or name in needed):
+            kind = "" if role.format == AUTO else f" and is {reader(role.format).about}"
             raise InputError(
-                f"no file for [file.{role.name}] of the map, expected one that matches "
-                f"'{role.match}'" + (" and is a Motive export" * (role.format == "motive"))
+                f"no file for [file.{name}] of the map, expected one that matches "
+                f"'{role.match}'{kind}"
             )
         if count not in (0, 1, len(main)):
             raise InputError(
-                f"{count} files for [file.{role.name}] and {len(main)} for "
-                f"[file.{spec.files[0].name}], expected one, or one for each"
+                f"{count} files for [file.{name}] and {len(main)} for "
+                f"[file.{spec.main}], expected one, or one for each"
             )
     return [
         {name: files[i if len(files) > 1 else 0] for name, files in by_role.items() if files}
@@ -114,16 +113,17 @@ def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
     return found
 
 
-def _roles_of(path: Path, spec: ImportMap) -> list[FileRole]:
+def _roles_of(path: Path, spec: ImportMap) -> list[str]:
     """The roles whose pattern and format fit."""
     return [
-        role
-        for role in spec.files
-        if fnmatch.fnmatch(path.name, role.match) and (role.format != "motive" or is_motive(path))
+        name
+        for name, role in spec.file.items()
+        if fnmatch.fnmatch(path.name, role.match)
+        and (role.format == AUTO or reader(role.format).fits(path))
     ]
 
 
-def _role_of(path: Path, spec: ImportMap) -> FileRole:
+def _role_of(path: Path, spec: ImportMap) -> str:
     """The first role that fits."""
     roles = _roles_of(path, spec)
     if not roles:
@@ -132,27 +132,19 @@ def _role_of(path: Path, spec: ImportMap) -> FileRole:
 
 
 def _patterns(spec: ImportMap) -> str:
-    return "one of " + ", ".join(f"[file.{role.name}] '{role.match}'" for role in spec.files)
-
-
-def _open(path: Path, role: FileRole) -> RawTable:
-    if role.format == "motive":
-        return motive_table(path, role)
-    if role.format == "parquet" or (role.format == "auto" and path.suffix == ".parquet"):
-        return parquet_table(path)
-    if path.suffix == ".tsv" and role.separator == ",":
-        role = replace(role, separator="\t")
-    return text_table(path, role)
+    return "one of " + ", ".join(
+        f"[file.{name}] '{role.match}'" for name, role in spec.file.items()
+    )
 
 
 def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     """One set of files as a recording on the main file's own clock."""
-    tables = {name: _open(path, spec.role(name)) for name, path in files.items()}
+    tables = {name: open_raw(path, spec.file[name]) for name, path in files.items()}
     measured = _with_columns(spec.measured, tables, "p")
     commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
     commanded = commanded if commanded and commanded.columns else None
     _check_actuation(measured, commanded, tables)
-    points = key_point_maps(spec.key_points, tables[spec.key_points.file])
+    points = key_points_of(spec.key_points, tables[spec.key_points.file])
     needed: dict[str, list[Column]] = {name: [] for name in tables}
     needed[measured.file] += measured.columns
     needed[spec.key_points.file] += needed_columns(points, spec.frame)
@@ -160,8 +152,13 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     if commanded:
         needed[commanded.file] += commanded.columns
         held = {(commanded.file, column) for column in commanded.columns}
-    main = spec.files[0].name
-    needed[main] += [c.column for c in spec.context.values() if c.column is not None]
+    main = spec.main
+    sources = (spec.context.temp_C, spec.context.payload_g)
+    needed[main] += [
+        source.column
+        for source in sources
+        if isinstance(source, ContextSource) and source.column is not None
+    ]
     needed = {name: list(dict.fromkeys(columns)) for name, columns in needed.items()}
     turns = {spec.key_points.file: quaternions(points, spec.frame)}
     joined = join(tables, spec, held, needed, turns)
@@ -180,7 +177,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
         commanded=_actuation(joined, commanded) if commanded else None,
         context=_context(joined, spec, main),
         run=_runs(joined, spec),
-        point=_settled_points(joined, spec),
+        point=_steady_state_numbers(joined, spec),
     )
     draft, notes = tidy(draft, spec, joined.main.cells.place)
     recording = _recording(draft, spec, measured.to or measured.unit, placed.gravity, joined)
@@ -234,9 +231,9 @@ def _check_actuation(
 def _actuation(joined: Joined, spec: ActuationMap) -> np.ndarray:
     """(T, m) in the unit that the map asks for; untouched where it asks for nothing."""
     values = joined.take(spec.file, spec.columns)
-    if spec.scale:
+    if spec.scale is not None:
         values = values * np.array(spec.scale)
-    if spec.offset:
+    if spec.offset is not None:
         values = values + np.array(spec.offset)
     by = factor(spec.unit, spec.to) if spec.to else 1.0
     if by is None:
@@ -248,19 +245,22 @@ def _context(joined: Joined, spec: ImportMap, main: str) -> np.ndarray:
     """(T, 2) temperature and payload, NaN where the map says nothing."""
     values = np.full((len(joined.t_s), 2), np.nan)
     for i, name in enumerate(("temp_C", "payload_g")):
-        if name in spec.context:
-            values[:, i] = _context_value(joined, spec.context[name], name, main)
+        source = getattr(spec.context, name)
+        if source is not None:
+            values[:, i] = _context_value(joined, source, name, main)
     return values
 
 
-def _context_value(joined: Joined, spec: ContextMap, name: str, main: str) -> np.ndarray | float:
+def _context_value(
+    joined: Joined, spec: float | ContextSource, name: str, main: str
+) -> np.ndarray | float:
+    if isinstance(spec, float):
+        return spec
     if spec.column is not None:
         return joined.columns[main, spec.column]
-    if not spec.from_name:
-        return spec.value
     match = re.search(spec.from_name, joined.main.path.name)
-    if match is None and spec.value is not None:
-        return spec.value
+    if match is None and spec.otherwise is not None:
+        return spec.otherwise
     try:
         return float(match[1])
     except (TypeError, ValueError) as error:
@@ -275,7 +275,7 @@ def _runs(joined: Joined, spec: ImportMap) -> np.ndarray:
     return run_numbers(joined.t_s, labels, spec.runs.gap_s, spec.runs.time_restarts)
 
 
-def _settled_points(joined: Joined, spec: ImportMap) -> np.ndarray:
+def _steady_state_numbers(joined: Joined, spec: ImportMap) -> np.ndarray:
     if spec.rows.average is None:
         return np.zeros(len(joined.t_s), np.int64)
     return point_numbers(joined.texts(spec.rows.average))
@@ -301,8 +301,8 @@ def _recording(
         commanded=draft.commanded,
         run=draft.run,
         unit=unit,
-        temp_C=draft.context[:, 0] if "temp_C" in spec.context else None,
-        payload_g=draft.context[:, 1] if "payload_g" in spec.context else None,
+        temp_C=draft.context[:, 0] if spec.context.temp_C is not None else None,
+        payload_g=draft.context[:, 1] if spec.context.payload_g is not None else None,
         **about,
     )
 

@@ -1,12 +1,14 @@
 """Centres of key feature planes from markers on their rim: plane and circle fit in 3D."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.align import Joined
-from surgisoft.measurement.importing.motive import bodies, planes
+from surgisoft.measurement.importing.raw import Column, RawTable
 from surgisoft.measurement.importing.rotation import (
     check_pose,
     matrices,
@@ -15,12 +17,11 @@ from surgisoft.measurement.importing.rotation import (
 )
 from surgisoft.measurement.importing.spec import (
     BaseMap,
-    Column,
     FrameMap,
     KeyPointsMap,
-    PointMap,
+    Position,
+    Quaternion,
 )
-from surgisoft.measurement.importing.tables import RawTable
 from surgisoft.measurement.recordings.columns import MM_PER
 
 _COLLINEAR = 0.02
@@ -115,14 +116,32 @@ class Points:
     """What was done, in words."""
 
 
-def key_point_maps(spec: KeyPointsMap, table: RawTable) -> tuple[PointMap, ...]:
+@dataclass(frozen=True)
+class KeyPoint:
+    """Where one key point comes from."""
+
+    positions: tuple[Position, ...]
+    """One position, or at least three markers on a circle around the key point."""
+    quaternion: Quaternion | None = None
+    """Orientation of the body that the key point is fixed to, where it has an offset."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Key point in the body's own axes, relative to its position [unit of the positions]."""
+
+
+def key_points_of(spec: KeyPointsMap, table: RawTable) -> tuple[KeyPoint, ...]:
     """The key points of the map, or all that the motion capture file has."""
+    if spec.auto is None:
+        return (
+            *(KeyPoint((position,)) for position in spec.positions),
+            *(KeyPoint(markers) for markers in spec.markers),
+            *(KeyPoint((p.position,), p.quaternion, p.offset) for p in spec.point),
+        )
     if spec.auto == "bodies":
-        found = tuple(PointMap((name,)) for name in bodies(table))
+        found = tuple(KeyPoint((name,)) for name in sorted(table.bodies, key=natural_order))
         expected = "rigid bodies in the file's header"
-    elif spec.auto == "planes":
-        groups = planes(table, spec.pattern)
-        found = tuple(PointMap(tuple(names)) for names in groups)
+    else:
+        groups = planes(table.markers, spec.pattern)
+        found = tuple(KeyPoint(tuple(names)) for names in groups)
         expected = f"markers whose names fit the pattern {spec.pattern!r}"
         for names in groups:
             if len(names) < 3:
@@ -130,11 +149,29 @@ def key_point_maps(spec: KeyPointsMap, table: RawTable) -> tuple[PointMap, ...]:
                     f"{table.path}: plane of {', '.join(names)} has {len(names)} markers, expected "
                     'at least 3 for a circle fit; use auto = "bodies" or another pattern'
                 )
-    else:
-        return spec.points
     if not found:
         raise InputError(f"{table.path}: no key point found, expected {expected}")
     return found
+
+
+def natural_order(name: str) -> list[tuple[int, int | str]]:
+    """Key by which 'Disc2' comes before 'Disc10'."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]
+
+
+def planes(markers: Sequence[str], pattern: str) -> list[list[str]]:
+    """Markers of each plane, planes and markers in natural order.
+
+    A marker belongs to the plane that the expression's first group finds in its name; names that do
+    not fit belong to none.
+    """
+    found: dict[str, list[str]] = {}
+    for name in markers:
+        match = re.match(pattern, name)
+        if match:
+            found.setdefault(match[1], []).append(name)
+    return [sorted(found[plane], key=natural_order) for plane in sorted(found, key=natural_order)]
 
 
 def columns_of(entry: tuple[Column, ...] | str, axes: str) -> tuple[Column, ...]:
@@ -144,7 +181,7 @@ def columns_of(entry: tuple[Column, ...] | str, axes: str) -> tuple[Column, ...]
     return tuple(entry)
 
 
-def needed_columns(points: tuple[PointMap, ...], frame: FrameMap) -> list[Column]:
+def needed_columns(points: tuple[KeyPoint, ...], frame: FrameMap) -> list[Column]:
     """All columns of positions and orientations."""
     found: list[Column] = []
     for point in points:
@@ -157,14 +194,14 @@ def needed_columns(points: tuple[PointMap, ...], frame: FrameMap) -> list[Column
     return found
 
 
-def quaternions(points: tuple[PointMap, ...], frame: FrameMap) -> list[tuple[Column, ...]]:
+def quaternions(points: tuple[KeyPoint, ...], frame: FrameMap) -> list[tuple[Column, ...]]:
     """The four columns of every orientation."""
     found = [columns_of(point.quaternion, "xyzw") for point in points if point.quaternion]
     return found + ([columns_of(frame.base.quaternion, "xyzw")] if frame.base else [])
 
 
 def read_points(
-    joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...], frame: FrameMap, unit: str
+    joined: Joined, spec: KeyPointsMap, maps: tuple[KeyPoint, ...], frame: FrameMap, unit: str
 ) -> Points:
     """Key points in the arm's base frame; `unit` is the unit of the raw positions."""
     scale = MM_PER[unit]
@@ -179,7 +216,7 @@ def read_points(
     origin = rest[0] if isinstance(frame.origin, str) else np.array(frame.origin) * scale
     if np.isnan(origin).any():
         raise InputError(f"{joined.main.path}: key point k0 is missing in every row at rest")
-    rotation = frame.rotation
+    rotation = frame.matrix
     if frame.align_z == "rest":
         rotation = turn_to_z(_chord(joined, rotation @ (rest - origin).T, frame)) @ rotation
     key_points = (turned - origin) @ rotation.T
@@ -192,7 +229,7 @@ def read_points(
 
 
 def _raw_point(
-    joined: Joined, spec: KeyPointsMap, point: PointMap, j: int, scale: float, notes: list[str]
+    joined: Joined, spec: KeyPointsMap, point: KeyPoint, j: int, scale: float, notes: list[str]
 ) -> np.ndarray:
     """One key point (T, 3) in the raw frame [mm]."""
     role = spec.file
@@ -241,7 +278,7 @@ def _stale(joined: Joined, cells: np.ndarray) -> np.ndarray:
     return np.concatenate([[False], same])
 
 
-def _stale_notes(joined: Joined, spec: KeyPointsMap, maps: tuple[PointMap, ...]) -> list[str]:
+def _stale_notes(joined: Joined, spec: KeyPointsMap, maps: tuple[KeyPoint, ...]) -> list[str]:
     counts = []
     for point in maps:
         cells = [joined.take(spec.file, columns_of(p, "xyz")) for p in point.positions]
@@ -302,7 +339,7 @@ def _chord(joined: Joined, rest: np.ndarray, frame: FrameMap) -> np.ndarray:
 
 
 def _note_tilt(key_points: np.ndarray, frame: FrameMap, notes: list[str]) -> None:
-    """Say so where the arm at rest does not point along z."""
+    """Add a note where the arm at rest does not point along z."""
     rest = _rest(key_points, frame.rest_rows)
     start = rest[0] if len(rest) > 1 else np.zeros(3)
     chord = rest[-1] - start

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Where, describe
 from surgisoft.errors import InputError
@@ -51,63 +52,58 @@ def _numbers(value: object) -> np.ndarray | None:
     return array if array.shape in ((3, 3), (4,)) and np.isfinite(array).all() else None
 
 
-def matrices(quaternions: np.ndarray, order: str) -> np.ndarray:
-    """Rotation matrices (T, 3, 3) of quaternions (T, 4); NaN where a quaternion is missing.
+LENGTH_TOLERANCE = 0.05
+"""A quaternion whose length is off by more is no orientation and counts as missing."""
 
-    A quaternion and its negative give the same matrix, so flips of sign do not matter here. A
-    length that is not 1 within 5 % is no orientation and counts as missing. Kuipers, Quaternions
-    and Rotation Sequences, 1999, chapter 5.
+
+def _known(quaternions: np.ndarray) -> np.ndarray:
+    """(T,) bool: which quaternions (T, 4) are orientations."""
+    return np.abs(np.linalg.norm(quaternions, axis=1) - 1) < LENGTH_TOLERANCE
+
+
+def _rotations(quaternions: np.ndarray, order: str) -> Rotation:
+    return Rotation.from_quat(quaternions, scalar_first=order == "wxyz")
+
+
+def matrices(quaternions: np.ndarray, order: str) -> np.ndarray:
+    """Rotation matrices (T, 3, 3) of quaternions (T, 4) in the order "xyzw" or "wxyz".
+
+    NaN where a quaternion is missing. A quaternion and its negative give the same matrix.
     """
-    q = quaternions if order == "xyzw" else quaternions[:, [1, 2, 3, 0]]
-    length = np.linalg.norm(q, axis=1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        x, y, z, w = np.where(np.abs(length - 1) < 0.05, q / length, np.nan).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    known = _known(quaternions)
+    found = np.full((len(quaternions), 3, 3), np.nan)
+    if known.any():
+        found[known] = _rotations(quaternions[known], order).as_matrix()
+    return found
 
 
 def mean_rotation(quaternions: np.ndarray, order: str) -> np.ndarray:
-    """The average orientation (3, 3) of quaternions (T, 4), whatever their signs.
+    """The mean orientation (3, 3) of quaternions (T, 4), whatever their signs; NaN where none.
 
-    The eigenvector of the largest eigenvalue of sum q q^T: Markley, Cheng, Crassidis and Oshman,
-    Averaging Quaternions, 2007, eqs. 12 and 13.
+    Markley, Cheng, Crassidis and Oshman, Averaging Quaternions, 2007, by scipy.
     """
-    length = np.linalg.norm(quaternions, axis=1)
-    good = np.abs(length - 1) < 0.05
-    if not good.any():
+    known = _known(quaternions)
+    if not known.any():
         return np.full((3, 3), np.nan)
-    q = quaternions[good] / length[good, None]
-    _, vectors = np.linalg.eigh(q.T @ q)
-    return matrices(vectors[:, -1][None], order)[0]
+    return _rotations(quaternions[known], order).mean().as_matrix()
 
 
 def between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Unit quaternions (T, 4) a share (T,) of the shortest way from first to second (T, 4).
 
     At a constant rate about one axis: Shoemake, Animating Rotation with Quaternion Curves, 1985.
-    Either order of the four numbers and either sign of a quaternion will do; NaN where a length
-    is not 1 within 5 %. A share of 0 or 1 gives the given quaternion as it is.
+    The way is a great circle of the unit quaternions, so either order of the four numbers will do.
+    The sign of a result is free. NaN where a quaternion is missing; a share of 0 or 1 gives the
+    given quaternion as it is.
     """
-    lengths = [np.linalg.norm(q, axis=1, keepdims=True) for q in (first, second)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        a, b = (
-            np.where(np.abs(length - 1) < 0.05, q / length, np.nan)
-            for q, length in zip((first, second), lengths, strict=True)
-        )
-        cosine = (a * b).sum(axis=1, keepdims=True)
-        b = np.where(cosine < 0, -b, b)
-        angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-        part = share[:, None]
-        far = angle > 1e-6
-        sine = np.where(far, np.sin(angle), 1.0)
-        turned = np.where(far, np.sin((1 - part) * angle) / sine, 1 - part) * a
-        turned += np.where(far, np.sin(part * angle) / sine, part) * b
-        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    return np.where(part == 0, first, np.where(part == 1, second, turned))
+    found = np.full(first.shape, np.nan)
+    known = _known(first) & _known(second)
+    if known.any():
+        start, end = Rotation.from_quat(first[known]), Rotation.from_quat(second[known])
+        way = (start.inv() * end).as_rotvec()
+        found[known] = (start * Rotation.from_rotvec(share[known, None] * way)).as_quat()
+    part = share[:, None]
+    return np.where(part == 0, first, np.where(part == 1, second, found))
 
 
 def turn_to_z(direction: np.ndarray) -> np.ndarray:

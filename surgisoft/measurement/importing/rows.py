@@ -15,13 +15,13 @@ from surgisoft.measurement.importing.align import (
     without_holds,
 )
 from surgisoft.measurement.importing.spec import ImportMap
+from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.quality import frozen_channels, spikes
-from surgisoft.measurement.recordings.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """Samples on their way into a recording; every array has one entry a sample."""
+    """Samples before they become a recording; every array has one entry a sample."""
 
     row: np.ndarray
     """(T,) row of the main file, counted from 0."""
@@ -38,7 +38,7 @@ class Draft:
     run: np.ndarray
     """(T,) number of the run inside this set of files."""
     point: np.ndarray
-    """(T,) number of the settled point that a row belongs to; -1: none."""
+    """(T,) number of the steady-state point that a row belongs to; -1: none."""
 
     def take(self, rows: np.ndarray) -> "Draft":
         """These samples (indices or a mask)."""
@@ -181,13 +181,15 @@ def _in_time(draft: Draft, spec: ImportMap, notes: list[str], place: Callable[[i
 
 
 def _averaged(draft: Draft, notes: list[str]) -> Draft:
-    """One sample a settled point: the mean of its rows; missing values are left out of it."""
+    """One sample a steady-state point: the mean of its rows, without missing values."""
     draft = draft.take(draft.point >= 0)
     if not len(draft.t_s):
-        raise InputError("no row has a settled point, expected labels in the column of 'average'")
+        raise InputError(
+            "no row belongs to a steady-state point, expected labels in the column of 'average'"
+        )
     keys = np.stack([draft.point, draft.run], axis=1)
     starts = np.flatnonzero(np.r_[True, (np.diff(keys, axis=0) != 0).any(axis=1)])
-    notes.append(f"{len(draft.t_s)} rows averaged into {len(starts)} settled points")
+    notes.append(f"{len(draft.t_s)} rows averaged into {len(starts)} steady-state points")
 
     def mean(values: np.ndarray) -> np.ndarray:
         known = ~np.isnan(values)

@@ -1,214 +1,391 @@
-"""What a map file can say, as frozen dataclasses; docs/recordings.md describes every field."""
+"""What a map file can say, as frozen dataclasses; docs/recordings.md describes every field.
 
-from dataclasses import dataclass, field
-from typing import Any
+A map says how a laboratory's own files become recordings: which files, columns, units and frame.
+`load_map` reads one; surgisoft/config.py gives every bad field its line.
+"""
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
-Column = str | int
-"""A column by its name or, counted from 1, by its number."""
+from surgisoft.config import (
+    POSITIVE,
+    Rule,
+    Where,
+    at_least,
+    describe,
+    from_table,
+    one_of,
+    parse_toml,
+    read_toml,
+)
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing.raw import TIME_UNIT, Column, FileRole
+from surgisoft.measurement.importing.readers import ADVICE, AUTO, NOT_READ, formats, reader
+from surgisoft.measurement.importing.ready_maps import READY_MAPS
+from surgisoft.measurement.importing.rotation import parse_rotation
+from surgisoft.measurement.importing.units import check_conversion
+from surgisoft.measurement.recordings import ArmInfo
+from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.measurement.recordings.sidecar import GravityTable, RecordingTable, Sidecar
 
 
-@dataclass(frozen=True)
-class FileRole:
-    """One kind of raw file: how it is written and how its rows belong to the main file's."""
+def _not_empty(value: Any) -> bool:
+    return len(value) > 0
 
-    name: str
-    """Name of the role, as the columns' sections refer to it."""
-    match: str = "*"
-    """Pattern of the file names that have this role."""
-    format: str = "auto"
-    """"text", "parquet", "motive" or "auto" (by the name's ending)."""
-    separator: str = ","
-    """One character, or "whitespace"."""
-    decimal: str = "."
-    """Decimal sign of text files."""
-    header: bool = True
-    """Whether a line of column names comes first."""
-    skip_rows: int = 0
-    """Lines before the header, or before the numbers where there is no header."""
-    comment: str = ""
-    """Lines that start with this are passed over."""
-    missing: tuple[str, ...] = ()
-    """Texts that mean a missing value, besides the empty cell and NaN."""
-    join: str = "rows"
-    """"rows": row by row with the main file; "time": matched by time."""
-    offset_rows: int = 0
-    """Row i of this file belongs to row i + offset_rows of the main file."""
-    unpaired: str = "error"
-    """What is done with rows at the end that have no partner: "error" or "drop"."""
-    time: Column = "t_s"
-    """Time column of a file that is joined by time."""
-    time_unit: str = "s"
-    """Unit of that column."""
-    clock_offset_s: float = 0.0
-    """Added to this file's times to get the main file's clock [s]."""
-    clock: str = "shared"
-    """"shared", or "from_start": both files' times count from their first row."""
-    interpolate: str = "linear"
-    """Between this file's rows: "linear" or "previous"."""
-    max_gap_s: float = 1.0
-    """Samples that fall into a longer gap of this file are dropped [s]."""
+
+def _is_expression(text: str) -> bool:
+    try:
+        return re.compile(text).groups >= 1
+    except re.error:
+        return False
+
+
+Position = Annotated[
+    tuple[Column, Column, Column] | str, Rule("three columns or a name", _not_empty)
+]
+"""Columns of x, y, z, or the name of a motion capture file's body or marker."""
+Quaternion = Annotated[
+    tuple[Column, Column, Column, Column] | str, Rule("four columns or a name", _not_empty)
+]
+"""Columns of a quaternion, or the name of a motion capture file's body."""
+Plane = Annotated[
+    tuple[Position, ...],
+    Rule("at least three markers (columns or names)", lambda markers: len(markers) >= 3),
+]
+"""The markers on a circle around a key point."""
+Expression = Annotated[str, Rule("a regular expression with one group", _is_expression)]
+Unit = Annotated[
+    str,
+    Rule(
+        'letters and digits only, such as "kPa"',
+        lambda text: re.fullmatch(r"[A-Za-z%][A-Za-z0-9%]*", text) is not None,
+    ),
+]
+PerChannel = Annotated[
+    float | tuple[float, ...],
+    Rule("a number or a number a channel", lambda value: value != ()),
+]
+UNIT_VECTOR = Rule(
+    "three numbers, a unit vector", lambda vector: abs(np.linalg.norm(vector) - 1) <= 0.01
+)
 
 
 @dataclass(frozen=True)
 class TimeMap:
-    """Where the time comes from."""
+    """[time]: where the time comes from."""
 
-    file: str
     column: Column | None = None
     """Column of the main file."""
-    unit: str = "s"
+    unit: Annotated[str, TIME_UNIT] = "s"
     """A unit of time, or "iso" for dates such as 2024-05-01T12:00:00.25."""
-    rate_hz: float | None = None
+    rate_hz: Annotated[float, POSITIVE] | None = None
     """Nominal rate where there are no time stamps [Hz]; with a column, the column counts frames."""
-    zero: str = "file"
+    zero: Annotated[str, one_of(("file", "recording", "none"))] = "file"
     """"file": each file starts at 0; "recording": the first one does; "none": as it is."""
+
+    def checked(self, where: Where) -> "TimeMap":
+        """Needs a column or a rate."""
+        if self.column is None and self.rate_hz is None:
+            raise where.error("neither column nor rate_hz", "a column, a rate, or both")
+        return self
 
 
 @dataclass(frozen=True)
 class ActuationMap:
-    """Columns of the measured or commanded actuation."""
+    """[measured] or [commanded]: columns of the actuation."""
 
-    file: str
-    columns: tuple[Column, ...] = ()
+    file: str = ""
+    """Role of the file; empty: the main file."""
+    columns: Annotated[tuple[Column, ...], Rule("a list of columns", _not_empty)] = ()
     """One a channel; none: the columns that are named as in a recording (p1_kPa or c1_kPa)."""
-    unit: str = ""
+    unit: Unit = ""
     """Unit of the columns."""
     to: str = ""
     """Unit to convert to; empty: as it is."""
-    scale: tuple[float, ...] = ()
+    scale: PerChannel | None = None
     """Value = scale * cell + offset, one for all channels or one each."""
-    offset: tuple[float, ...] = ()
+    offset: PerChannel | None = None
     delay_s: float = 0.0
     """By how much this log is late: what stands at t was true at t - delay_s [s]. Positive where
     the body seems to move before its actuation."""
-    repeated: str = "keep"
+    repeated: Annotated[str, one_of(("keep", "interpolate"))] = "keep"
     """Readings of a sensor that is slower than the log: "keep" them held until the next one, or
     "interpolate" between readings."""
+
+    def checked(self, where: Where) -> "ActuationMap":
+        """Columns need a unit; the other numbers must fit the columns."""
+        if self.columns and not self.unit:
+            raise (where / "unit").error("missing", 'the columns\' unit such as "kPa"')
+        if self.to and self.unit:
+            check_conversion(self.unit, self.to, where / "to")
+        for name in ("scale", "offset"):
+            value = getattr(self, name)
+            if self.columns and isinstance(value, tuple) and len(value) not in (1, self.channels):
+                raise (where / name).error(
+                    f"got {describe([*value])}", f"one number, or {self.channels}, one a channel"
+                )
+        return self
+
+    @property
+    def channels(self) -> int:
+        """Number of columns."""
+        return len(self.columns)
 
 
 @dataclass(frozen=True)
 class PointMap:
-    """One key point: a position, or at least three markers on a circle around it."""
+    """[[key_points.point]]: one key point fixed to a rigid body."""
 
-    positions: tuple[tuple[Column, Column, Column] | str, ...]
-    """One entry for a position, three or more for markers; a text names a body or marker."""
-    quaternion: tuple[Column, Column, Column, Column] | str = ()
+    position: Position
+    """Position of the body, or of the key point itself."""
+    quaternion: Quaternion | None = None
     """Orientation of the body, where `offset` is used."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Key point in the body's own axes, relative to its position [unit of the positions]."""
 
+    def checked(self, where: Where) -> "PointMap":
+        """An offset needs an orientation."""
+        if any(self.offset) and self.quaternion is None:
+            raise (where / "quaternion").error(
+                "missing", "the body's orientation, since there is an offset"
+            )
+        return self
+
 
 @dataclass(frozen=True)
 class KeyPointsMap:
-    """The key points, base to tip."""
+    """[key_points]: the key points, base to tip."""
 
-    file: str
-    points: tuple[PointMap, ...] = ()
-    auto: str = ""
-    """"planes" (circle fit of each group of markers) or "bodies": all that a Motive file has."""
-    pattern: str = r"(.+):"
+    file: str = ""
+    """Role of the file; empty: the main file."""
+    positions: tuple[Position, ...] = ()
+    """Three columns, or one name, a key point."""
+    markers: tuple[Plane, ...] = ()
+    """Markers on the rim of each key point's plane; the key point is the centre of their circle."""
+    point: tuple[PointMap, ...] = ()
+    """Key points fixed to rigid bodies."""
+    auto: Annotated[str, one_of(("planes", "bodies"))] | None = None
+    """"planes" (circle fit of each group of markers) or "bodies": all that the file has."""
+    pattern: Expression = r"(.+):"
     """For auto: the first group of this expression, in a marker's name, is its plane."""
-    unit: str = ""
-    """Unit of the positions; empty: as the Motive file says."""
-    quaternion_order: str = "xyzw"
+    unit: Annotated[str, one_of(MM_PER)] | None = None
+    """Unit of the positions; none: as the file says."""
+    quaternion_order: Annotated[str, one_of(("xyzw", "wxyz"))] = "xyzw"
     """Order of quaternions' columns: "xyzw" or "wxyz"."""
-    repeated: str = "keep"
+    repeated: Annotated[str, one_of(("keep", "missing"))] = "keep"
     """Positions that repeat bit-equal: "keep" them, or "missing" where mocap is slower."""
-    spikes: str = "keep"
+    spikes: Annotated[str, one_of(("keep", "missing"))] = "keep"
     """Key points that jump away and back within a few rows: "keep" or "missing"."""
-    max_residual_mm: float = np.inf
+    max_residual_mm: Annotated[float, POSITIVE] = math.inf
     """A circle that misses its markers by more (rms) is a missing key point [mm]."""
+
+    def checked(self, where: Where) -> "KeyPointsMap":
+        """The key points are given in one way."""
+        names = ("positions", "markers", "point", "auto")
+        given = [name for name in names if getattr(self, name)]
+        if len(given) != 1:
+            raise where.error(
+                f"got {' and '.join(given) or 'nothing'}", f"exactly one of {', '.join(names)}"
+            )
+        return self
 
 
 @dataclass(frozen=True)
 class BaseMap:
-    """A body fixed to the arm's base, whose pose sets the frame."""
+    """[frame.base]: a body fixed to the arm's base, whose pose sets the frame."""
 
-    position: tuple[Column, Column, Column] | str
-    quaternion: tuple[Column, Column, Column, Column] | str
-    mode: str = "fixed"
+    position: Position
+    quaternion: Quaternion
+    mode: Annotated[str, one_of(("fixed", "rest", "moving"))] = "fixed"
     """"fixed": average over the file; "rest": over its first rows; "moving": row by row."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class FrameMap:
-    """From raw positions to the arm's base frame, in this order: base, origin, rotation, align."""
+    """[frame]: from raw positions to the arm's base frame: base, origin, rotation, then align_z."""
 
     base: BaseMap | None = None
-    origin: tuple[float, float, float] | str = (0.0, 0.0, 0.0)
+    origin: Annotated[
+        tuple[float, float, float] | str,
+        Rule('three numbers or "k0"', lambda value: value == "k0" or not isinstance(value, str)),
+    ] = (0.0, 0.0, 0.0)
     """Subtracted [unit of the positions], or "k0": key point 0 at rest."""
-    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """(3, 3); arm = rotation @ raw."""
-    align_z: str = ""
-    """"rest": turn z onto the line from key point 0 (or the origin) to the tip at rest."""
-    gravity: tuple[float, float, float] | None = None
-    """Direction of weight in the raw frame."""
-    rest_rows: int = 20
-    """Rows at the start of a file where the arm is at rest."""
+    rotation: Any = "x y z"
+    """Arm's axes in the raw frame: signed axes, a 3x3 matrix of rows, or a quaternion xyzw."""
+    mirror: bool = False
+    """Whether the raw frame is left-handed, so that `rotation` must swap handedness."""
+    align_z: Annotated[str, one_of(("rest",))] | None = None
+    """"rest": turn once more so that the arm at rest points along z."""
+    gravity: Annotated[tuple[float, float, float], UNIT_VECTOR] | None = None
+    """(3,) direction of the weight in the raw frame."""
+    rest_rows: Annotated[int, at_least(1)] = 20
+    """The arm is at rest during this many first rows."""
+
+    def checked(self, where: Where) -> "FrameMap":
+        """The rotation must be one."""
+        parse_rotation(self.rotation, where / "rotation", self.mirror)
+        return self
+
+    @cached_property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) the rotation: rows are the arm's axes in the raw frame."""
+        return parse_rotation(self.rotation, Where(Path("frame")), self.mirror)
 
 
 @dataclass(frozen=True)
 class RowsMap:
-    """Which rows are kept."""
+    """[rows]: which rows are kept."""
 
-    first: int = 1
+    first: Annotated[int, at_least(1)] = 1
     """First row of the main file, counted from 1 without the header."""
     last: int | None = None
     """Last row that is kept."""
-    every: int = 1
+    every: Annotated[int, at_least(1)] = 1
     """Keep each n-th row."""
-    repeated_time: str = "error"
+    repeated_time: Annotated[str, one_of(("error", "drop"))] = "error"
     """Rows whose time does not increase over the row before: "error" or "drop"."""
-    duplicates: str = "keep"
+    duplicates: Annotated[str, one_of(("keep", "drop"))] = "keep"
     """Rows equal to the one before in every value but the time: "keep" or "drop"."""
-    frozen: str = "keep"
+    frozen: Annotated[str, one_of(("keep", "drop"))] = "keep"
     """Rows in which measured actuation is frozen: "keep" or "drop"."""
     average: Column | None = None
-    """Column whose equal values mark rows that are averaged into one settled point."""
+    """Column whose equal values mark rows that are averaged into one steady-state sample."""
+
+    def checked(self, where: Where) -> "RowsMap":
+        """The last row comes after the first."""
+        if self.last is not None and self.last < self.first:
+            raise (where / "last").error(f"got {self.last}", f"an integer >= {self.first}")
+        return self
 
 
 @dataclass(frozen=True)
 class RunsMap:
-    """What starts a new run besides a new file."""
+    """[runs]: what starts a new run besides a new file."""
 
     column: Column | None = None
     """A new value in this column."""
-    gap_s: float | None = None
+    gap_s: Annotated[float, POSITIVE] | None = None
     """A gap in time longer than this [s]."""
     time_restarts: bool = False
     """Time that jumps back."""
 
 
 @dataclass(frozen=True)
-class ContextMap:
-    """A constant, a column, or a number in the file's name."""
+class ContextSource:
+    """A column, or a number in the file's name."""
 
-    value: float | None = None
     column: Column | None = None
-    from_name: str = ""
+    from_name: Expression | None = None
     """Expression whose first group in the main file's name is the number."""
+    otherwise: float | None = None
+    """The value where the name has none."""
+
+    def checked(self, where: Where) -> "ContextSource":
+        """One source."""
+        if (self.column is None) == (self.from_name is None):
+            raise where.error("got a table", A_CONTEXT.expected)
+        return self
+
+
+A_CONTEXT = Rule("a number, {column = ...} or {from_name = ...}", lambda _: True)
 
 
 @dataclass(frozen=True)
+class ContextMap:
+    """[context]: temperature and payload, each a constant or where it comes from."""
+
+    temp_C: Annotated[float | ContextSource, A_CONTEXT] | None = None
+    payload_g: Annotated[float | ContextSource, A_CONTEXT] | None = None
+
+
+A_FILE = Rule("at least one table [file.NAME]", _not_empty)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ImportMap:
     """The whole map."""
 
-    files: tuple[FileRole, ...]
-    """Roles; the first one is the main file, whose rows are the samples."""
+    file: Annotated[dict[str, FileRole], Rule("at least one table [file.NAME]", _not_empty)] = (
+        field(default_factory=lambda: {"main": FileRole()})
+    )
+    """Roles by name; the first one is the main file, whose rows are the samples."""
     time: TimeMap
     measured: ActuationMap
-    commanded: ActuationMap | None
+    commanded: ActuationMap | None = None
     key_points: KeyPointsMap
-    frame: FrameMap
-    rows: RowsMap
-    runs: RunsMap
-    context: dict[str, ContextMap]
-    """By the recording's column: temp_C, payload_g."""
-    sidecar: dict[str, Any]
-    """Fields of the recording that the map states: arm, kind, noise_mm, note, gravity."""
+    frame: FrameMap = FrameMap()
+    rows: RowsMap = RowsMap()
+    runs: RunsMap = RunsMap()
+    context: ContextMap = ContextMap()
+    arm: ArmInfo = field(default_factory=ArmInfo)
+    gravity: GravityTable = field(default_factory=GravityTable)
+    recording: RecordingTable = field(default_factory=RecordingTable)
 
-    def role(self, name: str) -> FileRole:
-        """The role of this name."""
-        return next(role for role in self.files if role.name == name)
+    @property
+    def main(self) -> str:
+        """Name of the main file's role."""
+        return next(iter(self.file))
+
+    @property
+    def sidecar(self) -> dict[str, Any]:
+        """Fields of the recording that the map states: arm, kind, noise_mm, note, gravity."""
+        return Sidecar(self.arm, self.gravity, self.recording).fields
+
+    def checked(self, where: Where) -> "ImportMap":
+        """Roles that are named exist, and sections that name none get the main file."""
+        main = self.file[self.main]
+        for name, role in self.file.items():
+            _check_format(role.format, where / "file" / name / "format")
+        if main.join == "time" or main.offset_rows:
+            raise (where / "file" / self.main).error(
+                "the first file is the main one", "join and offset_rows at the others only"
+            )
+        if self.commanded and self.commanded.repeated != "keep":
+            raise (where / "commanded" / "repeated").error(
+                f"got {describe(self.commanded.repeated)}",
+                '"keep": a command is held until the next one',
+            )
+        filled = {}
+        for name in ("measured", "commanded", "key_points"):
+            part = getattr(self, name)
+            if part and part.file and part.file not in self.file:
+                raise (where / name / "file").error(
+                    f"got {describe(part.file)}", f"one of {', '.join(self.file)}"
+                )
+            filled[name] = replace(part, file=part.file or self.main) if part else None
+        found = self.file[filled["key_points"].file]
+        states_unit = found.format != AUTO and reader(found.format).states_unit
+        if self.key_points.unit is None and not states_unit:
+            raise (where / "key_points" / "unit").error(
+                "missing", f"the positions' unit, one of {', '.join(MM_PER)}"
+            )
+        return replace(self, **filled)
+
+
+def _check_format(name: str, where: Where) -> None:
+    known = formats()
+    if name not in known:
+        kind = NOT_READ.get(name.lower())
+        came = f"got {describe(name)}" + (f", {kind}, which no reader reads" if kind else "")
+        expected = f"one of {', '.join(known)}" + (f"; {ADVICE}" if kind else "")
+        raise where.error(came, expected)
+
+
+def load_map(name: str) -> ImportMap:
+    """The map of this path, or the ready map of this name."""
+    if name in READY_MAPS:
+        where = Where(Path(f"ready map '{name}'"), READY_MAPS[name])
+        return from_table(ImportMap, parse_toml(where.text, where.path), where)
+    path = Path(name)
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such map, expected a TOML file or one of the ready maps "
+            f"{', '.join(READY_MAPS)}"
+        )
+    return from_table(ImportMap, *read_toml(path))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from surgisoft.measurement.importing.align import renewal_s, renewed_rows, without_holds
-from surgisoft.measurement.recordings.recording import Recording
+from surgisoft.measurement.recordings import Recording
 
 BACK_S = 0.5
 """Largest shift at which the body moves first [s]."""
@@ -20,9 +20,9 @@ LEAST_ROWS = 200
 STEPS = 25
 """Shifts on each side of zero, before those around the best one."""
 BLOCKS = 30
-"""Blocks of time whose errors are told apart."""
+"""Blocks of time over which the errors are summed separately."""
 FOLDS = 5
-"""Parts that take turns in judging."""
+"""Folds of the cross-validation."""
 MOVE_SHARE = 0.25
 """The longest moves last until their mean square is this share of twice the body's variance."""
 LONGEST_S = 5.0
@@ -126,7 +126,7 @@ class Moves:
         return rows, np.concatenate(moved)
 
     def _errors(self, rows, moved: np.ndarray, length: int, shift: int) -> np.ndarray:
-        """(BLOCKS,) squared error of moves (S, d), each judged without its own part [mm^2]."""
+        """(BLOCKS,) squared error of moves (S, d), each left out of its own fit [mm^2]."""
         parts = zip(self.actuation, rows, strict=True)
         features = np.concatenate(
             [_features(p[at - shift]) - _features(p[at - shift - length]) for p, at in parts]
@@ -214,7 +214,7 @@ class Lead:
 
 
 def held_period_s(recording: Recording) -> float | None:
-    """The period of a sensor that is slower than the log while the body moves on [s], if it is.
+    """The period of a sensor that is slower than the log while the body moves on [s]; else None.
 
     Not where readings come irregularly, as quantised or resting ones do, nor where the command
     changes in the very same rows: then the actuation may be a staircase indeed.
@@ -258,11 +258,11 @@ def released(recording: Recording, period_s: float) -> Recording:
 
 
 def body_lead(recording: Recording) -> Lead | None:
-    """The body's lead before its measured actuation, where the recording shows one beyond doubt.
+    """The body's lead before its measured actuation, where the recording shows one significantly.
 
     Moves of the body x(t) - x(t - w) are regressed on those of a quadratic function of the
-    actuation, shifted in time; judged on blocks that took no part. A lead is called one where it
-    leaves less than every lag (so that a periodic motion, whose lead is as good as a lag, shows
+    actuation, shifted in time, and cross-validated. A lead is reported where it leaves a smaller
+    error than every lag (so that a periodic motion, whose lead is as good as a lag, shows
     none), and where shorter moves show it too: a late log shifts every speed of motion alike,
     whereas an arm's relaxation, or a readings' hold, shifts some of them only.
     """

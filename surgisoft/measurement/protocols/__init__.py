@@ -1,7 +1,17 @@
-"""Protocols: which pressures a rig is told to reach, when, and how samples are taken."""
+"""Protocols: which pressures a rig is commanded to reach, when, and how samples are taken."""
 
 from surgisoft.measurement.protocols.catalogue import PROTOCOLS, Entry, make_protocol
+from surgisoft.measurement.protocols.continuous import SIGNALS, Knots, Signal
 from surgisoft.measurement.protocols.protocol import Protocol
 from surgisoft.measurement.protocols.schedule_file import load_schedule
 
-__all__ = ["PROTOCOLS", "Entry", "Protocol", "load_schedule", "make_protocol"]
+__all__ = [
+    "PROTOCOLS",
+    "SIGNALS",
+    "Entry",
+    "Knots",
+    "Protocol",
+    "Signal",
+    "load_schedule",
+    "make_protocol",
+]

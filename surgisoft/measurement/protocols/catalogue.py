@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.measurement.protocols import continuous, settled
+from surgisoft.measurement.protocols import continuous, steady_state
 from surgisoft.measurement.protocols.protocol import Protocol
 from surgisoft.measurement.protocols.schedule_file import load_schedule
 
@@ -23,57 +23,56 @@ class Entry:
     about: str
     """One line."""
     points: int
-    """Samples where none are asked for: settled points, or frames at 20 Hz."""
-    settled: Callable | None = None
-    """Builder of settled points."""
-    figures: tuple[Callable, ...] = ()
-    """Figures of a continuous schedule, one run each."""
+    """Samples where none are asked for: steady-state points, or frames at 20 Hz."""
+    steady_state: Callable | None = None
+    """Builder of the pressures of steady-state points."""
+    signals: tuple[str, ...] = ()
+    """Excitation signals of a continuous schedule, one run each."""
 
 
-FIGURES = (
-    continuous.ramps,
-    continuous.holds,
-    continuous.reversals,
-    continuous.ladder,
-    continuous.wander,
-)
+MIXED = ("ramps", "holds", "reversals", "ladder", "wander")
+"""Excitation signals of the mixed protocol, in the order of its runs."""
 
 PROTOCOLS: dict[str, Entry] = {
     "grid": Entry(
         "every point of the 24-level lattice once, direction and memory excited everywhere",
         13824,
-        settled=settled.grid,
+        steady_state=steady_state.grid,
     ),
     "traverse": Entry(
         "plain back-and-forth traverse of the lattice; the slow chamber only ever rises",
         13824,
-        settled=settled.traverse,
+        steady_state=steady_state.traverse,
     ),
     "walk": Entry(
-        "random walk over 24 levels, all chambers, minor loops", 13824, settled=settled.walk
+        "random walk over 24 levels, all chambers, minor loops",
+        13824,
+        steady_state=steady_state.walk,
     ),
     "validation": Entry(
-        "straight legs between random pressures, off the lattice", 1000, settled=settled.validation
+        "straight legs between random pressures, off the lattice",
+        1000,
+        steady_state=steady_state.validation,
     ),
     "test": Entry(
-        "smooth oscillations of all chambers, off the lattice", 1000, settled=settled.test
+        "smooth oscillations of all chambers, off the lattice", 1000, steady_state=steady_state.test
     ),
-    "ramps": Entry("ramps at 2, 4, 8 and 16 kPa/s, 5 minutes", 6000, figures=(continuous.ramps,)),
-    "holds": Entry("quick steps held for 5 to 40 s, 5 minutes", 6000, figures=(continuous.holds,)),
+    "ramps": Entry("ramps at 2, 4, 8 and 16 kPa/s, 5 minutes", 6000, signals=("ramps",)),
+    "holds": Entry("quick steps held for 5 to 40 s, 5 minutes", 6000, signals=("holds",)),
     "reversals": Entry(
         "small reversals about many mean pressures, 5 minutes",
         6000,
-        figures=(continuous.reversals,),
+        signals=("reversals",),
     ),
     "ladder": Entry(
         "triangles of growing and shrinking amplitude, 5 minutes",
         6000,
-        figures=(continuous.ladder,),
+        signals=("ladder",),
     ),
     "mixed": Entry(
         "ramps, holds, reversals, ladder and a random walk, one run each, 10 minutes",
         12000,
-        figures=FIGURES,
+        signals=MIXED,
     ),
 }
 
@@ -84,7 +83,7 @@ def make_protocol(
     """A protocol of the catalogue, or a schedule file by its path.
 
     limits: (m, 2) lowest and highest actuation [kPa]; points: samples (default: the catalogue's);
-    seed: draws the random parts; each protocol draws its own numbers.
+    seed: of the random parts; each protocol has its own random number stream.
     """
     if str(name).endswith(".csv"):
         if points is not None:
@@ -98,8 +97,8 @@ def make_protocol(
         raise InputError(f"--points is {points}, expected at least 10")
     rng = np.random.default_rng([seed, zlib.crc32(str(name).encode())])
     limits = np.asarray(limits, np.float64)
-    if entry.settled:
-        commands, run = entry.settled(points, limits, rng)
+    if entry.steady_state:
+        commands, run = entry.steady_state(points, limits, rng)
         return Protocol(str(name), "settled", commands, run)
-    t_s, commands, run = continuous.schedule(entry.figures, points, PERIOD_S, limits, rng)
+    t_s, commands, run = continuous.schedule(entry.signals, points, PERIOD_S, limits, rng)
     return Protocol(str(name), "continuous", commands, run, t_s)

@@ -1,9 +1,20 @@
-"""Continuous schedules: knots of time and pressure, between which the command is linear."""
+"""Excitation signals: continuous commands as knots of time and pressure, linear between knots.
+
+Each signal excites some effects of an arm more than others: ramps its rate dependence, holds its
+creep, reversals its hysteresis. SIGNALS names them all; the protocols of `surgisoft collect` choose
+from it.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 BRISK = 20.0
 """Rate at which a schedule goes to a starting point [kPa/s]."""
+QUICK = 60.0
+"""Rate of a step [kPa/s]; the experiment design scales rates to the arm's range."""
 
 
 class Knots:
@@ -99,16 +110,107 @@ def wander(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
         knots.go(rng.uniform(knots.low, knots.high), float(np.exp(rng.uniform(0.7, 3.0))))
 
 
-def schedule(figures, points: int, period_s: float, limits: np.ndarray, rng: np.random.Generator):
-    """Knot times, rows and run ids of one run a figure, `points` samples together."""
+def _subset(rng: np.random.Generator, chambers: int) -> np.ndarray:
+    """(m,) 1 for the chambers of a random single, pair or larger set, 0 for the others.
+
+    Has the distribution of `_some` but draws the size first: the schedules of a seed depend on it.
+    """
+    number = int(rng.integers(1, chambers + 1))
+    return (rng.permutation(chambers) < number).astype(float)
+
+
+def two_speeds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
+    """The same path at 3, 20 and 60 kPa/s: separates what depends on time from what does not."""
+    while knots.now < seconds:
+        chosen = _subset(rng, len(knots.low))
+        top = chosen * rng.uniform(0.5, 1.0) * knots.high
+        for rate in rng.permutation([3.0, 20.0, 60.0]):
+            for target in (top, 0.4 * top, 0.8 * top, 0.0 * top):
+                knots.go(target, rate)
+
+
+def steps(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
+    """Quick steps to random pressures, held for 1.5 to 4 s."""
+    while knots.now < seconds:
+        knots.go(rng.uniform(knots.low, knots.high), QUICK)
+        knots.hold(rng.uniform(1.5, 4.0))
+
+
+def long_holds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
+    """A quick step to a high pressure held for 40 s, then 20 s at rest."""
+    while knots.now < seconds:
+        chosen = _subset(rng, len(knots.low))
+        knots.go(chosen * rng.uniform(0.6, 1.0) * knots.high, QUICK)
+        knots.hold(40.0)
+        knots.go(np.zeros_like(chosen), QUICK)
+        knots.hold(20.0)
+
+
+def returns(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
+    """To the same two postures and back to rest, again and again: shows drift and slow recovery."""
+    postures = [rng.uniform(0.0, 0.9, len(knots.high)) * knots.high for _ in range(2)]
+    for posture in itertools.cycle(postures):
+        if knots.now >= seconds:
+            return
+        for target in (posture, np.zeros_like(posture)):
+            knots.go(target, 20.0)
+            knots.hold(4.0)
+
+
+def sets(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
+    """Each chamber alone, each pair, all together, up and down in steady sweeps."""
+    m = len(knots.high)
+    chosen = [c for c in itertools.product([0.0, 1.0], repeat=m) if any(c)] if m <= 4 else []
+    while knots.now < seconds:
+        order = rng.permutation(len(chosen)) if chosen else range(8)
+        for k in order:
+            pick = np.array(chosen[k]) if chosen else _subset(rng, m)
+            for level in (1.0, 0.5, 1.0, 0.0):
+                knots.go(pick * level * knots.high, 16.0)
+                knots.hold(0.5)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One kind of excitation."""
+
+    about: str
+    """What is done, in words; {channels} stands for what the actuation goes to."""
+    draw: Callable[[Knots, float, np.random.Generator], None]
+    """Writes at least so many seconds into knots."""
+
+
+SIGNALS: dict[str, Signal] = {
+    "ramps": Signal("ramps at four speeds", ramps),
+    "two_speeds": Signal("the same paths slowly and fast", two_speeds),
+    "steps": Signal("quick steps with short stops", steps),
+    "long_holds": Signal("high loads held for 40 s, then rest", long_holds),
+    "holds": Signal("steps held for 5 to 40 s", holds),
+    "reversals": Signal("small reversals about many mean loads", reversals),
+    "ladder": Signal("triangles of growing and shrinking amplitude", ladder),
+    "returns": Signal("the same two postures and rest, again and again", returns),
+    "sets": Signal("single, pair and all {channels} in steady sweeps", sets),
+    "wander": Signal("straight legs between random loads at random rates", wander),
+}
+"""Every excitation signal by name."""
+
+
+def schedule(
+    signals: Sequence[str],
+    points: int,
+    period_s: float,
+    limits: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Knot times (K,), rows (K, m), run ids (K,): one run a signal, `points` samples in all."""
     times, rows, runs = [], [], []
-    edges = np.round(np.linspace(0, points, len(figures) + 1)).astype(int)
-    for run, (figure, count) in enumerate(zip(figures, np.diff(edges), strict=True)):
+    edges = np.round(np.linspace(0, points, len(signals) + 1)).astype(int)
+    for run, (name, count) in enumerate(zip(signals, np.diff(edges), strict=True)):
         if count == 0:
             continue
         seconds = float(count * period_s)
         knots = Knots(limits)
-        figure(knots, seconds, rng)
+        SIGNALS[name].draw(knots, seconds, rng)
         t, p = knots.cut(seconds)
         times.append(t)
         rows.append(p)

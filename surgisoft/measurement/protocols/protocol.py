@@ -1,4 +1,4 @@
-"""A protocol is data, so that anybody can write their own."""
+"""The commands of a protocol as data, so that anybody can write their own."""
 
 import itertools
 from dataclasses import dataclass
@@ -6,19 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.errors import InputError
-
-KINDS = ("settled", "continuous")
+from surgisoft.measurement.recordings.recording import KINDS
 
 
 @dataclass(frozen=True, eq=False)
 class Protocol:
-    """Commands for a rig. Each run begins with a vented, rested arm."""
+    """Commands for a rig; each run begins with a vented arm at rest."""
 
     name: str
-    """What recordings made with it are called."""
+    """Name of the recordings made with it."""
     kind: str
-    """"settled": one averaged sample a row; "continuous": samples at the rig's rate, the command
-    linear between rows."""
+    """"settled": one averaged steady-state sample a row; "continuous": samples at the rig's
+    rate, the command linear between rows."""
     commands: np.ndarray
     """(T, m) float64, commanded actuation [unit]."""
     run: np.ndarray
@@ -26,9 +25,9 @@ class Protocol:
     t_s: np.ndarray | None = None
     """(T,) float64, time of each row from the start of its run [s]; continuous protocols only."""
     settle_s: float = 3.0
-    """Time between a command and its first sample [s]; settled only (Chen et al. 2025, III-B)."""
+    """Time between a command and its sample [s]; steady-state only (Chen et al. 2025, III-B)."""
     average_s: float = 1.0
-    """Time over which samples are averaged to one [s]; settled only (same)."""
+    """Time over which samples are averaged to one [s]; steady-state only (same source)."""
     unit: str = "kPa"
     """Unit of the commands."""
 
@@ -49,7 +48,9 @@ class Protocol:
         if self.kind == "continuous":
             self._check_times()
         elif not (self.settle_s >= 0 and self.average_s > 0):
-            self._fail(f"settles {self.settle_s} s and averages {self.average_s} s, expected > 0")
+            self._fail(
+                f"settle_s {self.settle_s} and average_s {self.average_s}, expected >= 0 and > 0"
+            )
 
     def _check_times(self) -> None:
         if self.t_s is None or np.shape(self.t_s) != self.run.shape:
@@ -77,7 +78,8 @@ class Protocol:
         return [(int(self.run[a]), slice(a, b)) for a, b in itertools.pairwise(edges)]
 
     def commands_at(self, rows: slice, period_s: float) -> np.ndarray:
-        """(F, m) commands of one run for samples every `period_s` [s]; settled: its rows."""
+        """(F, m) commands of one run for samples every `period_s` [s]; for steady-state
+        points, its rows."""
         if self.kind == "settled":
             return self.commands[rows]
         knots = self.t_s[rows] - self.t_s[rows.start]

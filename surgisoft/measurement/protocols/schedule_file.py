@@ -1,6 +1,5 @@
-"""Schedules of one's own: a CSV file with the columns t_s, c1_kPa ... cm_kPa and maybe run."""
+"""User-defined schedules: a CSV file with the columns t_s, c1_kPa ... cm_kPa and maybe run."""
 
-import csv
 import re
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols.protocol import Protocol
+from surgisoft.measurement.tables import DelimitedText, read_text
 
 COMMAND = re.compile(r"c(\d+)_(\w+)")
 
@@ -15,18 +15,20 @@ COMMAND = re.compile(r"c(\d+)_(\w+)")
 def load_schedule(path: str | Path) -> Protocol:
     """The continuous protocol in a CSV file; the command is linear between its rows."""
     path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in csv.reader(file) if line]
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the schedule ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: the schedule is not a text file") from error
-    if len(lines) < 3:
-        raise InputError(f"{path}: {max(len(lines) - 1, 0)} rows, a schedule needs at least two")
-    header = [name.strip() for name in lines[0]]
+    head, _, body = read_text(path).partition(b"\n")
+    header = [name.strip() for name in head.decode("utf-8", "replace").split(",")]
     columns, unit = _command_columns(path, header)
-    table = _numbers(path, header, lines[1:])
+    cells = DelimitedText(path, body, 2, header, missing=())
+    table = cells.numbers(range(len(header)))
+    if len(table) < 2:
+        raise InputError(f"{path}: {len(table)} rows, a schedule needs at least two")
+    bad = np.argwhere(~np.isfinite(table))
+    if len(bad):
+        row, column = bad[0].tolist()
+        raise InputError(
+            f"{cells.place(row)}, column '{header[column]}': got {table[row, column]}, "
+            "expected a finite number"
+        )
     run = table[:, header.index("run")] if "run" in header else np.zeros(len(table))
     if (run != np.round(run)).any():
         raise InputError(f"{path}: column run has a value that is not a whole number")
@@ -55,24 +57,3 @@ def _command_columns(path: Path, header: list[str]) -> tuple[list[int], str]:
     if len(units) > 1:
         raise InputError(f"{path}: commands in {', '.join(sorted(units))}, expected one unit")
     return [found[i][0] for i in sorted(found)], units.pop()
-
-
-def _numbers(path: Path, header: list[str], lines: list[list[str]]) -> np.ndarray:
-    """The table (T, columns) behind the header."""
-    table = np.empty((len(lines), len(header)))
-    for row, line in enumerate(lines):
-        if len(line) != len(header):
-            raise InputError(
-                f"{path}: row {row + 2} has {len(line)} cells, the header has {len(header)}"
-            )
-        for column, cell in enumerate(line):
-            try:
-                table[row, column] = float(cell)
-            except ValueError:
-                table[row, column] = np.nan
-            if not np.isfinite(table[row, column]):
-                raise InputError(
-                    f"{path}: row {row + 2}, column {header[column]} is '{cell.strip()}', "
-                    "expected a number"
-                )
-    return table

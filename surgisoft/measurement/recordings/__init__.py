@@ -1,1 +1,34 @@
-"""Recordings: their columns, files, sidecars and data-quality warnings."""
+"""Recordings: what a lab measured on one arm, in memory and on disk, and how good the data are.
+
+The file format is described in docs/recordings.md.
+"""
+
+from surgisoft.measurement.recordings.file import (
+    check_writable,
+    load_recording,
+    load_recordings,
+    save_recording,
+)
+from surgisoft.measurement.recordings.quality import QualityWarning, find_warnings, summary
+from surgisoft.measurement.recordings.recording import (
+    KINDS,
+    ArmInfo,
+    Recording,
+    check_rows,
+    check_same_arm,
+)
+
+__all__ = [
+    "KINDS",
+    "ArmInfo",
+    "QualityWarning",
+    "Recording",
+    "check_rows",
+    "check_same_arm",
+    "check_writable",
+    "find_warnings",
+    "load_recording",
+    "load_recordings",
+    "save_recording",
+    "summary",
+]

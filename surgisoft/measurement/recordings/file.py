@@ -1,8 +1,9 @@
 """Recordings from and to files: finding, reading with every check, writing as a whole or not."""
 
+import csv
 import itertools
-import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +12,50 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from surgisoft.errors import InputError
-from surgisoft.measurement.recordings import table
+from surgisoft.files import new_file
 from surgisoft.measurement.recordings.columns import Layout, parse_header
-from surgisoft.measurement.recordings.quality import find_oddities
+from surgisoft.measurement.recordings.quality import find_warnings
 from surgisoft.measurement.recordings.recording import (
     Recording,
     first_run_again,
     first_time_backwards,
 )
 from surgisoft.measurement.recordings.sidecar import read_sidecar, sidecar_of, sidecar_text
+from surgisoft.measurement.tables import DelimitedText, ParquetTable, read_text
 
+SUFFIXES = (".csv", ".parquet")
+"""Suffixes of the files that hold recordings."""
+
+Table = DelimitedText | ParquetTable
 Warn = Callable[[str], None]
 
 
-def find(paths: list[Path], warn: Warn) -> list[Path]:
+def load_recording(path: str | Path, on_warning: Warn | None = None) -> Recording:
+    """Read one recording; data-quality warnings go to `on_warning` (default: warnings.warn)."""
+    return _read(Path(path), on_warning or _warn)
+
+
+def load_recordings(
+    paths: Iterable[str | Path | Recording] | str | Path | Recording,
+    on_warning: Warn | None = None,
+) -> list[Recording]:
+    """Read files, and every recording of folders in the order of their names.
+
+    Recordings that are open already stay as they are.
+    """
+    given = [paths] if isinstance(paths, str | Path | Recording) else list(paths)
+    if any(isinstance(item, Recording) for item in given):
+        read = ([i] if isinstance(i, Recording) else load_recordings(i, on_warning) for i in given)
+        return [recording for part in read for recording in part]
+    files = _find([Path(p) for p in given], on_warning or _warn)
+    return [load_recording(file, on_warning) for file in files]
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, stacklevel=2)
+
+
+def _find(paths: list[Path], warn: Warn) -> list[Path]:
     """The recordings that files and folders name, folders in the order of their files' names."""
     if not paths:
         raise InputError("no recording given, expected a file or a folder of recordings")
@@ -44,7 +75,7 @@ def _in_folder(folder: Path) -> list[Path]:
     files = sorted(
         file
         for file in folder.iterdir()
-        if file.suffix in table.SUFFIXES and file.is_file() and not file.name.startswith(".")
+        if file.suffix in SUFFIXES and file.is_file() and not file.name.startswith(".")
     )
     if not files:
         raise InputError(f"{folder}: no .csv or .parquet in this folder, expected recordings")
@@ -57,31 +88,63 @@ def _in_folder(folder: Path) -> list[Path]:
     return files
 
 
-def read(path: Path, warn: Warn) -> Recording:
+def _read(path: Path, warn: Warn) -> Recording:
     """One recording with every check of the format."""
-    if path.suffix not in table.SUFFIXES and path.exists() and not path.is_dir():
+    table = _open(path)
+    header = f"{path}, line 1" if path.suffix == ".csv" else f"{path}"
+    layout = parse_header(table.names, header)
+    for name in layout.ignored:
+        warn(f"{path}: column '{name}' is not part of the format and was left out")
+    cells = table.numbers(layout.used)
+    if len(cells) == 0:
+        raise InputError(f"{path}: the table is empty, expected at least one row of numbers")
+    at = {column: i for i, column in enumerate(layout.used)}
+    _check_finite(table, cells, layout)
+    rows = _rows_with_actuation(table, cells, layout, at, warn)
+    recording = _assemble(table, cells[rows], rows, layout, at)
+    for found in find_warnings(recording):
+        warn(f"{table.place(int(rows[found.sample]))}: {found.text}")
+    return recording
+
+
+def _open(path: Path) -> DelimitedText | ParquetTable:
+    """The table of a file; its columns are not read yet."""
+    if path.suffix not in SUFFIXES and path.exists() and not path.is_dir():
         raise InputError(
             f"{path}: suffix '{path.suffix}', expected .csv or .parquet; "
             "'surgisoft import' reads other files"
         )
-    table.check_is_file(path)
-    names = table.read_header(path)
-    layout = parse_header(names, table.header_place(path))
-    for name in layout.ignored:
-        warn(f"{path}: column '{name}' is not part of the format and was left out")
-    cells = table.read_numbers(path, names, layout.used)
-    if len(cells) == 0:
-        raise InputError(f"{path}: the table is empty, expected at least one row of numbers")
-    at = {column: i for i, column in enumerate(layout.used)}
-    _check_finite(path, cells, layout)
-    rows = _rows_with_actuation(path, cells, layout, at, warn)
-    recording = _assemble(path, cells[rows], rows, layout, at)
-    for oddity in find_oddities(recording):
-        warn(f"{table.row_place(path, int(rows[oddity.sample]))}: {oddity.text}")
-    return recording
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, expected a file")
+    if not path.exists():
+        raise InputError(f"{path}: no such file, expected a recording (.csv or .parquet)")
+    if not path.is_file():
+        raise InputError(f"{path}: not a regular file, expected a recording (.csv or .parquet)")
+    return ParquetTable.open(path) if path.suffix == ".parquet" else _open_csv(path)
 
 
-def _check_finite(path: Path, cells: np.ndarray, layout: Layout) -> None:
+def _open_csv(path: Path) -> DelimitedText:
+    head, _, body = read_text(path).partition(b"\n")
+    try:
+        text = head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not text in UTF-8, expected comma-separated values") from error
+    if not text.strip():
+        raise InputError(f"{path}, line 1: is blank, expected the names of the columns")
+    try:
+        names = next(csv.reader([text]))
+    except csv.Error as error:
+        raise InputError(f"{path}, line 1: {error}, expected the names of the columns") from error
+    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
+        if len(names) < 3 and text.count(separator) >= 3:
+            raise InputError(
+                f"{path}, line 1: separated by {called}, expected commas; "
+                "'surgisoft import' reads other separators"
+            )
+    return DelimitedText(path, body, 2, names)
+
+
+def _check_finite(table: Table, cells: np.ndarray, layout: Layout) -> None:
     """No infinite cell anywhere; no missing time or run."""
     needed = [i for i in (layout.time, layout.run) if i is not None]
     strict = np.isin(layout.used, needed)
@@ -91,13 +154,13 @@ def _check_finite(path: Path, cells: np.ndarray, layout: Layout) -> None:
         value = cells[row, column]
         got = "a missing value" if np.isnan(value) else f"{value}"
         raise InputError(
-            f"{table.row_place(path, row)}, column '{layout.names[layout.used[column]]}': "
+            f"{table.place(row)}, column '{layout.names[layout.used[column]]}': "
             f"got {got}, expected a finite number"
         )
 
 
 def _rows_with_actuation(
-    path: Path, cells: np.ndarray, layout: Layout, at: dict[int, int], warn: Warn
+    table: Table, cells: np.ndarray, layout: Layout, at: dict[int, int], warn: Warn
 ) -> np.ndarray:
     """Indices of the rows where all of the actuation is known; the others are left out."""
     channels = [*layout.measured, *layout.commanded]
@@ -105,7 +168,7 @@ def _rows_with_actuation(
     if missing.any():
         row, channel = np.argwhere(missing)[0].tolist()
         count = int(missing.any(axis=1).sum())
-        place = f"{table.row_place(path, row)}, column '{layout.names[channels[channel]]}'"
+        place = f"{table.place(row)}, column '{layout.names[channels[channel]]}'"
         if count == len(cells):
             raise InputError(f"{place}: the actuation is missing in every row, expected numbers")
         warn(f"{place}: actuation missing here, {count} such rows of {len(cells)} left out")
@@ -113,7 +176,7 @@ def _rows_with_actuation(
 
 
 def _assemble(
-    path: Path, cells: np.ndarray, rows: np.ndarray, layout: Layout, at: dict[int, int]
+    table: Table, cells: np.ndarray, rows: np.ndarray, layout: Layout, at: dict[int, int]
 ) -> Recording:
     """The recording from its cells (T, columns) and the rows (T,) that they stand in."""
 
@@ -126,8 +189,9 @@ def _assemble(
     points = columns(layout.key_points)
     points = points if layout.mm_per_unit == 1 else points * layout.mm_per_unit
     t_s = column(layout.time)
-    run = _run_ids(path, column(layout.run), rows)
-    _check_order(path, t_s, run, rows)
+    run = _run_ids(table, column(layout.run), rows)
+    _check_order(table, t_s, run, rows)
+    path = table.path
     recording = Recording(
         name=path.stem,
         t_s=t_s,
@@ -146,35 +210,36 @@ def _assemble(
     return recording
 
 
-def _run_ids(path: Path, values: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
+def _run_ids(table: Table, values: np.ndarray | None, rows: np.ndarray) -> np.ndarray:
     if values is None:
         return np.zeros(len(rows), np.int64)
     odd = np.flatnonzero((values != np.round(values)) | (np.abs(values) >= 2**53))
     if len(odd):
-        place = table.row_place(path, int(rows[odd[0]]))
+        place = table.place(int(rows[odd[0]]))
         raise InputError(f"{place}, column 'run': got {values[odd[0]]}, expected an integer")
     return values.astype(np.int64)
 
 
-def _check_order(path: Path, t_s: np.ndarray, run: np.ndarray, rows: np.ndarray) -> None:
+def _check_order(table: Table, t_s: np.ndarray, run: np.ndarray, rows: np.ndarray) -> None:
     again = first_run_again(run)
     if again is not None:
         raise InputError(
-            f"{table.row_place(path, int(rows[again]))}, column 'run': run {run[again]} comes back "
+            f"{table.place(int(rows[again]))}, column 'run': run {run[again]} comes back "
             "after another run, expected the rows of a run in one block"
         )
     back = first_time_backwards(t_s, run)
     if back is not None:
         raise InputError(
-            f"{table.row_place(path, int(rows[back]))}, column 't_s': {float(t_s[back])!r} s after "
+            f"{table.place(int(rows[back]))}, column 't_s': {float(t_s[back])!r} s after "
             f"{float(t_s[back - 1])!r} s, expected time to increase inside a run; "
             "give separate runs a column 'run'"
         )
 
 
-def check_writable(path: Path, force: bool) -> None:
-    """Raise where a recording cannot go to this path."""
-    if path.suffix not in table.SUFFIXES:
+def check_writable(path: str | Path, force: bool = False) -> None:
+    """Raise where `save_recording` would refuse this path."""
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")
     for target in (path, sidecar_of(path)):
         if target.is_dir():
@@ -183,22 +248,20 @@ def check_writable(path: Path, force: bool) -> None:
             raise InputError(f"{target}: exists already; choose another name or use --force")
 
 
-def write(recording: Recording, path: Path, force: bool) -> None:
-    """Table and sidecar: both complete under temporary names first, then both put in place."""
+def save_recording(recording: Recording, path: str | Path, force: bool = False) -> None:
+    """Write the table (.csv or .parquet by the suffix) and its sidecar (.toml) beside it.
+
+    Both are complete under temporary names before either is put in place. Existing files are kept
+    unless `force` is set.
+    """
+    path = Path(path)
     check_writable(path, force)
-    sidecar = sidecar_of(path)
-    part, sidecar_part = (t.with_name(f".{t.name}.{os.getpid()}.part") for t in (path, sidecar))
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _write_table(_to_arrow(recording), part, path.suffix)
-        sidecar_part.write_text(sidecar_text(recording), encoding="utf-8")
-        os.replace(sidecar_part, sidecar)
-        os.replace(part, path)
+        with new_file(path) as table, new_file(sidecar_of(path)) as sidecar:
+            _write_table(_to_arrow(recording), table, path.suffix)
+            sidecar.write_text(sidecar_text(recording), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        part.unlink(missing_ok=True)
-        sidecar_part.unlink(missing_ok=True)
 
 
 def _write_table(content: pa.Table, part: Path, suffix: str) -> None:

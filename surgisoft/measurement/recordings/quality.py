@@ -1,9 +1,10 @@
-"""What is odd but usable in a recording: channels that froze and jumps in the marker data.
+"""Data-quality warnings of a recording: channels that froze and jumps in the marker data.
 
 A frozen signal repeats one value bit for bit, for longer than it ever does otherwise, while other
-signals live on. A jump is one step of a key point that neither the rows around it, nor the other
-key points, nor the actuation explain; settled rows stand for themselves, so there each key point is
-compared with a smooth function of the actuation instead of with the row before.
+signals change. A jump is one step of a key point that neither the rows around it, nor the other
+key points, nor the actuation explain. Steady-state samples are independent of each other: each
+key point of theirs is compared with a smooth function of the actuation instead of with the row
+before.
 """
 
 from dataclasses import dataclass
@@ -28,28 +29,28 @@ SPIKE_ROWS = 12
 """A key point that comes back within so many rows has made a spike."""
 SPIKE_RETURN = 0.5
 """How near a spike ends to where it began, as a share of its size."""
-SETTLED_RATIO = 15.0
-"""How many robust standard deviations a settled key point lies off before it is called a jump."""
-SETTLED_SHARE = 0.1
-"""The least deviation of a settled key point called a jump, as a share of its motion."""
+STEADY_RATIO = 15.0
+"""Robust standard deviations by which a steady-state key point is off that counts as a jump."""
+STEADY_SHARE = 0.1
+"""The least deviation of a steady-state key point called a jump, as a share of its motion."""
 
 
 @dataclass(frozen=True)
-class Oddity:
+class QualityWarning:
     """One finding, in words, and where it starts."""
 
     sample: int
     """Index of the sample where it starts."""
     text: str
-    """What is odd, in one line."""
+    """What was found, in one line."""
 
 
-def find_oddities(recording: Recording) -> list[Oddity]:
+def find_warnings(recording: Recording) -> list[QualityWarning]:
     """The findings, in the order of their samples."""
-    jumps = _settled_jumps if recording.kind == "settled" else _continuous_jumps
+    jumps = _steady_state_jumps if recording.kind == "settled" else _continuous_jumps
     with np.errstate(over="ignore", invalid="ignore"):  # finite numbers of any size are read
         found = [*_frozen_channels(recording), *_frozen_key_points(recording), *jumps(recording)]
-    return sorted(found, key=lambda oddity: oddity.sample)
+    return sorted(found, key=lambda warning: warning.sample)
 
 
 # --- frozen signals ----------------------------------------------------------------------------
@@ -129,9 +130,9 @@ def frozen_channels(recording: Recording) -> list[tuple[list[int], slice]]:
     return _merged(frozen)
 
 
-def _frozen_channels(recording: Recording) -> list[Oddity]:
+def _frozen_channels(recording: Recording) -> list[QualityWarning]:
     return [
-        Oddity(
+        QualityWarning(
             stretch.start,
             f"{', '.join(f'p{i + 1}_{recording.unit}' for i in members)} repeat bit-equal for "
             f"{_duration(recording, stretch)} while other signals move; frozen?",
@@ -175,7 +176,7 @@ def _actuation_moves(recording: Recording, rows: slice, share: float) -> bool:
     return False
 
 
-def _frozen_key_points(recording: Recording) -> list[Oddity]:
+def _frozen_key_points(recording: Recording) -> list[QualityWarning]:
     changes = _key_point_changes(recording)
     frozen: list[tuple[int, slice]] = []
     for j, changed in enumerate(changes):
@@ -187,7 +188,7 @@ def _frozen_key_points(recording: Recording) -> list[Oddity]:
             if known and (others or _actuation_moves(recording, stretch, 0.05)):
                 frozen.append((j, stretch))
     return [
-        Oddity(
+        QualityWarning(
             stretch.start,
             f"key point {', '.join(f'k{j}' for j in members)} repeats bit-equal for "
             f"{_duration(recording, stretch)} while other signals move; frozen?",
@@ -280,7 +281,7 @@ def key_point_jumps(recording: Recording) -> dict[int, list[tuple[int, float]]]:
     return hits
 
 
-def _continuous_jumps(recording: Recording) -> list[Oddity]:
+def _continuous_jumps(recording: Recording) -> list[QualityWarning]:
     return [_jump(j, found) for j, found in key_point_jumps(recording).items()]
 
 
@@ -328,14 +329,16 @@ def _explained(
     return _actuation_moves(recording, rows, ACTUATION_SHARE * share)
 
 
-def _jump(j: int, found: list[tuple[int, float]]) -> Oddity:
+def _jump(j: int, found: list[tuple[int, float]]) -> QualityWarning:
     row, size = found[0]
     more = f", and {len(found) - 1} more times" if len(found) > 1 else ""
-    return Oddity(row, f"key point k{j} jumps by {size:.3g} mm{more}; markers swapped or lost?")
+    return QualityWarning(
+        row, f"key point k{j} jumps by {size:.3g} mm{more}; markers swapped or lost?"
+    )
 
 
-def _settled_jumps(recording: Recording) -> list[Oddity]:
-    """Settled rows against the quadratic function of the actuation that fits them all."""
+def _steady_state_jumps(recording: Recording) -> list[QualityWarning]:
+    """Steady-state samples against the quadratic function of the actuation that fits them all."""
     channels = [
         recording.measured[:, i]
         for i in range(recording.chambers)
@@ -353,7 +356,7 @@ def _settled_jumps(recording: Recording) -> list[Oddity]:
             continue
         fit = basis[known] @ np.linalg.lstsq(basis[known], points[known], rcond=None)[0]
         off = np.linalg.norm(points[known] - fit, axis=1)
-        least = max(SETTLED_RATIO * 1.4826 * np.median(off), SETTLED_SHARE * motion[j])
+        least = max(STEADY_RATIO * 1.4826 * np.median(off), STEADY_SHARE * motion[j])
         hits = np.flatnonzero(off > least)
         if len(hits):
             found.append(_jump(j, [(int(known[i]), float(off[i])) for i in hits]))

@@ -1,22 +1,25 @@
-"""Recordings: what a lab measured on one arm, in memory and on disk.
+"""A recording in memory, and the checks that every recording passes.
 
-The file format is described in docs/recordings.md. A recording that could be loaded is whole:
-times, actuation and run ids have no missing values; a key point is either known in x, y and z or
+Times, actuation and run ids have no missing values; a key point is either known in x, y and z or
 missing (NaN) as a whole.
 """
 
 import itertools
-import warnings
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
+from surgisoft.config import POSITIVE, Rule
 from surgisoft.errors import InputError
 
 KINDS = ("continuous", "settled")
+"""Kinds of recordings and protocols: samples at a rate, or steady-state averages."""
+
+NOT_NEGATIVE = Rule("a number >= 0", lambda value: value >= 0)
+"""For standard deviations."""
 
 UNIT_TOLERANCE = 0.01
 """How far the length of gravity's direction may be from 1 before it is taken for an error."""
@@ -26,9 +29,9 @@ UNIT_TOLERANCE = 0.01
 class ArmInfo:
     """The arm's size, where the lab stated it."""
 
-    length_mm: float | None = None
+    length_mm: Annotated[float, POSITIVE] | None = None
     """Length of the arm at rest [mm]."""
-    diameter_mm: float | None = None
+    diameter_mm: Annotated[float, POSITIVE] | None = None
     """Outer diameter of the arm [mm]."""
 
 
@@ -59,7 +62,7 @@ class Recording:
     gravity: np.ndarray | None = None
     """(3,) unit vector along the weight, arm base frame."""
     kind: str = "continuous"
-    """"continuous", or "settled" where each sample is one settled point."""
+    """"continuous", or "settled" where each sample is one steady-state average."""
     noise_mm: float | None = None
     """Standard deviation of a key point's coordinate as the lab knows it [mm]."""
     note: str = ""
@@ -206,45 +209,6 @@ def first_run_again(run: np.ndarray) -> int | None:
             return start
         seen.add(int(run[start]))
     return None
-
-
-def save_recording(recording: Recording, path: str | Path, force: bool = False) -> None:
-    """Write the table (.csv or .parquet by the suffix) and its sidecar (.toml) beside it.
-
-    Both are written to temporary files first. Existing files are kept unless `force` is set.
-    """
-    from surgisoft.measurement.recordings import file as recording_file
-
-    recording_file.write(recording, Path(path), force)
-
-
-def check_writable(path: str | Path, force: bool = False) -> None:
-    """Raise where `save_recording` would refuse this path."""
-    from surgisoft.measurement.recordings import file as recording_file
-
-    recording_file.check_writable(Path(path), force)
-
-
-def load_recording(path: str | Path, on_warning: Callable[[str], None] | None = None) -> Recording:
-    """Read one recording; what is odd but usable goes to `on_warning` (default: warnings.warn)."""
-    from surgisoft.measurement.recordings import file as recording_file
-
-    return recording_file.read(Path(path), on_warning or _warn)
-
-
-def load_recordings(
-    paths: Iterable[str | Path] | str | Path, on_warning: Callable[[str], None] | None = None
-) -> list[Recording]:
-    """Read files, and every recording of folders in the order of their names."""
-    from surgisoft.measurement.recordings import file as recording_file
-
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
-    files = recording_file.find([Path(p) for p in given], on_warning or _warn)
-    return [load_recording(file, on_warning) for file in files]
-
-
-def _warn(message: str) -> None:
-    warnings.warn(message, stacklevel=2)
 
 
 def check_same_arm(recordings: list[Recording]) -> None:

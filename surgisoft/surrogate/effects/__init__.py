@@ -1,4 +1,4 @@
-"""The named physical effects; a file's stem is the name that is printed."""
+"""The physical effects by name: one file each, whose stem is the name."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,6 +20,7 @@ from surgisoft.surrogate.effects.creep import Creep
 from surgisoft.surrogate.effects.dead_zone import DeadZone
 from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.effects.gain_mismatch import GainMismatch
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, hypothesis_of
 from surgisoft.surrogate.effects.hysteresis import Hysteresis
 from surgisoft.surrogate.effects.inertia import Inertia
 from surgisoft.surrogate.effects.line_lag import LineLag
@@ -55,10 +56,13 @@ __all__ = [
     "ArmFacts",
     "Context",
     "Effect",
+    "Hypothesis",
     "Memoryless",
     "Quantity",
     "Stage",
+    "effect_class",
     "free_name",
+    "hypothesis_of",
     "known_effects",
     "make_effect",
     "named_effect",
@@ -106,15 +110,20 @@ def named_effect(given: str) -> str:
     return given
 
 
-def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
-    """The named effect for an arm; a model's second of a kind is named `kind#2`."""
+def effect_class(name: str) -> type[Effect]:
+    """The class of an effect by its name in a model: `creep`, or `creep#2` for a second creep."""
     kind = own.kind_of(name)
     if kind in EFFECTS:
-        return EFFECTS[kind](facts, **config)
+        return EFFECTS[kind]
     known = known_effects()
     if kind not in known:
         raise unknown_name("effect", kind, known)
-    return known[kind](facts, **config)
+    return known[kind]
+
+
+def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
+    """The named effect for an arm; `config` are the arguments of its class."""
+    return effect_class(name)(facts, **config)
 
 
 def free_name(kind: str, taken) -> str:

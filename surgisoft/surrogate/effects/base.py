@@ -1,11 +1,12 @@
-"""What every physical effect is.
+"""The interface of a physical effect.
 
-The chain: line (commanded to chamber pressure) -> material (chamber pressure to effective
-actuation, with memory) -> HAW-NN -> body (loads deform the shape) -> sensor (shape to what is
-measured). An effect acts at one stage of it.
+An effect acts at one stage of the arm model's chain: line (commanded to chamber pressure),
+material (chamber pressure to effective actuation, with memory), body (loads deform the shape) or
+sensor (shape to what is measured); the network stands between material and body.
 
-An effect has amplitudes (`strengths`), in which its answer is linear to first order and which do
-nothing at zero, and the rest of its parameters (`shapes`): time constants, widths, places.
+An effect has amplitudes, in which its result is linear to first order and which change nothing at
+zero, and nonlinear parameters: time constants, widths, places. What identification needs to know
+of it beside its physics is its `Hypothesis` (`surgisoft.surrogate.effects.hypothesis`).
 """
 
 from abc import ABC, abstractmethod
@@ -15,6 +16,8 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+
+from surgisoft.errors import InputError
 
 Stage = Literal["line", "material", "body", "sensor"]
 STAGES: tuple[Stage, ...] = ("line", "material", "body", "sensor")
@@ -90,22 +93,34 @@ def _leaves(value) -> Iterator[float]:
         yield float(value)
 
 
+OLD_NAMES = {
+    "strengths": "amplitudes",
+    "shapes": "nonlinear_parameters",
+    "columns": "sensitivities",
+}
+"""Methods of `Effect` by the names that they had before."""
+
+
 class Effect(nn.Module, ABC):
     """One physical effect: a memory that follows the signal, and what it does to the signal.
 
     The signal of line and material effects is the actuation (..., m); of body and sensor effects
-    the key points (..., n, 3), mm, base frame. With its strengths at zero an effect returns the
+    the key points (..., n, 3), mm, base frame. With its amplitudes at zero an effect returns the
     signal unchanged, bit for bit.
+
+    User-defined effects of before may name their methods `strengths` (now `amplitudes`), `shapes`
+    (now `nonlinear_parameters`) and `columns` (now `sensitivities`); either name works.
     """
 
     stage: Stage
-    side_by_side = True
-    """Whether several of its shapes at once make sense, as in a spectrum of times."""
-    needs_reversals = False
-    """Whether it can only be learned from data with inner reversals."""
-    settled_form = False
-    """Whether real arms have this very form, as with a turned frame or a weight, and not only one
-    like it, as with what rubber does."""
+    version: int = 1
+    """Version of `config` and of the parameters' meaning; a model's file keeps it."""
+
+    def __init_subclass__(cls, **more):
+        super().__init_subclass__(**more)
+        for old, new in OLD_NAMES.items():
+            if old in vars(cls) and new not in vars(cls):
+                setattr(cls, new, vars(cls)[old])
 
     def __init__(self, facts: ArmFacts):
         super().__init__()
@@ -148,50 +163,38 @@ class Effect(nn.Module, ABC):
         return memory, self.apply(signal, memory)
 
     @abstractmethod
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         """The amplitudes by attribute name: all zero means no change at all."""
 
-    def shapes(self) -> dict[str, nn.Parameter]:
+    def nonlinear_parameters(self) -> dict[str, nn.Parameter]:
         """The other parameters by attribute name, each free to take any real value."""
-        mine = {id(parameter) for parameter in self.strengths().values()}
+        mine = {id(parameter) for parameter in self.amplitudes().values()}
         return {name: p for name, p in self.named_parameters() if id(p) not in mine}
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def strengths(self) -> dict[str, nn.Parameter]:
+        """Old name of `amplitudes`."""
+        return self.amplitudes()
+
+    def shapes(self) -> dict[str, nn.Parameter]:
+        """Old name of `nonlinear_parameters`."""
+        return Effect.nonlinear_parameters(self)
+
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(K, *signal.shape) derivative of `apply` by each of the K amplitudes, all at zero.
 
-        The amplitudes come in the order of `strengths()`, each flattened. The memory counts as
-        given.
+        The amplitudes come in the order of `amplitudes`, each flattened. The memory counts as
+        given. By forward differentiation; an effect may override it with the closed form, which
+        is several times as fast.
         """
-        zero = {name: torch.zeros_like(p) for name, p in self.strengths().items()}
+        zero = {name: torch.zeros_like(p) for name, p in self.amplitudes().items()}
 
-        def answer(strengths):
-            return torch.func.functional_call(self, strengths, (signal, memory))
+        def result(amplitudes):
+            return torch.func.functional_call(self, amplitudes, (signal, memory))
 
         with torch.no_grad():
-            slopes = torch.func.jacfwd(answer)(zero)
+            slopes = torch.func.jacfwd(result)(zero)
         flat = [slopes[name].flatten(signal.ndim).movedim(-1, 0) for name in zero]
         return torch.cat(flat)
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list["Effect"]:
-        """Effects of zero strength over a coarse grid of the shapes, for a diagnosis to try.
-
-        points: (S, n, 3) predicted key points of the recordings, mm, base frame.
-        """
-        return [cls(facts)]
-
-    @classmethod
-    def together(cls, some: list["Effect"]) -> list[list[int]]:
-        """Sets of candidates, by number, that a diagnosis also tries side by side."""
-        return [list(range(len(some)))] if cls.side_by_side else []
-
-    @classmethod
-    def further(cls, facts: ArmFacts, points: Tensor) -> list["Effect"]:
-        """The same where the model has the effect already: shapes that add up with any other.
-
-        Most effects have none: of them there can only be more or less.
-        """
-        return []
 
     def memory_parameters(self) -> list[nn.Parameter]:
         """Parameters that the memory depends on: they are fitted through whole runs."""
@@ -203,6 +206,20 @@ class Effect(nn.Module, ABC):
     @abstractmethod
     def config(self) -> dict:
         """Arguments that build the effect again; its tensors are in the weights file."""
+
+    @classmethod
+    def migrated(cls, config: dict, version: int | None) -> dict:
+        """The `config` of this version from one that another version wrote.
+
+        version: that of the class that wrote it; None in models that were written before versions
+        were kept. Raises InputError where the parameters mean something else now.
+        """
+        if version is not None and version > cls.version:
+            raise InputError(
+                f"version {version} of the effect wrote it, expected at most {cls.version}: "
+                "use the surgisoft that wrote the model"
+            )
+        return config
 
     @abstractmethod
     def quantities(self) -> list[Quantity]:
@@ -234,7 +251,7 @@ class Memoryless(Effect, ABC):
 
 
 def amplitude(*shape: int) -> nn.Parameter:
-    """Amplitudes of zero strength."""
+    """Amplitudes of an array shape, all zero."""
     return nn.Parameter(torch.zeros(shape))
 
 

@@ -6,8 +6,8 @@ whole body yields as a clamped beam under a force at c (Love 1927, ch. XVIII), m
 
     delta = max(n . p_c - offset, 0),    q = p + share delta u(p) / |u_c(p) . n|,
 
-with u the beam's displacement under a force along -n at c (`surgisoft.surrogate.beam`). share = 1
-is a rigid support, less a yielding one (penalty contact, Wriggers 2006).
+with u the beam's displacement under a force along -n at c (`surgisoft.surrogate.effects.beam`).
+share = 1 is a rigid support, less a yielding one (penalty contact, Wriggers 2006).
 """
 
 import math
@@ -15,7 +15,6 @@ import math
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Effect,
@@ -24,17 +23,19 @@ from surgisoft.surrogate.effects.base import (
     amplitude,
     value_of,
 )
+from surgisoft.surrogate.effects.beam import Beam, cross, displaced
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 AROUND = 16
-"""Directions of the support that a diagnosis tries."""
+"""Directions of the support that identification tries."""
 DEPTHS = (0.5, 0.7, 0.86, 0.96)
-"""Quantiles of the body's excursion at which it puts the support."""
+"""Quantiles of the body's excursion at which identification puts the support."""
 LEAST_SHARE = 0.08
 """Least share of a support that is there. One that yields more is met all the time and looks like
 a weight, or like a stiffer wall."""
 BESIDE = 1
-"""Neighbouring directions that it puts supports in at once, either side: what is met may be round,
-but an arm that is held from all around is a stiffer one."""
+"""Neighbouring directions, on either side, in which identification puts supports at once: the
+support may be round, but an arm that is held from all around is a stiffer one."""
 STEEP = 0.2
 """Least share of the point's displacement that is along the normal; below it the arm stands on the
 support, and to push it back would take no bounded bending."""
@@ -62,44 +63,15 @@ class Contact(Memoryless):
         self.share = amplitude(1)
         self.azimuth = nn.Parameter(torch.tensor([float(azimuth_rad)]))
         self.rise = nn.Parameter(torch.tensor([float(rise_rad)]))
-        # In lengths of the arm, so that a step of the shapes means alike for all of them.
+        # In lengths of the arm, so that a step of any nonlinear parameter has a like size.
         self.offset = nn.Parameter(torch.tensor([float(offset_mm) / self.length_mm]))
         lever = beam.levers[self.point] / self.length_mm**2
         self.register_buffer("lever", lever, persistent=False)
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        """Supports around the body, each where it would be met in a part of the recording."""
-        points = points[torch.isfinite(points).all(-1).all(-1)]
-        n = points.shape[1]
-        made = []
-        if not len(points):
-            return made
-        # The lowest of several key points hardly moves.
-        point = max(n - 2, min(1, n - 1))
-        for turn in range(AROUND):
-            azimuth = 2 * math.pi * turn / AROUND
-            normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
-            out = points[:, point] @ normal
-            if float(out.max() - out.min()) <= 0.0:
-                continue
-            for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
-                made.append(cls(facts, point, azimuth, 0.0, offset))
-        return made
-
-    @classmethod
-    def together(cls, some: list[Effect]) -> list[list[int]]:
-        turns = [round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi)) for effect in some]
-        near = [min(turn, AROUND - turn) <= BESIDE for turn in range(AROUND)]
-        return [
-            [i for i, turn in enumerate(turns) if near[(turn - middle) % AROUND]]
-            for middle in sorted(set(turns))
-        ]
 
     @property
     def normal(self) -> Tensor:
@@ -122,7 +94,7 @@ class Contact(Memoryless):
         """Supported key points (..., n, 3) from those of the free arm, mm."""
         return signal + self.share * self._yielded(signal)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         with torch.no_grad():
             return self._yielded(signal).unsqueeze(0)
 
@@ -142,3 +114,36 @@ class Contact(Memoryless):
             Quantity("offset_mm", offset, "mm", -1.5 * length, 1.5 * length, reach),
             Quantity("key_point", self.point, "", 0, self.lever.shape[0], "which one meets it"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Supports around the body, each where it would be met in a part of the recording."""
+    points = points[torch.isfinite(points).all(-1).all(-1)]
+    n = points.shape[1]
+    made = []
+    if not len(points):
+        return made
+    # The lowest of several key points hardly moves.
+    point = max(n - 2, min(1, n - 1))
+    for turn in range(AROUND):
+        azimuth = 2 * math.pi * turn / AROUND
+        normal = points.new_tensor([math.cos(azimuth), math.sin(azimuth), 0.0])
+        out = points[:, point] @ normal
+        if float(out.max() - out.min()) <= 0.0:
+            continue
+        for offset in out.quantile(out.new_tensor(DEPTHS)).tolist():
+            made.append(Contact(facts, point, azimuth, 0.0, offset))
+    return made
+
+
+def _neighbours(some: list[Effect]) -> list[list[int]]:
+    """For each direction the supports in it and in the directions beside it."""
+    turns = [round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi)) for effect in some]
+    near = [min(turn, AROUND - turn) <= BESIDE for turn in range(AROUND)]
+    return [
+        [i for i, turn in enumerate(turns) if near[(turn - middle) % AROUND]]
+        for middle in sorted(set(turns))
+    ]
+
+
+HYPOTHESIS = Hypothesis(Contact, _grid, combinations=_neighbours)

@@ -15,7 +15,15 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.errors import unknown_name
-from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
+from surgisoft.surrogate.effects.base import (
+    ArmFacts,
+    Effect,
+    Memoryless,
+    Quantity,
+    amplitude,
+    value_of,
+)
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 
 WHO = ("all", "next", "previous")
 """Chambers that may take a share of what one pushes."""
@@ -25,7 +33,6 @@ class Coupling(Memoryless):
     """Loss of push by the other chambers' loads."""
 
     stage = "material"
-    side_by_side = False  # a chamber loses in one way; products both ways round would be a twist
 
     def __init__(self, facts: ArmFacts, pairs: bool = False, who: str | None = None):
         """pairs: a quadratic loss of its own for each pair, not one for all; who: one of WHO, a
@@ -48,21 +55,13 @@ class Coupling(Memoryless):
             spread = spread.unsqueeze(0)
         self.register_buffer("spread", spread, persistent=False)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"linear": self.linear, self._second: getattr(self, self._second)}
 
     @property
     def _second(self) -> str:
         """Name of the amplitudes of second order."""
         return "quadratic" if self.who is None else "product"
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        """One loss for all pairs, and one for each; none for a single chamber."""
-        if len(facts.low) == 1:
-            return []
-        who = WHO if len(facts.low) > 2 else WHO[:1]
-        return [cls(facts), cls(facts, pairs=True), *(cls(facts, who=some) for some in who)]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m)."""
@@ -72,7 +71,7 @@ class Coupling(Memoryless):
         lost = lost + ((x * x.abs()) @ shares if self.who is None else x * (x @ shares))
         return signal - self.reach * lost
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         x = self.load(signal).detach()
         linear = (x.sum(-1, keepdim=True) - x).unsqueeze(0)
         other = x * x.abs() if self.who is None else x
@@ -93,3 +92,19 @@ class Coupling(Memoryless):
             Quantity(f"{self._second}_share", value_of(second), "", -0.3, 0.5, wall),
             Quantity("total_share", total, "", -0.2, 0.5, wall),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """One loss for all pairs, and one for each; none for a single chamber."""
+    if len(facts.low) == 1:
+        return []
+    who = WHO if len(facts.low) > 2 else WHO[:1]
+    return [
+        Coupling(facts),
+        Coupling(facts, pairs=True),
+        *(Coupling(facts, who=some) for some in who),
+    ]
+
+
+# A chamber loses push in one way; products both ways round the ring would be a twist.
+HYPOTHESIS = Hypothesis(Coupling, _grid, combinations=no_combinations)

@@ -23,6 +23,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.scan import linear_scan
 
 TIMES = torch.logspace(-0.45, 2.55, 11, dtype=torch.float64)
@@ -39,7 +40,7 @@ GRID = (
     (20.0, 2.0),
     (90.0, 2.5),
 )
-"""(tau in s, width in natural logarithms) that a diagnosis tries."""
+"""(tau in s, width in natural logarithms) that identification tries."""
 
 
 class Creep(Effect):
@@ -58,15 +59,11 @@ class Creep(Effect):
         self.log_width = logarithm(width)
         self.log_power = logarithm(power)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"amount": self.amount}
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.log_power]
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, tau, width) for tau, width in GRID]
 
     @property
     def spectrum(self) -> Tensor:
@@ -97,7 +94,7 @@ class Creep(Effect):
         """Effective actuation (..., m) from actuation (..., m) and retarded loads (..., m, K)."""
         return signal + self.amount * self.reach * (memory @ self.spectrum)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return (self.reach * (memory @ self.spectrum)).unsqueeze(0).detach()
 
     def config(self) -> dict:
@@ -132,3 +129,10 @@ class Creep(Effect):
                 "wide: 1 is a linear solid (Findley 1976, ch. 5)",
             ),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    return [Creep(facts, tau, width) for tau, width in GRID]
+
+
+HYPOTHESIS = Hypothesis(Creep, _grid)

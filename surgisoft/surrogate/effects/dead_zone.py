@@ -14,15 +14,17 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
+    Effect,
     Memoryless,
     Quantity,
     amplitude,
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 GRID = (0.04, 0.1, 0.25)
-"""Widths that a diagnosis tries, loads."""
+"""Widths that identification tries, loads."""
 
 
 class DeadZone(Memoryless):
@@ -37,13 +39,8 @@ class DeadZone(Memoryless):
         self.threshold = amplitude(len(facts.low) if self.each else 1)
         self.log_width = logarithm(width)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"threshold": self.threshold}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        each = (False, True) if len(facts.low) > 1 else (False,)
-        return [cls(facts, width, one) for one in each for width in GRID]
 
     def _lost(self, signal: Tensor) -> Tensor:
         x = self.load(signal)
@@ -53,7 +50,7 @@ class DeadZone(Memoryless):
         """Effective actuation (..., m) from actuation (..., m)."""
         return signal + self.threshold * self._lost(signal)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         lost = self._lost(signal).detach()
         return torch.diag_embed(lost).movedim(-1, 0) if self.each else lost.unsqueeze(0)
 
@@ -69,3 +66,11 @@ class DeadZone(Memoryless):
             Quantity(f"threshold_{unit}", threshold, unit, 0.0, 0.5 * full, folds),
             Quantity(f"width_{unit}", width, unit, 0.002 * full, full, folds),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    each = (False, True) if len(facts.low) > 1 else (False,)
+    return [DeadZone(facts, width, one) for one in each for width in GRID]
+
+
+HYPOTHESIS = Hypothesis(DeadZone, _grid)

@@ -33,28 +33,28 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.rotation import rotate
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.rotation import rotate
 
 KINDS = ("base", "actuation", "temperature")
 TEN_MINUTES = 600.0
 """Time at which the amplitudes are given, s."""
 ROOM_C = 22.0
-"""T_0 where nobody knows it, degrees Celsius."""
+"""T_0 where the recordings do not state it, degrees Celsius."""
 TEN_KELVIN = 10.0
 """Change of temperature at which the amplitudes are given, K."""
 GRID = (200.0, 1000.0, 20000.0)
-"""Times tau of the base that a diagnosis tries, s."""
+"""Times tau of the base that identification tries, s."""
 FEW = (1000.0, 20000.0)
-"""The same of the actuation, and of a base that yields with a power of the time."""
+"""Times tau of the actuation, and of a base that yields with a power of the time, s."""
 POWER = 0.5
-"""That power."""
+"""Power of the time of a base that identification tries."""
 
 
 class Drift(Effect):
     """A yielding holder, or gains and offsets that follow the time or the temperature."""
 
     stage = "body"
-    side_by_side = False  # a quick drift less a slow one would be none: an error from the start
 
     def __init__(
         self,
@@ -84,16 +84,10 @@ class Drift(Effect):
             self.log_tau = logarithm(tau_s)
             self.log_power = None if power is None else logarithm(power)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         if self.kind == "base":
             return {"turn": self.turn, "shift": self.shift}
         return {"gain": self.gain, "offset": self.offset}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        timed = [("base", tau) for tau in GRID] + [("actuation", tau) for tau in FEW]
-        slow = [cls(facts, "base", tau, power=POWER) for tau in FEW]
-        return [*(cls(facts, *each) for each in timed), *slow, cls(facts, "temperature")]
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, 1) elapsed time, s, or warming over T_0, K: none."""
@@ -143,7 +137,7 @@ class Drift(Effect):
         moved = self.gain * (signal - self.origin) + self.reach * self.offset
         return signal + share * moved
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         with torch.no_grad():
             if self.kind == "base":
                 grown = self.grown(memory).unsqueeze(-2)
@@ -188,3 +182,13 @@ class Drift(Effect):
             Quantity("gain_in_10_K_share", value_of(self.gain), "", -0.4, 0.4, rubber),
             Quantity("offset_in_10_K_share", value_of(self.offset), "", -0.3, 0.3, rubber),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    timed = [("base", tau) for tau in GRID] + [("actuation", tau) for tau in FEW]
+    slow = [Drift(facts, "base", tau, power=POWER) for tau in FEW]
+    return [*(Drift(facts, *each) for each in timed), *slow, Drift(facts, "temperature")]
+
+
+# A quick drift less a slow one would be none: an error from the start.
+HYPOTHESIS = Hypothesis(Drift, _grid, combinations=no_combinations)

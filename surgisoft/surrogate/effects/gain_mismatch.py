@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 
 class GainMismatch(Memoryless):
@@ -20,14 +21,14 @@ class GainMismatch(Memoryless):
         super().__init__(facts)
         self.gain = amplitude(len(facts.low))
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"gain": self.gain}
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m)."""
         return signal + self.gain * (signal - self.origin)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return torch.diag_embed((signal - self.origin).detach()).movedim(-1, 0)
 
     def config(self) -> dict:
@@ -36,3 +37,6 @@ class GainMismatch(Memoryless):
     def quantities(self) -> list[Quantity]:
         cast = "wide: half to one and a half times the nominal push"
         return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]
+
+
+HYPOTHESIS = Hypothesis(GainMismatch)

@@ -3,8 +3,8 @@
 A play operator of radius r follows its input through a gap of width 2r:
 y(t) = clamp(y(t-), u(t) - r, u(t) + r) (Krasnosel'skii & Pokrovskii 1989, ch. 1). Many of them
 remember every reversal that no larger one has wiped out. In a soft arm friction sits in the wall,
-and the strain of a wall line is moved by several chambers at once; as in a vector hysteron model
-(Mayergoyz 2003, ch. 3), plays therefore run along several lines l of the actuation space,
+and several chambers at once move the strain of a wall fibre; as in a vector hysteron model
+(Mayergoyz 2003, ch. 3), play operators therefore run along several lines l of the actuation space,
 
     u_l = sum_i a_li x_i + sum_ij b_lij x_i x_j,      x = actuation scaled to [-1, 1],
 
@@ -20,25 +20,25 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.arm import centre_and_half
 from surgisoft.surrogate.effects.base import ArmFacts, Context, Effect, Quantity, value_of
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.wall_fibres import RINGS, fibre_matrix
 from surgisoft.surrogate.scan import play_scan
-from surgisoft.surrogate.wall_fibres import RINGS, wall_lines
 
 RADII = (0.02, 0.04, 0.08, 0.14, 0.22, 0.32, 0.44, 0.58, 0.74, 0.90)
-"""Radii of the plays, in units of half a line's range: fine for small reversals, and up to nearly
-the half range (a larger radius never moves)."""
+"""Radii of the play operators, in units of half a line's range: fine for small reversals, and up to
+nearly the half range (an operator of a larger radius never moves)."""
 OTHERS = (0.0, -0.2, -0.4)
-"""Shares of the other chambers in a line that a diagnosis tries."""
+"""Shares of the other chambers in a line that identification tries."""
 SECTION = {3: -0.2, 4: 0.2}
 """Shares of the neighbours in the lines of a plane section: four fifths of a strain bend."""
 FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
-"""Radii where a diagnosis asks whether there is any play."""
+"""Radii for the question whether there is any play."""
 
 
 class Hysteresis(Effect):
     """Rate-independent hysteresis with minor loops."""
 
     stage = "material"
-    needs_reversals = True
 
     def __init__(
         self,
@@ -49,13 +49,13 @@ class Hysteresis(Effect):
         others: float = 0.0,
         section: bool = False,
     ):
-        """Radii of the plays, in units of half a line's range.
+        """Radii of the play operators, in units of half a line's range.
 
         ring: the chambers are alike and stand in a ring, so that one chamber's weights, turned,
         are those of all; pairs: lines along pairs of neighbours beside those along one chamber;
         others: share of the other chambers in each line to start from, negative where a chamber
         that bends the arm shortens the wall on the other side; section: the lines, those along
-        pairs too, are those of a plane section (`wall_lines`), others being that of a neighbour.
+        pairs too, are those of a plane section (`fibre_matrix`), others being that of a neighbour.
         """
         super().__init__(facts)
         chambers = len(facts.low)
@@ -71,7 +71,7 @@ class Hysteresis(Effect):
             lines = lines[:chambers]
         self.others, self.section = float(others), bool(section)
         if self.section:
-            lines = wall_lines(torch.tensor(self.others), chambers, ring=True)
+            lines = fibre_matrix(torch.tensor(self.others), chambers, ring=True)
             lines = torch.cat([lines[::2], lines[1::2].roll(1, dims=0)])
             lines = lines / lines.abs().sum(1, keepdim=True)
         elif self.others:
@@ -87,27 +87,10 @@ class Hysteresis(Effect):
             self.weight = nn.Parameter(torch.zeros(shape))
             self.slope = nn.Parameter(torch.zeros(shape))
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         if self.ring:
             return {"turned": self.turned}
         return {"weight": self.weight, "slope": self.slope}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        """Alike chambers, whose lines are stretched the other way by the rest of them or not."""
-        if len(facts.low) == 1:
-            return [cls(facts, FEW_RADII, ring=True, pairs=False)]
-        return [*cls.further(facts, points), cls(facts, FEW_RADII, True, True, OTHERS[1])]
-
-    @classmethod
-    def further(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003)."""
-        m = len(facts.low)
-        if m in RINGS:
-            section = cls(facts, FEW_RADII, True, True, SECTION[m], True)
-            return [*(cls(facts, FEW_RADII, True, False, o) for o in OTHERS[::2]), section]
-        some = OTHERS if m > 1 else OTHERS[:1]
-        return [cls(facts, FEW_RADII, True, False, others) for others in some]
 
     def use_chambers(self, use: Tensor) -> None:
         self.use.copy_(use)
@@ -157,7 +140,7 @@ class Hysteresis(Effect):
             shift = shift + (lag * away).flatten(-2) @ self.slope.flatten(1).T
         return signal + self.half_range * shift
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         with torch.no_grad():
             u = self.lines(signal)
             lag = memory - u.unsqueeze(-1)
@@ -211,3 +194,23 @@ def first_lines(chambers: int) -> Tensor:
         return single
     pairs = (single + single.roll(1, dims=0)) / 2
     return torch.cat([single, pairs[: 1 if chambers == 2 else chambers]])
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Chambers that are alike; the others stretch a fibre the other way, or do not."""
+    if len(facts.low) == 1:
+        return [Hysteresis(facts, FEW_RADII, ring=True, pairs=False)]
+    return [*_further(facts, points), Hysteresis(facts, FEW_RADII, True, True, OTHERS[1])]
+
+
+def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """Lines along single chambers, or of a plane section: loops add up (Kuhnen 2003)."""
+    m = len(facts.low)
+    if m in RINGS:
+        section = Hysteresis(facts, FEW_RADII, True, True, SECTION[m], True)
+        return [*(Hysteresis(facts, FEW_RADII, True, False, o) for o in OTHERS[::2]), section]
+    some = OTHERS if m > 1 else OTHERS[:1]
+    return [Hysteresis(facts, FEW_RADII, True, False, others) for others in some]
+
+
+HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True)

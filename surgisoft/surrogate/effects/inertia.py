@@ -25,6 +25,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 from surgisoft.surrogate.scan import linear_scan
 
 GRID = (
@@ -37,7 +38,7 @@ GRID = (
     (2.0, 0.4),
     (4.0, 0.4),
 )
-"""(frequency in Hz, damping ratio) that a diagnosis tries."""
+"""(frequency in Hz, damping ratio) that identification tries."""
 
 
 class Inertia(Effect):
@@ -52,15 +53,11 @@ class Inertia(Effect):
         self.log_frequency = logarithm(frequency_Hz)
         self.damping_logit = nn.Parameter(torch.tensor([math.log(damping / (1 - damping))]))
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.log_frequency, self.damping_logit]
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, *mode) for mode in GRID]
 
     def _pole(self) -> tuple[Tensor, Tensor]:
         """(1,) pole l over w, complex, and w in rad/s."""
@@ -103,7 +100,7 @@ class Inertia(Effect):
         """Effective actuation (..., m) from actuation (..., m) and oscillators (..., m, 2)."""
         return signal + self.share * (memory[..., 0] - signal)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return (memory[..., 0] - signal).unsqueeze(0).detach()
 
     def config(self) -> dict:
@@ -118,3 +115,10 @@ class Inertia(Effect):
             Quantity("frequency_Hz", value_of(self.log_frequency.exp()), "Hz", 0.1, 50.0, soft),
             Quantity("damping_ratio", damping, "", 0.005, 0.5, swings),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    return [Inertia(facts, *mode) for mode in GRID]
+
+
+HYPOTHESIS = Hypothesis(Inertia, _grid)

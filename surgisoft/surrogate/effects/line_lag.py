@@ -33,6 +33,7 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 from surgisoft.surrogate.scan import follow, linear_scan
 
 CHAIN = 3
@@ -40,9 +41,9 @@ CHAIN = 3
 USUAL = 0.1
 """Difference, as a share of the range, at which the time constants are stated."""
 LAMINAR = 100.0
-"""Difference, as a share of the range, up to which flow is laminar unless told otherwise."""
+"""Difference, as a share of the range, up to which flow is laminar by default."""
 TURBULENT = 0.003
-"""The same for the turbulent flow that a diagnosis tries."""
+"""Difference up to which the turbulent flow that identification tries is laminar."""
 GRID = (
     (0.05, 0.05, 0.02, LAMINAR),
     (0.15, 0.15, 0.02, LAMINAR),
@@ -63,7 +64,7 @@ GRID = (
     (0.35, 0.7, 0.02, TURBULENT),
     (0.6, 1.2, 0.02, TURBULENT),
 )
-"""(filling, emptying, dead time) in s and the difference of the turn that a diagnosis tries."""
+"""(filling, emptying, dead time) in s and the difference of the turn that identification tries."""
 TOLERANCE = 1e-6
 """Change of a whole recording's lag, as a share of the range, at which its iteration ends."""
 
@@ -101,7 +102,6 @@ class LineLag(Effect):
     """Lag of laminar or turbulent flow, with its own times up and down, and a dead time."""
 
     stage = "line"
-    side_by_side = False  # a chamber has one line; lags of both signs would be a lead
 
     def __init__(
         self,
@@ -122,15 +122,11 @@ class LineLag(Effect):
         self.log_dead = logarithm(dead_s)
         self.log_turn = logarithm(turn)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.log_up, self.log_down, self.log_dead, self.log_turn]
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        return [cls(facts, *shape) for shape in GRID]
 
     def rest(self, signal: Tensor) -> Tensor:
         """(B, m, 1 + CHAIN) the chamber's pressure and the chain's, all at the command (B, m)."""
@@ -171,7 +167,7 @@ class LineLag(Effect):
         """Chamber pressure (..., m) from the command (..., m)."""
         return signal + self.share * (memory[..., 0] - signal)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return (memory[..., 0] - signal).unsqueeze(0).detach()
 
     def config(self) -> dict:
@@ -187,3 +183,11 @@ class LineLag(Effect):
             Quantity("dead_s", value_of(self.log_dead.exp()), "s", 0.0, 2.0, tube),
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    return [LineLag(facts, *values) for values in GRID]
+
+
+# A chamber has one line; lags of both signs together would be a lead.
+HYPOTHESIS = Hypothesis(LineLag, _grid, combinations=no_combinations)

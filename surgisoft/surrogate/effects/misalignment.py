@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
-from surgisoft.surrogate.rotation import rotate
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.rotation import rotate
 
 
 class Misalignment(Memoryless):
     """A similarity between the frame of the arm's base and that of the measurement."""
 
     stage = "sensor"
-    settled_form = True
 
     def __init__(self, facts: ArmFacts):
         super().__init__(facts)
@@ -25,7 +25,7 @@ class Misalignment(Memoryless):
         self.shift = amplitude(3)
         self.scale = amplitude(1)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"turn": self.turn, "shift": self.shift, "scale": self.scale}
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -33,7 +33,7 @@ class Misalignment(Memoryless):
         turned = rotate(signal, self.turn)
         return turned + self.scale * turned + self.shift
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         axes = torch.eye(3, dtype=signal.dtype, device=signal.device)
         axes = axes.view(3, *[1] * (signal.ndim - 1), 3).expand(3, *signal.shape)
         p = signal.detach()
@@ -49,3 +49,6 @@ class Misalignment(Memoryless):
             Quantity("shift_mm", value_of(self.shift), "mm", -20.0, 20.0, setup),
             Quantity("scale_share", value_of(self.scale), "", -0.1, 0.1, "a wand's calibration"),
         ]
+
+
+HYPOTHESIS = Hypothesis(Misalignment, exact_form=True)

@@ -1,27 +1,27 @@
 """Payload: weight at the tip and along the body bends the arm.
 
-Euler-Bernoulli on the bent centreline r(s) (Love 1927, ch. XVIII; `surgisoft.surrogate.beam`):
+Euler-Bernoulli beam on the bent centreline r(s) (Love 1927, ch. XVIII; `effects/beam.py`):
 
     M(s) = (r_tip - r(s)) x F + int_s^L (r(s') - r(s)) x w ds',
     theta(s) = C int_0^s M ds,     u(s) = int_0^s theta x dr,     q = p + u.
 
-Shapes alone tell C F and C w, compliance times load. They are given as the sag that they cause at
-the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8. Where gravity's
-direction is not known, each is a vector in the base frame.
+The shape of an arm determines only C F and C w, compliance times load. They are given as the sag
+that they cause at the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8.
+Where gravity's direction is not known, each is a vector in the base frame.
 """
 
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, cross, displaced
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
+from surgisoft.surrogate.effects.beam import Beam, cross, displaced
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 
 class Payload(Memoryless):
     """Weight at the tip and along the body."""
 
     stage = "body"
-    settled_form = True
 
     def __init__(self, facts: ArmFacts):
         super().__init__(facts)
@@ -40,7 +40,7 @@ class Payload(Memoryless):
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         """Sag at the tip, mm, by a load at the tip and along the body; (1,), or (3,) by axis."""
         return {"tip_sag": self.tip_sag, "body_sag": self.body_sag}
 
@@ -55,7 +55,7 @@ class Payload(Memoryless):
         """Loaded key points (..., n, 3) from those of the unloaded arm, mm."""
         return signal + self._moved(signal, torch.stack([self.tip_sag, self.body_sag]) @ self.down)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         with torch.no_grad():
             p = signal.mT.contiguous()
             chords = p @ self.chords
@@ -82,3 +82,6 @@ class Payload(Memoryless):
             Quantity("body_sag_mm", value_of(self.body_sag), "mm", least, largest, small),
             Quantity("sag_mm", value_of(total), "mm", lightest, largest, "no negative mass"),
         ]
+
+
+HYPOTHESIS = Hypothesis(Payload, exact_form=True)

@@ -3,14 +3,14 @@
     y' = (u - y) / tau  (1 + |u - y| / turn) / (1 + 1/10 / turn),      u = A x / |A|, x = load,
     x_eff = x + share A' (y - u) / |A|.
 
-u is the load of a wall line, y the part of it that the line has followed, and u - y the stress
-that its fluid takes up. With share = 1 a line is a spring beside a dashpot (Kelvin & Voigt), with
+u is the load of a wall fibre, y the part of it that the fibre has followed, and u - y the stress
+that its fluid takes up. With share = 1 a fibre is a spring beside a dashpot (Kelvin & Voigt), with
 less the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is that
 of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newton's at stresses below
 `turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele). So
 tau is the time constant at a stress of a tenth of the range; turn -> infinity is Newton's fluid. A
-mixes the chambers' loads into those of the lines (`wall_lines`): a chamber that bends the arm
-shortens the wall on the other side; what moves all lines most is held back by the whole share.
+mixes the chambers' loads into those of the fibres (`fibre_matrix`): a chamber that bends the arm
+shortens the wall on the other side; what moves all fibres most is held back by the whole share.
 The load is held between two rows; over one of them the equation, a logistic one, is solved exactly.
 """
 
@@ -26,28 +26,28 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 from surgisoft.surrogate.scan import follow
-from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
 
 USUAL = 0.1
 """Stress, as a share of the largest load, at which the time constant is stated."""
 NEWTON = 100.0
-"""Stress up to which a fluid is Newton's unless told otherwise."""
+"""Stress up to which a fluid is Newton's by default."""
 THIN = 0.01
-"""The same for the shear-thinning fluid that a diagnosis tries."""
+"""Stress up to which the shear-thinning fluid that identification tries is Newton's."""
 NEWTONS, THINS = (0.04, 0.1, 0.25, 0.6), (0.01, 0.04, 0.15, 0.6)
-"""Time constants of Newton's and of shear-thinning fluids that a diagnosis tries, s."""
+"""Time constants of Newton's and of shear-thinning fluids that identification tries, s."""
 OTHERS = -0.5
-"""Share of the other chambers in a wall line's load that a diagnosis tries."""
+"""Share of the other chambers in a wall fibre's load that identification tries."""
 TOLERANCE = 1e-6
 """Change of a whole recording's loads at which their iteration ends."""
 
 
-class RateDependence(Effect):
-    """Newtonian or shear-thinning resistance to the rate of the wall lines' loads, all alike."""
+class RateDependence(WallFibres):
+    """Newtonian or shear-thinning resistance to the rate of the wall fibres' loads, all alike."""
 
     stage = "material"
-    side_by_side = False  # a wall has one fluid; several of both signs would be a lead
 
     def __init__(
         self,
@@ -58,38 +58,22 @@ class RateDependence(Effect):
         ring: bool = False,
     ):
         """Time constant, s; stress at which the fluid thins, as a share of the largest load; the
-        wall lines' loads (`wall_lines`)."""
+        mixture of the wall fibres' loads (`fibre_matrix`)."""
         super().__init__(facts)
-        self.ring = bool(ring)
         self.share = amplitude(1)
         self.log_tau = logarithm(tau_s)
         self.log_turn = logarithm(turn)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+        self.set_fibres(others, ring)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.log_tau, self.log_turn, self.others]
 
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        newton = [cls(facts, tau) for tau in NEWTONS]  # any lines of it do nearly the same
-        lines = lines_tried(len(facts.low), OTHERS)
-        return [*newton, *(cls(facts, tau, THIN, *some) for tau in THINS for some in lines)]
-
-    def lines(self, signal: Tensor) -> Tensor:
-        """(..., K) load of each wall line from the actuation (..., m)."""
-        return self.load(signal) @ self._lines.T
-
-    @property
-    def _lines(self) -> Tensor:
-        """(K, m) loads of the wall lines by those of the chambers."""
-        return wall_lines(self.others, len(self.reach), self.ring)
-
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, K) what the lines of an arm that has rested at the actuation (B, m) have followed."""
-        return self.lines(signal)
+        """(B, K) what the fibres of an arm at rest at the actuation (B, m) have followed."""
+        return self.fibre_loads(signal)
 
     def _decayed(self, dt: Tensor, stress: Tensor) -> tuple[Tensor, Tensor]:
         """What dt (..., 1) s leave of a stress (..., K), and its derivative by the stress."""
@@ -99,28 +83,25 @@ class RateDependence(Effect):
         return stress * keep / faster, keep / faster.square()
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, K) what the lines have followed after the actuation (B, m)."""
-        u = self.lines(signal)
+        """(B, K) what the fibres have followed after the actuation (B, m)."""
+        u = self.fibre_loads(signal)
         return u - self._decayed(context.dt_s.unsqueeze(-1), u - memory)[0]
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, K) what the lines have followed along the actuation (R, T, m)."""
+        """(R, T, K) what the fibres have followed along the actuation (R, T, m)."""
         dt = context.dt_s.unsqueeze(-1)
-        return follow(lambda s: self._decayed(dt, s), self.lines(signal), memory, TOLERANCE)
+        return follow(lambda s: self._decayed(dt, s), self.fibre_loads(signal), memory, TOLERANCE)
 
     def _behind(self, signal: Tensor, memory: Tensor) -> Tensor:
         """(..., m) what the fluid keeps back of the loads, at a share of one."""
-        return (memory - self.lines(signal)) @ self._lines
+        return (memory - self.fibre_loads(signal)) @ self.fibres
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m) and followed loads."""
         return signal + self.reach * self.share * self._behind(signal, memory)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return (self.reach * self._behind(signal, memory)).unsqueeze(0).detach()
-
-    def config(self) -> dict:
-        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: what is slower than a second is creep"
@@ -132,3 +113,14 @@ class RateDependence(Effect):
             Quantity("turn", value_of(self.log_turn.exp()), "", 0.0, 1e4, both),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    newton = [RateDependence(facts, tau) for tau in NEWTONS]  # any fibres do nearly the same
+    fibres = fibres_tried(len(facts.low), OTHERS)
+    thin = [RateDependence(facts, tau, THIN, *some) for tau in THINS for some in fibres]
+    return [*newton, *thin]
+
+
+# A wall has one fluid; several of both signs together would be a lead.
+HYPOTHESIS = Hypothesis(RateDependence, _grid, combinations=no_combinations)

@@ -1,13 +1,13 @@
 """Softening: the wall is softer below the largest load that it has seen (Mullins 1969).
 
-As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall line's load, its
+As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall fibre's load, its
 largest value so far W_max, and an exponential instead of the error function:
 
     x_eff = x + own A' (u d(W, W_max)) / |A| + common x d(V, V_max),   u = A x / |A|,
     d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
     W_i = u_i^2,   V = sum_i x_i^2 / m.
 
-A mixes the chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm
+A mixes the chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm
 shortens the wall on the other side. On a first loading W = W_max and nothing changes.
 """
 
@@ -23,15 +23,16 @@ from surgisoft.surrogate.effects.base import (
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = ((0.05, 0.02), (0.2, 0.02), (0.8, 0.02), (0.02, 0.2), (0.02, 0.7))
-"""Widths that a diagnosis tries, in units of the energy at full load, and their growths."""
+"""Widths that identification tries, in units of the energy at full load, and their growths."""
 OTHERS = -0.35
-"""Share of the other chambers in a wall line's load that a diagnosis tries."""
+"""Share of the other chambers in a wall fibre's load that identification tries."""
 
 
-class Softening(Effect):
+class Softening(WallFibres):
     """Mullins softening by the largest load of a chamber and of all of them."""
 
     stage = "material"
@@ -46,37 +47,26 @@ class Softening(Effect):
     ):
         """width: fall of the energy over which the wall turns soft, in units of that at full load.
 
-        growth: what that grows by, as a share of the largest energy; others, ring: the wall lines'
-        loads (`wall_lines`).
+        growth: share of the largest energy that is added to the width; others, ring: the mixture of
+        the wall fibres' loads (`fibre_matrix`).
         """
         super().__init__(facts)
-        self.ring = bool(ring)
         self.own = amplitude(1)
         self.common = amplitude(1)
         self.log_width = logarithm(width)
         self.log_growth = logarithm(growth)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+        self.set_fibres(others, ring)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "common": self.common}
-
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Effect]:
-        lines = lines_tried(len(facts.low), OTHERS)
-        return [cls(facts, *widths, *some) for widths in GRID for some in lines]
 
     def memory_parameters(self) -> list[nn.Parameter]:
         return [self.others]
 
-    @property
-    def _lines(self) -> Tensor:
-        """(K, m) loads of the wall lines by those of the chambers."""
-        return wall_lines(self.others, len(self.reach), self.ring)
-
     def energy(self, signal: Tensor) -> Tensor:
-        """(..., K + 1) energy of each wall line and the chambers' mean, from actuation (..., m)."""
+        """(..., K + 1) energy of each fibre and the chambers' mean, from actuation (..., m)."""
         load = self.load(signal)
-        own, mean = (load @ self._lines.T).square(), load.square().mean(-1, keepdim=True)
+        own, mean = (load @ self.fibres.T).square(), load.square().mean(-1, keepdim=True)
         return torch.cat([own, mean], dim=-1)
 
     def rest(self, signal: Tensor) -> Tensor:
@@ -92,11 +82,11 @@ class Softening(Effect):
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at strength one: own and common."""
+        """Two (..., m) shifts of the actuation at amplitude one: own and common."""
         below = (memory - self.energy(signal)).clamp(min=0)
         damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
-        load, lines = self.load(signal), self._lines
-        own = ((load @ lines.T) * damage[..., :-1]) @ lines
+        load, fibres = self.load(signal), self.fibres
+        own = ((load @ fibres.T) * damage[..., :-1]) @ fibres
         return self.reach * own, self.reach * load * damage[..., -1:]
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -104,11 +94,8 @@ class Softening(Effect):
         own, common = self._softened(signal, memory)
         return signal + self.own * own + self.common * common
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return torch.stack(self._softened(signal, memory)).detach()
-
-    def config(self) -> dict:
-        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"
@@ -121,3 +108,11 @@ class Softening(Effect):
             Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    fibres = fibres_tried(len(facts.low), OTHERS)
+    return [Softening(facts, *widths, *some) for widths in GRID for some in fibres]
+
+
+HYPOTHESIS = Hypothesis(Softening, _grid)

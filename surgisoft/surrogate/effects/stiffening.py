@@ -1,6 +1,6 @@
 """Stiffening: the wall resists more, the farther it is strained.
 
-The share of push that is lost grows with the load u of each wall line and with the bending of the
+The share of push that is lost grows with the load u of each wall fibre and with the bending of the
 arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
     x_eff = x - own A' (u h(u^2)) / |A| - bend x h(B^2),   u = A x / |A|,
@@ -9,8 +9,8 @@ arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
 
 with B = 1 where one chamber alone is fully loaded; of four chambers, which stand in a ring, opposed
 ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A mixes the
-chambers' loads into those of wall lines (`wall_lines`): a chamber that bends the arm shortens the
-wall on the other side.
+chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm shortens
+the wall on the other side.
 """
 
 import torch
@@ -18,21 +18,23 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
+    Effect,
     Memoryless,
     Quantity,
     amplitude,
     logarithm,
     value_of,
 )
-from surgisoft.surrogate.wall_fibres import lines_tried, wall_lines
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
 
 GRID = (0.1, 2.0, 5.0)
-"""Steepnesses k that a diagnosis tries: nearly cubic, and exponential."""
+"""Steepnesses k that identification tries: nearly cubic, and exponential."""
 OTHERS = -0.35
-"""Share of the other chambers in a wall line's load that a diagnosis tries."""
+"""Share of the other chambers in a wall fibre's load that identification tries."""
 
 
-class Stiffening(Memoryless):
+class Stiffening(WallFibres, Memoryless):
     """Progressive loss of push, the same for all chambers."""
 
     stage = "material"
@@ -42,25 +44,19 @@ class Stiffening(Memoryless):
     ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
-        others, ring: the wall lines' loads (`wall_lines`).
+        others, ring: the mixture of the wall fibres' loads (`fibre_matrix`).
         """
         super().__init__(facts)
-        self.ring = bool(ring)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+        self.set_fibres(others, ring)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         return {"own": self.own, "bend": self.bend}
 
-    @classmethod
-    def candidates(cls, facts: ArmFacts, points: Tensor) -> list[Memoryless]:
-        lines = lines_tried(len(facts.low), OTHERS)
-        return [cls(facts, steepness, *some) for steepness in GRID for some in lines]
-
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at strength one: own and bending."""
+        """Two (..., m) shifts of the actuation at amplitude one: own and bending."""
         x, k = self.load(signal), self.log_steepness.exp()
         m = x.shape[-1]
         if m == 4:
@@ -73,9 +69,9 @@ class Stiffening(Memoryless):
             # A recording beyond the fitted range must not blow up.
             return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
 
-        lines = wall_lines(self.others, m, self.ring)
-        u = x @ lines.T
-        own = lost(u, u.square()) @ lines
+        fibres = self.fibres
+        u = x @ fibres.T
+        own = lost(u, u.square()) @ fibres
         return self.reach * own, self.reach * lost(x, bend)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -83,11 +79,8 @@ class Stiffening(Memoryless):
         own, bend = self._lost(signal)
         return signal + self.own * own + self.bend * bend
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         return torch.stack(self._lost(signal)).detach()
-
-    def config(self) -> dict:
-        return {"ring": self.ring}
 
     def quantities(self) -> list[Quantity]:
         rubber = "wide: a rest of the push is left"
@@ -106,3 +99,11 @@ class Stiffening(Memoryless):
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
             Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+
+
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    fibres = fibres_tried(len(facts.low), OTHERS)
+    return [Stiffening(facts, steepness, *some) for steepness in GRID for some in fibres]
+
+
+HYPOTHESIS = Hypothesis(Stiffening, _grid)

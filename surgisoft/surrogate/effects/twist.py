@@ -12,7 +12,6 @@ with t the tangent of the bent centreline r(s) of length L. A straight arm hides
 import torch
 from torch import Tensor, nn
 
-from surgisoft.surrogate.beam import Beam, displaced
 from surgisoft.surrogate.effects.base import (
     ArmFacts,
     Context,
@@ -21,6 +20,8 @@ from surgisoft.surrogate.effects.base import (
     amplitude,
     value_of,
 )
+from surgisoft.surrogate.effects.beam import Beam, displaced
+from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 
 class Twist(Effect):
@@ -37,7 +38,7 @@ class Twist(Effect):
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)
 
-    def strengths(self) -> dict[str, nn.Parameter]:
+    def amplitudes(self) -> dict[str, nn.Parameter]:
         """Twist of the tip against the base at full load, rad."""
         return {"linear": self.linear, "quadratic": self.quadratic}
 
@@ -67,7 +68,7 @@ class Twist(Effect):
         angle = self.linear * memory + self.quadratic * memory * memory.abs()
         return signal + angle.unsqueeze(-1) * self._turned(signal)
 
-    def columns(self, signal: Tensor, memory: Tensor) -> Tensor:
+    def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
         with torch.no_grad():
             turned, load = self._turned(signal), memory.unsqueeze(-1)
             return torch.stack([load * turned, load * load.abs() * turned])
@@ -81,3 +82,6 @@ class Twist(Effect):
             Quantity("linear_rad", value_of(self.linear), "rad", -1.0, 1.0, fibres),
             Quantity("quadratic_rad", value_of(self.quadratic), "rad", -1.0, 1.0, fibres),
         ]
+
+
+HYPOTHESIS = Hypothesis(Twist)

@@ -144,7 +144,7 @@ class ArmPart:
     offset_mm: Tensor
     """(B, n, 3) mm: known difference of the key points from the model's; 0 in simulation."""
     plant: Any = None
-    """State of the plants where simulated rigs move the arm, a pytree with `Objects` in it;
+    """State of the plants where simulated rigs move the arm, a pytree with `ObjectBatch`es in it;
     None where the model moves it. Resets and row selections carry it like any tensor."""
 
     @property

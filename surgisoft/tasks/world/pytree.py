@@ -1,16 +1,16 @@
-"""States are pytrees: frozen dataclasses, mappings and tuples of tensors, the batch in front."""
+"""Pytree operations on states: frozen dataclasses, dicts and tuples of tensors, batch in front."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import Field, fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields, is_dataclass, replace
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 Tree = TypeVar("Tree")
-Thing = TypeVar("Thing")
+Item = TypeVar("Item")
 
 
 class TensorDataclass(Protocol):
@@ -19,60 +19,34 @@ class TensorDataclass(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
 
-class Objects(Generic[Thing]):
-    """A batch of B things that are no tensors, one for each environment, such as simulated plants.
+@dataclass(frozen=True, eq=False)
+class ObjectBatch(Generic[Item]):
+    """One Python object for each of B environments, carried in a state beside its tensors.
 
-    `rows` and `with_rows` choose among the things as they choose among the rows of tensors. The
-    things themselves are never copied: two states may hold the same one, and where a step changes
-    it, only the new state may be stepped again.
+    `rows` and `with_rows` select and replace objects as they do rows of tensors; `tree_map` leaves
+    them alone. An object that changes in a step (a simulated rig) is shared by the old state and
+    the new one, so the old state must not be stepped again.
     """
 
-    def __init__(self, things: Iterable[Thing]):
-        self.things: tuple[Thing, ...] = tuple(things)
-
-    def __len__(self) -> int:
-        return len(self.things)
+    items: tuple[Item, ...]
+    """B objects."""
 
 
-def tree_map(
-    function: Callable[..., Tensor],
-    tree: Tree,
-    *others: Tree,
-    objects: Callable[..., Objects] | None = None,
-) -> Tree:
-    """The pytree with `function` applied to each tensor and its counterparts in `others`.
+def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:
+    """Apply `function` to each tensor of a pytree and its counterparts in `others`.
 
-    `objects` does the same to each batch of `Objects`; without it they are kept as they are in
-    `tree`, as is everything else that is no tensor (a name, None).
+    A leaf that is no tensor (a name, None, an `ObjectBatch`) is kept as it is in `tree`.
     """
-
-    def down(value, *values):
-        return tree_map(function, value, *values, objects=objects)
-
-    if isinstance(tree, Tensor):
-        return function(tree, *others)
-    if isinstance(tree, Objects):
-        return tree if objects is None else objects(tree, *others)
-    if isinstance(tree, dict):
-        return {key: down(value, *(o[key] for o in others)) for key, value in tree.items()}
-    if isinstance(tree, tuple):
-        return tuple(down(*values) for values in zip(tree, *others, strict=True))
-    if is_dataclass(tree):
-        parts = {
-            field.name: down(*(getattr(each, field.name) for each in (tree, *others)))
-            for field in fields(tree)
-        }
-        return replace(tree, **parts)
-    return tree
+    return _mapped(function, lambda objects, *_: objects, tree, *others)
 
 
 def rows(tree: Tree, index: Tensor) -> Tree:
     """The environments at index (R,) int64."""
-    return tree_map(
-        lambda value: value.index_select(0, index),
-        tree,
-        objects=lambda batch: Objects(batch.things[row] for row in index.tolist()),
-    )
+
+    def chosen(objects: ObjectBatch) -> ObjectBatch:
+        return ObjectBatch(tuple(objects.items[i] for i in index.tolist()))
+
+    return _mapped(lambda value: value.index_select(0, index), chosen, tree)
 
 
 def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
@@ -81,17 +55,52 @@ def with_rows(tree: Tree, index: Tensor, fresh: Tree) -> Tree:
     Out of place; values are copied, never blended, so a nan that is replaced leaves no trace.
     """
 
-    def replaced(old: Objects, new: Objects) -> Objects:
-        things = list(old.things)
-        for row, thing in zip(index.tolist(), new.things, strict=True):
-            things[row] = thing
-        return Objects(things)
+    def replaced(old: ObjectBatch, new: ObjectBatch) -> ObjectBatch:
+        items = list(old.items)
+        for place, item in zip(index.tolist(), new.items, strict=True):
+            items[place] = item
+        return ObjectBatch(tuple(items))
 
-    return tree_map(
-        lambda old, new: old.index_copy(0, index, new.to(old.dtype)), tree, fresh, objects=replaced
-    )
+    def copied(old: Tensor, new: Tensor) -> Tensor:
+        return old.index_copy(0, index, new.to(old.dtype))
+
+    return _mapped(copied, replaced, tree, fresh)
 
 
 def overwritable(tensor: Tensor) -> bool:
     """Whether PyTorch allows a write here: a tensor made under inference_mode only inside one."""
     return torch.is_inference_mode_enabled() or not tensor.is_inference()
+
+
+def _mapped(
+    of_tensors: Callable[..., Tensor],
+    of_objects: Callable[..., ObjectBatch],
+    tree: Any,
+    *others: Any,
+) -> Any:
+    """The pytree with one function applied to its tensors and one to its object batches."""
+    if isinstance(tree, Tensor):
+        return of_tensors(tree, *others)
+    if isinstance(tree, ObjectBatch):
+        return of_objects(tree, *others)
+    if isinstance(tree, dict):
+        return {
+            key: _mapped(of_tensors, of_objects, value, *(other[key] for other in others))
+            for key, value in tree.items()
+        }
+    if isinstance(tree, tuple):
+        return tuple(
+            _mapped(of_tensors, of_objects, *values) for values in zip(tree, *others, strict=True)
+        )
+    if is_dataclass(tree) and not isinstance(tree, type):
+        parts = {
+            field.name: _mapped(
+                of_tensors,
+                of_objects,
+                getattr(tree, field.name),
+                *(getattr(other, field.name) for other in others),
+            )
+            for field in fields(tree)
+        }
+        return replace(tree, **parts)
+    return tree

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-import surgisoft
 from surgisoft.errors import unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap, AblationState
@@ -20,6 +18,7 @@ from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesions import lesions_like
 from surgisoft.scene.mesh import Body
+from surgisoft.scene.packaged import PHANTOM as PHANTOM
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.refereed import RefereedScene
 from surgisoft.scene.tissue import Tissue
@@ -27,10 +26,6 @@ from surgisoft.tasks.world.arm import ArmPart, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
 
-_PACKAGE = Path(surgisoft.__file__).parent
-_HOME = _PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent
-PHANTOM = _HOME / "scenes" / "phantom_liver"
-"""The scene that comes with the project: in the installed package, or beside it in a checkout."""
 GEOMETRIES = ("batched", "fcl")
 """Collision engines: `batched` for training, `fcl` exact."""
 LASER, ENDOSCOPE = "laser", "endoscope"

@@ -2,7 +2,14 @@
 
 import torch
 
-from surgisoft.surrogate.effects import ArmFacts, Context, Effect, known_effects, make_effect
+from surgisoft.surrogate.effects import (
+    ArmFacts,
+    Context,
+    Effect,
+    hypothesis_of,
+    known_effects,
+    make_effect,
+)
 
 REST_MM = torch.tensor([[0.0, 0.0, 17.5 * k] for k in range(5)])
 
@@ -68,7 +75,7 @@ def variants() -> dict[str, Effect]:
     answer = {}
     for name, kind in known_effects().items():
         answer[name] = make_effect(name, FACTS)
-        made = kind.candidates(FACTS, points)
+        made = hypothesis_of(kind).candidates(FACTS, points)
         kinds = {}
         for number, effect in enumerate(made):
             kinds[effect.stage, *(tuple(p.shape) for p in effect.parameters())] = number

@@ -7,7 +7,7 @@ from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import STAGES, free_name, known_effects, make_effect
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.model import ArmModel, arm_facts
+from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import HawNN
 from tests.surrogate.effects.arms import REST_MM, stir
 
@@ -24,7 +24,7 @@ def model(names) -> ArmModel:
     network.mean.copy_(REST_MM.flatten())
     facts = arm_facts(SPEC, REST_MM)
     made = {name: stir(make_effect(name, facts), size=0.03) for name in names}
-    return ArmModel(SPEC, network, made, REST_MM, {"rmse_mm": 1.0}).eval().requires_grad_(False)
+    return ArmModel(SPEC, network, made, REST_MM, Validation(1.0)).eval().requires_grad_(False)
 
 
 def history(runs: int, steps: int) -> History:
@@ -59,7 +59,7 @@ def test_two_effects_of_a_kind_act_in_one_model(tmp_path):
     assert name == "creep#2"
     assert free_name("creep", ("creep", "creep#2")) == "creep#3"
     more = dict(arm.effects) | {name: stir(make_effect(name, facts), seed=8)}
-    twice = ArmModel(SPEC, arm.network, more, REST_MM, {"rmse_mm": 1.0})
+    twice = ArmModel(SPEC, arm.network, more, REST_MM, Validation(1.0))
     save_model(twice.eval(), tmp_path / "arm")
     again, seen = load_model(tmp_path / "arm"), history(1, 30)
     assert list(again.effects) == ["creep", "creep#2", "payload"]

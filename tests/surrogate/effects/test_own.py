@@ -11,18 +11,19 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import (
+    hypothesis_of,
     known_effects,
     make_effect,
     named_effect,
     own,
     register_effect_file,
 )
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.networks import ConstantCurvature
 from tests.surrogate.effects.arms import FACTS
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
-EXAMPLE = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.S)[1]
+EXAMPLE, SECOND = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +45,7 @@ def arm() -> ArmModel:
     effect.loss.data.fill_(0.3)
     network = ConstantCurvature(torch.tensor(spec.low), torch.tensor(spec.high), 2)
     network.set_rest(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 70.0]]))
-    return ArmModel(spec, network, {"slack": effect}, torch.eye(3)[:2], {"rmse_mm": 0.1})
+    return ArmModel(spec, network, {"slack": effect}, torch.eye(3)[:2], Validation(0.1))
 
 
 def test_the_documentations_effect_works(slack):
@@ -54,10 +55,85 @@ def test_the_documentations_effect_works(slack):
     x = torch.tensor([[-10.0, 0.0, 20.0]])
     memory = effect.rest(x)
     assert torch.equal(effect.apply(x, memory), x)
-    assert torch.equal(effect.columns(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
+    assert torch.equal(effect.sensitivities(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
     effect.loss.data.fill_(0.5)
     assert effect.apply(x, memory).tolist() == [[-5.0, 0.0, 20.0]]
     assert effect.plausible()
+
+
+OLD = """
+import torch
+from surgisoft.surrogate.effects import Memoryless, Quantity
+
+
+class Old(Memoryless):
+    stage = "material"
+    side_by_side = False
+    needs_reversals = True
+    settled_form = True
+
+    def __init__(self, facts, bend=1.0):
+        super().__init__(facts)
+        self.loss = torch.nn.Parameter(torch.zeros(1))
+        self.bend = torch.nn.Parameter(torch.tensor([float(bend)]))
+
+    def strengths(self):
+        return {"loss": self.loss}
+
+    def shapes(self):
+        return super().shapes()
+
+    def columns(self, signal, memory):
+        return -self.bend.detach() * signal[None]
+
+    def apply(self, signal, memory):
+        return signal - self.loss * self.bend * signal
+
+    def config(self):
+        return {}
+
+    def quantities(self):
+        return [Quantity("loss_share", float(self.loss.detach()), "", 0.0, 1.0, "")]
+
+    @classmethod
+    def candidates(cls, facts, points):
+        return [cls(facts, bend) for bend in (1.0, 2.0)]
+"""
+"""An effect with the names of methods and the class attributes of earlier versions."""
+
+
+def test_an_effect_with_the_names_of_before_still_works(tmp_path):
+    (tmp_path / "old.py").write_text(OLD)
+    register_effect_file(tmp_path / "old.py")
+    effect = make_effect("old", FACTS)
+    assert effect.amplitudes() == {"loss": effect.loss}
+    assert effect.nonlinear_parameters() == {"bend": effect.bend} == effect.shapes()
+    x = torch.tensor([[2.0, 3.0, 4.0]])
+    assert torch.equal(effect.sensitivities(x, effect.rest(x)), -x[None])
+    stated = hypothesis_of(effect)
+    assert (stated.needs_reversals, stated.exact_form) == (True, True)
+    tried = stated.candidates(FACTS, torch.zeros(1, 5, 3))
+    assert [float(one.bend.detach()) for one in tried] == [1.0, 2.0]
+    assert stated.further(FACTS, torch.zeros(1, 5, 3)) == []
+    assert stated.combinations(tried) == []
+
+
+def test_without_a_hypothesis_an_effect_is_tried_as_it_is(slack):
+    register_effect_file(slack)
+    stated = hypothesis_of(known_effects()["slack"])
+    (tried,) = stated.candidates(FACTS, torch.zeros(1, 5, 3))
+    assert not tried.loss.any()
+    assert stated.combinations([tried, tried]) == [[0, 1]]
+    assert (stated.needs_reversals, stated.exact_form) == (False, False)
+
+
+def test_a_file_states_its_hypothesis_beside_the_effect(slack):
+    """The documentation's second snippet behind its first."""
+    slack.write_text(EXAMPLE + SECOND.replace("Slack, grid", "Slack, grid, exact_form=True"))
+    register_effect_file(slack)
+    stated = hypothesis_of(known_effects()["slack"])
+    assert stated.exact_form
+    assert len(stated.candidates(FACTS, torch.zeros(1, 5, 3))) == 1
 
 
 def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):

@@ -9,7 +9,13 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from surgisoft.surrogate.effects import ArmFacts, Context, known_effects, make_effect
+from surgisoft.surrogate.effects import (
+    ArmFacts,
+    Context,
+    hypothesis_of,
+    known_effects,
+    make_effect,
+)
 
 RANGE = ArmFacts(torch.zeros(3), torch.full((3,), 50.0), torch.zeros(3), torch.zeros(5, 3))
 STRAIGHT = torch.tensor([[0.0, 0.0, 10.0 * k] for k in range(9)])
@@ -27,7 +33,9 @@ def arm(rest_mm: torch.Tensor, gravity=None) -> ArmFacts:
 def with_strength(effect, **values):
     """The effect with strengths set by name."""
     for name, value in values.items():
-        effect.strengths()[name].data.copy_(torch.as_tensor(value).expand_as(getattr(effect, name)))
+        effect.amplitudes()[name].data.copy_(
+            torch.as_tensor(value).expand_as(getattr(effect, name))
+        )
     return effect
 
 
@@ -162,7 +170,7 @@ def test_stiffening_of_wall_lines_that_the_other_chambers_shorten():
 @pytest.mark.parametrize("name", ["rate_dependence", "softening", "stiffening"])
 def test_a_ring_of_lines_answers_alike_whichever_chamber_is_loaded(name):
     ring = make_effect(name, RANGE, others=-0.2, ring=True)
-    ring = with_strength(ring, **dict.fromkeys(ring.strengths(), 0.3))
+    ring = with_strength(ring, **dict.fromkeys(ring.amplitudes(), 0.3))
     loads = torch.tensor([[1.0, 0.3, 0.0], [0.4, 0.9, 0.1], [0.2, 0.1, 0.0]])
     answer = run(ring, loads)
     for turn in (1, 2):
@@ -319,8 +327,8 @@ def test_supports_that_are_tried_together_stand_on_one_side():
     sway = torch.linspace(0, 2 * math.pi, 60)
     lean = torch.stack([sway.cos(), sway.sin(), 0 * sway], -1)
     points = STRAIGHT + 0.1 * STRAIGHT[:, 2:] * lean[:, None]
-    tried = known_effects()["contact"].candidates(arm(STRAIGHT), points)
-    together = type(tried[0]).together(tried)
+    tried = hypothesis_of(known_effects()["contact"]).candidates(arm(STRAIGHT), points)
+    together = hypothesis_of(tried[0]).combinations(tried)
     assert len(together) == 16
     for some in together:
         normals = torch.cat([tried[i].normal.detach()[None] for i in some])

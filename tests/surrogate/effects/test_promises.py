@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.surrogate.effects import STAGES, Context, known_effects, make_effect
+from surgisoft.surrogate.effects import STAGES, Context, hypothesis_of, known_effects, make_effect
 from tests.surrogate.effects.arms import (
     FACTS,
     REST_MM,
@@ -24,6 +24,11 @@ VARIANTS = variants()
 EVERY = pytest.mark.parametrize("effect", VARIANTS.values(), ids=VARIANTS)
 
 
+def candidates(name, arm, points):
+    """What identification tries of an effect."""
+    return hypothesis_of(known_effects()[name]).candidates(arm, points)
+
+
 def through(effect, x, seen):
     """The effect's answer along whole runs (R, T, ...)."""
     return effect.apply(x, effect.scan(effect.rest(x[:, 0]), x, seen))
@@ -33,7 +38,7 @@ def at_zero(effect):
     """The effect with other shapes, of zero strength."""
     effect = stir(copy.deepcopy(effect))
     with torch.no_grad():
-        for strength in effect.strengths().values():
+        for strength in effect.amplitudes().values():
             strength.zero_()
     return effect
 
@@ -41,7 +46,7 @@ def at_zero(effect):
 @EVERY
 def test_no_strength_no_change(effect):
     x = signal(effect, 2, 30, 0)
-    assert all(not strength.any() for strength in effect.strengths().values())
+    assert all(not strength.any() for strength in effect.amplitudes().values())
     assert torch.equal(x, through(effect, x, context(2, 30)))
     assert torch.equal(x, through(at_zero(effect), x, context(2, 30)))
     assert not torch.equal(x, through(stir(copy.deepcopy(effect)), x, context(2, 30)))
@@ -71,10 +76,10 @@ def test_columns_are_the_slopes_at_zero_strength(effect):
     effect = at_zero(effect).double()
     x, seen = signal(effect, 1, 400, 0).double(), context(1, 400)
     memory = effect.scan(effect.rest(x[:, 0]), x, seen)
-    columns = effect.columns(x, memory)
+    columns = effect.sensitivities(x, memory)
     found = []
     with torch.no_grad():
-        for strength in effect.strengths().values():
+        for strength in effect.amplitudes().values():
             for number in range(strength.numel()):
                 sides = []
                 for step in (1e-5, -1e-5):
@@ -158,7 +163,7 @@ def test_quantities_have_unit_range_and_source(effect):
 @EVERY
 def test_strengths_and_shapes_are_all_parameters(effect):
     named = dict(effect.named_parameters())
-    assert {**effect.strengths(), **effect.shapes()}.keys() == named.keys()
+    assert {**effect.amplitudes(), **effect.nonlinear_parameters()}.keys() == named.keys()
     mine = {id(p) for p in named.values()}
     assert all(id(p) in mine for p in effect.memory_parameters())
 
@@ -176,14 +181,14 @@ def test_registered_under_its_file(name):
 def test_any_number_of_chambers(name, chambers):
     arm = facts(chambers)
     points = REST_MM + torch.randn(50, 5, 3, generator=torch.Generator().manual_seed(0))
-    for effect in [make_effect(name, arm), *known_effects()[name].candidates(arm, points)]:
+    for effect in [make_effect(name, arm), *candidates(name, arm, points)]:
         x = torch.rand(2, 9, chambers) * 40
         if effect.stage in ("body", "sensor"):
             x = points[:18].view(2, 9, 5, 3)
         seen = context(2, 9, chambers=chambers)
         assert through(effect, x, seen).shape == x.shape
         memory = effect.scan(effect.rest(x[:, 0]), x, seen)
-        assert effect.columns(x, memory).isfinite().all()
+        assert effect.sensitivities(x, memory).isfinite().all()
 
 
 def test_unknown_effect_names_the_known_ones():
@@ -198,9 +203,9 @@ def test_few_key_points(name, count):
     for rest_mm in (REST_MM[-count:], torch.zeros(count, 3)):
         arm = dataclasses.replace(FACTS, rest_mm=rest_mm)
         points = REST_MM[-count:] + torch.randn(50, count, 3, generator=torch.manual_seed(0))
-        for effect in [make_effect(name, arm), *known_effects()[name].candidates(arm, points)]:
+        for effect in [make_effect(name, arm), *candidates(name, arm, points)]:
             x = points[:18].view(2, 9, count, 3) if on_points(effect) else torch.rand(2, 9, 3) * 40
             memory = effect.scan(effect.rest(x[:, 0]), x, context(2, 9))
-            columns = effect.columns(x, memory)
+            columns = effect.sensitivities(x, memory)
             assert columns.isfinite().all()
             assert stir(effect).apply(x, memory).shape == columns.shape[1:]

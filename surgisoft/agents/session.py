@@ -1,0 +1,303 @@
+"""Train and evaluate policies by the names of their tasks and the folders of their runs."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surgisoft.agents.distributed import processes
+from surgisoft.agents.evaluate import Evaluation
+from surgisoft.agents.evaluate import evaluate as evaluate_policy
+from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.policies import POLICIES, check_policy, open_policy
+from surgisoft.agents.presets import Plan, preset_for, steps_for
+from surgisoft.agents.rollout import EpisodeRecorders
+from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
+from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
+from surgisoft.config import to_table
+from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
+from surgisoft.tasks.base import Task
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.registry import (
+    TASKS,
+    config_of,
+    make_task,
+    read_config,
+    with_fields,
+)
+from surgisoft.workers import torch_threads
+
+CONFIDENCE = 0.95
+"""Share of the intervals of an evaluation that hold the true mean."""
+
+
+def task_config(
+    task: str,
+    config: Any = None,
+    arm: str | Path | None = None,
+    scene: str | Path | None = None,
+) -> Any:
+    """The configuration of a task with another arm or scene where one is given.
+
+    config: the task's configuration, a TOML file with fields of it, or None for the default.
+    """
+    if config is None:
+        config = config_of(task)
+    elif isinstance(config, str | Path):
+        config = read_config(task, Path(config))
+    given = {"arm": arm, "scene": scene}
+    return with_fields(config, **{name: str(v) for name, v in given.items() if v is not None})
+
+
+@dataclass(frozen=True)
+class TrainingRequest:
+    """What to train, before it is resolved to a `Plan`."""
+
+    task: str
+    """Name of the task."""
+    preset: str = "fast"
+    """`fast`, or `paper`: the hyper-parameters of Chen et al. 2025."""
+    steps: int | None = None
+    """Steps over all episodes; None: the task's own, unless minutes are given."""
+    minutes: float | None = None
+    """Time to train in place of steps, minutes."""
+    envs: int | None = None
+    """Episodes side by side; None: the preset's."""
+    seed: int = 0
+    """Seed of weights, noise and episodes."""
+    target_error: float | None = None
+    """Training ends when evaluation finds no larger mean error, mm, and full success."""
+    arm: str | Path | None = None
+    """Arm model of all arms; None: the configuration's."""
+    scene: str | Path | None = None
+    """Scene; None: the configuration's."""
+    config: Any = None
+    """Configuration of the task, or a TOML file with fields of it."""
+
+    def plan(self) -> Plan:
+        """The training run that this asks for."""
+        if self.steps is not None and self.minutes is not None:
+            raise InputError(
+                f"--steps {self.steps} and --minutes {self.minutes:g}: give one of them, the "
+                "training ends by one or the other"
+            )
+        own = task_config(self.task, self.config, self.arm, self.scene)
+        numbers = preset_for(self.preset, self.task, envs=self.envs)
+        steps = self.steps
+        if steps is None and self.minutes is None:
+            steps = steps_for(self.preset, self.task)
+        return Plan(
+            self.task,
+            own,
+            self.preset,
+            numbers,
+            steps,
+            self.minutes,
+            self.target_error,
+            self.seed,
+        )
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A training run after its training."""
+
+    folder: Path
+    """Folder of the run."""
+    result: Result
+    """How training ended."""
+    leads: bool
+    """Whether this process wrote the folder, where torchrun started several."""
+
+
+def train(
+    task: str | None = None,
+    output: str | Path | None = None,
+    *,
+    resume_from: str | Path | None = None,
+    device: str = "cpu",
+    threads: int = 1,
+    progress: Callable[[TrainingProgress], None] | None = None,
+    **fields: Any,
+) -> TrainedRun:
+    """Train the agents of a task with PPO; all of them learn at the same time.
+
+    output: folder of the new run; default `runs/TASK-DATE-TIME`.
+    resume_from: folder of an interrupted run that goes on, in place of a task and its fields.
+    fields: other fields of `TrainingRequest`, such as `steps=100_000` or `arm="my_arm"`.
+    progress: called with the state of the training after each iteration.
+    """
+    report = progress or (lambda state: None)
+    if resume_from is not None:
+        names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
+        if names:
+            given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+            raise InputError(
+                f"--resume goes on with what the run was started with: leave {given} out"
+            )
+        plan, folder = None, Path(resume_from)
+    elif task is None:
+        raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")
+    else:
+        plan = TrainingRequest(task, **fields).plan()
+        folder = _new_folder(task, output)
+    with torch_threads(threads), processes(device) as (here, kind):
+        if plan is None:
+            result = resume(folder, here, kind, report)
+        else:
+            result = train_new(folder, plan, here, kind, report)
+        return TrainedRun(folder, result, here.leads)
+
+
+def _new_folder(task: str, output: str | Path | None) -> Path:
+    """The folder of a new run; several processes cannot each name it by the time."""
+    if output is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError("several processes need one folder: name it with -o RUN")
+    folder = Path(output) if output else default_folder(task)
+    if os.environ.get("RANK", "0") == "0":
+        check_free(folder)
+    return folder
+
+
+@dataclass(frozen=True)
+class EvaluationRequest:
+    """Which policies to evaluate, on what."""
+
+    policies: Sequence[str]
+    """`scripted`, `random`, or folders of training runs."""
+    task: str | None = None
+    """Name of the task; None: that of the first run."""
+    episodes: int = 20
+    """Episodes of each policy."""
+    seed: int = 0
+    """Seed of the episodes, the same for each policy."""
+    rig: RigConfig | None = None
+    """The arms are on this virtual rig; None: in simulation."""
+    referee: bool = True
+    """Whether FCL checks contact, clearance and beam, where there is a scene."""
+    arm: str | Path | None = None
+    """Arm model of all arms; None: the configuration's."""
+    scene: str | Path | None = None
+    """Scene; None: the configuration's."""
+    config: Any = None
+    """Configuration of the task, or a TOML file with fields of it; None: that of the first run."""
+    log: Collection[str] = ()
+    """Policies whose first episode is logged."""
+
+    @property
+    def place(self) -> str:
+        """Where the episodes take place: `simulation` or `rig`."""
+        return "simulation" if self.rig is None else "rig"
+
+    def resolved(self, on_warning: Callable[[str], None]) -> tuple[Task, Any]:
+        """The task and its configuration; a run brings its own."""
+        if not self.policies:
+            raise InputError("no policy is given; expected scripted, random or a run's folder")
+        for name in self.policies:
+            check_policy(name)
+        runs = [RunFolder(name) for name in self.policies if name not in POLICIES]
+        if self.task is None and not runs:
+            raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
+        task = self.task or runs[0].config["task"]
+        brought = [run for run in runs if run.config["task"] == task]
+        for run in runs:
+            if run not in brought:
+                on_warning(f"{run.path} was trained on {run.config['task']}, not on {task}")
+        config = self.config
+        if config is None and brought:
+            config = brought[0].plan().task_config
+        config = task_config(task, config, self.arm, self.scene)
+        return make_task(task, config), config
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluations:
+    """How well several policies do one task, on the same episodes."""
+
+    request: EvaluationRequest
+    """What was asked for."""
+    task: str
+    """Name of the task."""
+    task_config: dict
+    """Its configuration as a table."""
+    dt_s: float
+    """Time of a step, s."""
+    results: tuple[Evaluation, ...]
+    """One for each policy, in order."""
+    logs: dict[str, EpisodeLog]
+    """The first episode of each policy that was to be logged."""
+
+    def to_json(self) -> dict:
+        """Plain values, as `evaluate --json` writes them."""
+        asked = self.request
+        return {
+            "task": self.task,
+            "task_config": self.task_config,
+            "on": asked.place,
+            "rig": asked.rig and to_table(asked.rig),
+            "seed": asked.seed,
+            "episodes": asked.episodes,
+            "dt_s": self.dt_s,
+            "confidence": CONFIDENCE,
+            "drivers": {
+                name: result.to_json()
+                for name, result in zip(asked.policies, self.results, strict=True)
+            },
+        }
+
+
+def evaluate(
+    policies: str | Path | Sequence[str | Path],
+    task: str | None = None,
+    *,
+    progress: Progress = silent,
+    on_warning: Callable[[str], None] = warnings.warn,
+    **fields: Any,
+) -> Evaluations:
+    """Evaluate policies on the same episodes of a task, with 95 % intervals.
+
+    policies: `scripted` (inverse kinematics with privileged information), `random`, or folders of
+    training runs. A run brings its task and the task's configuration.
+    fields: other fields of `EvaluationRequest`, such as `episodes=100` or `rig=RigConfig(seed=3)`.
+    progress: called with (episodes done, episodes to do, policy).
+    """
+    given = [policies] if isinstance(policies, str | Path) else policies
+    names = tuple(dict.fromkeys(str(name) for name in given))
+    request = EvaluationRequest(names, task, **fields)
+    plain, config = request.resolved(on_warning)
+    place = plain if request.rig is None else on_rig(plain, request.rig)
+    opened = {name: open_policy(name, place) for name in request.policies}
+    logs = {
+        name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
+        for name in request.log
+    }
+    results = []
+    for number, (name, policy) in enumerate(opened.items()):
+
+        def tell(done: float, total: float, first: int = number, name: str = name) -> None:
+            progress(first * total + done, len(opened) * total, name)
+
+        result = evaluate_policy(
+            place,
+            name,
+            policy,
+            request.episodes,
+            request.seed,
+            request.referee,
+            progress=tell,
+            watch=logs.get(name),
+        )
+        results.append(result)
+    return Evaluations(
+        request,
+        plain.name,
+        to_table(config),
+        plain.world.config.dt_s,
+        tuple(results),
+        {name: each.log(0) for name, each in logs.items()},
+    )

@@ -1,0 +1,1 @@
+"""Estimation: the parameters of effects in a model, fitted through the whole chain."""

@@ -1,0 +1,247 @@
+"""Put named effects into a model, or fit those anew that it has, on a problem's rows."""
+
+import copy
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.candidates import Candidate, candidates, with_effect
+from surgisoft.diagnosis.criteria import CRITERIA
+from surgisoft.diagnosis.cross_validation import cross_validation_of
+from surgisoft.diagnosis.estimation.intervals import Parameter, intervals
+from surgisoft.diagnosis.estimation.least_squares import (
+    Fit,
+    fit_all,
+    fit_amplitudes,
+    free_parameters,
+    repeated_scan,
+)
+from surgisoft.diagnosis.residuals import Problem
+from surgisoft.errors import InputError
+from surgisoft.surrogate.effects import Effect
+from surgisoft.surrogate.model import ArmModel
+
+LARGE = 24
+"""Most free values of an effect that are all fitted; of more, the amplitudes alone are."""
+FIRST_ITERATIONS = 4
+"""Steps from each start before the best of them goes on."""
+BISECTIONS = 20
+"""Halvings in the search for the largest plausible amplitudes."""
+ROUNDS = 2
+"""Rounds in turns where effects with few and with many values are fitted together."""
+REFINING_ITERATIONS = 8
+"""Most steps of a fit that refines a candidate."""
+MOST_VALUES = 12
+"""Most values of a candidate that is refined: the rows that score it are those it is fitted to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A model with effects fitted to a problem."""
+
+    model: ArmModel
+    """A model of its own: nothing is shared with the one that it came from."""
+    parameters: tuple[Parameter, ...]
+    """What was fitted, in physical units with intervals."""
+    refitted: tuple[str, ...]
+    """Effects among them that the model had before."""
+
+
+def fit_effects(problem: Problem, names: list[str]) -> Fitted:
+    """Fit the named effects in a problem's model; one that it lacks is added first."""
+    model = copy.deepcopy(problem.model)
+    if model.remembers:
+        raise InputError(
+            "effects are for models with a static network; the recurrent baseline takes none"
+        )
+    names = list(dict.fromkeys(names))
+    refitted = tuple(name for name in names if name in model.effects)
+    for name in names:
+        if name not in model.effects:
+            model = _added(problem.with_model(model), name)
+    large = [name for name in names if is_large(model.effects[name])]
+    small = [name for name in names if name not in large]
+    fits: dict[tuple[str, ...], Fit] = {}
+    for _ in range(ROUNDS if (small and large) or len(large) > 1 else 1):
+        for name in large:
+            fits[name,] = fit_amplitudes(model, problem, name)
+        if small:
+            fits[tuple(small)] = fit_all(model, problem, small)
+    parameters = []
+    for keys, fit in fits.items():
+        effects = {key: model.effects[key] for key in keys}
+        free = free_parameters(model, keys)
+        if len(keys) == 1 and keys[0] in large:
+            free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].amplitudes().items()}
+        parameters += intervals(effects, free, fit, problem.block)
+    order = {name: position for position, name in enumerate(names)}
+    parameters.sort(key=lambda parameter: order[parameter.effect])
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted)
+
+
+def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str) -> Fitted | None:
+    """The fit again with the amplitudes of one effect at the plausible end, all else free.
+
+    A network that was fitted without an effect has learned some of it, and the residual may then
+    ask for more of the effect than there can be. The amplitudes are shrunk by one factor, no
+    further than it takes. None where that does not make the effect plausible, or where nothing
+    else is free.
+    """
+    model = copy.deepcopy(fitted.model)
+    small = [each for each in dict.fromkeys(names) if not is_large(model.effects[each])]
+    if name not in small or not free_parameters(model, small, held=name):
+        return None
+    if not shrink(model.effects[name]):
+        return None
+    fit = fit_all(model, problem.with_model(model), small, held=name)
+    if not model.effects[name].plausible():
+        return None
+    effects = {key: model.effects[key] for key in small}
+    free = free_parameters(model, small, held=name)
+    found = intervals(effects, free, fit, problem.block)
+    rest = [p for p in fitted.parameters if p.effect not in small]
+    order = {each: position for position, each in enumerate(names)}
+    parameters = sorted([*found, *rest], key=lambda parameter: order[parameter.effect])
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), fitted.refitted)
+
+
+@torch.no_grad()
+def shrink(effect: Effect) -> bool:
+    """Scale an effect's amplitudes by the largest factor that makes it plausible, if there is one.
+
+    By bisection between 0 and the present amplitudes; returns whether such a factor was found.
+    """
+    amplitudes = {name: p.detach().clone() for name, p in effect.amplitudes().items()}
+
+    def scale(factor: float) -> bool:
+        for name, parameter in effect.amplitudes().items():
+            parameter.copy_(factor * amplitudes[name])
+        return effect.plausible()
+
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if scale(middle) else (low, middle)
+    return scale(low) and low > 0
+
+
+def is_large(effect: Effect) -> bool:
+    """Whether an effect has so many values that its amplitudes alone are fitted."""
+    return _values(effect) > LARGE
+
+
+def _added(problem: Problem, name: str) -> ArmModel:
+    """The problem's model with one effect more, roughly fitted, from the best of a few starts.
+
+    Of two that come to nearly the same, the simpler one is the best.
+    """
+    tried = []
+    for model in starts(problem, name):
+        effect = model.effects[name]
+        if is_large(effect):
+            misfit = fit_amplitudes(model, problem, name).misfit
+        else:
+            misfit = fit_all(model, problem, [name], FIRST_ITERATIONS).misfit
+        values = sum(p.numel() for p in effect.amplitudes().values())
+        tried.append((misfit * (1.0 + CRITERIA.selection.amplitude_price) ** values, model))
+    return min(tried, key=lambda one: one[0])[1]
+
+
+def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
+    """Models with the named effect in its best few candidates, amplitudes fitted; parts are copies.
+
+    The candidates are ranked by the error that each leaves on held-out blocks beside the model
+    discrepancy; of two that leave nearly the same, the simpler one comes first.
+    """
+    tried = candidates(problem, [name])
+    if not tried:
+        raise InputError(
+            f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "
+            "record motion that it would show in"
+        )
+    ends = np.cumsum([0] + [candidate.columns.shape[-1] for candidate in tried])
+    sensitivities = np.concatenate([candidate.columns for candidate in tried], axis=-1)
+    validation = cross_validation_of(problem, sensitivities)
+    picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
+    before = validation.losses().sum()
+    gains = [np.log(before / validation.losses(pick).sum()) for pick in picks]
+    selection = CRITERIA.selection
+    scores = [selection.priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
+    models = []
+    for best in np.argsort(scores)[::-1][:number]:
+        effect = copy.deepcopy(tried[best].effect)
+        amplitudes = torch.from_numpy(validation.amplitudes(picks[best])).float()
+        begin = 0
+        with torch.no_grad():
+            for amplitude in effect.amplitudes().values():
+                end = begin + amplitude.numel()
+                amplitude.copy_(amplitudes[begin:end].view_as(amplitude))
+                begin = end
+        models.append(with_effect(copy.deepcopy(problem.model), name, effect))
+    return models
+
+
+@dataclass(frozen=True, eq=False)
+class Refined(Candidate):
+    """An effect whose nonlinear parameters were fitted; one column, at its fitted amplitudes."""
+
+    @torch.no_grad()
+    def with_amplitudes(self, amplitudes: np.ndarray) -> Effect:
+        """The effect at a multiple (1,) of its fitted amplitudes."""
+        effect = copy.deepcopy(self.effect)
+        for parameter in effect.amplitudes().values():
+            parameter.mul_(float(amplitudes[0]))
+        return effect
+
+
+def refined(problem: Problem, effects: Iterable[tuple[str, Effect]]) -> list[Candidate]:
+    """Named effects with nonlinear parameters that are fitted instead of taken from a grid.
+
+    Candidates come from a coarse grid and are compared to first order in their amplitudes. Between
+    effects that then explain about as much, the grid decides: a lag whose time constant lies
+    between two of the grid loses to a viscosity whose values fit well. So each of the competing
+    effects is fitted through the whole chain, from where it stands, and the change that it then
+    makes in the prediction is one more candidate. Effects that change nothing or that
+    `with_fitted` does not fit are left out.
+    """
+    with torch.no_grad():
+        before = repeated_scan(problem.model, problem, [])().double().numpy()
+    found = []
+    for name, effect in effects:
+        model = with_fitted(problem, name, effect)
+        if model is None:
+            continue
+        with torch.no_grad():
+            after = repeated_scan(model, problem, [name])().double().numpy()
+        column = (after - before)[..., None]
+        if np.isfinite(column).all() and np.abs(column).max() > 1e-6:
+            fitted = model.effects[name].requires_grad_(False)
+            found.append(Refined(name, fitted, column, fitted=True))
+    return found
+
+
+def with_fitted(problem: Problem, name: str, effect: Effect) -> ArmModel | None:
+    """A problem's model with one effect more, fitted from where it stands to the problem.
+
+    None for an effect that the model has already, for one with more than MOST_VALUES values, and
+    where the fit ends at implausible values and cannot be held: half a lag twice as long is nearly
+    the same lag, so amplitudes beyond their range are held at its end while the nonlinear
+    parameters go on.
+    """
+    if name in problem.model.effects or _values(effect) > MOST_VALUES:
+        return None
+    model = with_effect(copy.deepcopy(problem.model), name, copy.deepcopy(effect))
+    fit_all(model, problem, [name], REFINING_ITERATIONS)
+    effect = model.effects[name]
+    if not effect.plausible() and effect.nonlinear_parameters() and shrink(effect):
+        fit_all(model, problem, [name], REFINING_ITERATIONS, held=name)
+    return model if effect.plausible() else None
+
+
+def _values(effect: Effect) -> int:
+    """How many numbers a fit of the effect chooses."""
+    free = [*effect.amplitudes().values(), *effect.nonlinear_parameters().values()]
+    return sum(p.numel() for p in free)

@@ -1,0 +1,131 @@
+"""Re-tune the network's last layer with the effects in place, as far as held-out motion rewards it.
+
+A network that was fitted without an effect has taken some of it for its own shape. The last layer
+is linear, so its best change D is a ridge regression in the activations h of the layer before,
+
+    min_D  sum_rows |r - h D|^2 + ridge rows var_range (h D),
+
+whose second term holds the network's shape over its whole range of actuation, also where the
+recordings do not go; a shift of everything is free. Residuals behind body and sensor effects are
+taken for those of the network: what these effects turn or bend is small.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from surgisoft.diagnosis.estimation.nuisance import held_out_parts
+from surgisoft.diagnosis.residuals import Problem
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import HawNN
+
+RIDGES = 10.0 ** np.arange(-4.0, 2.1, 0.5)
+"""Ridges that are tried."""
+RANGE_ROWS = 4000
+"""Random actuations over the range where the network is held."""
+LEAST_GAIN = 0.05
+"""Least fall of the held-out squared error that is worth a change, as a share of it."""
+CHANCE = 0.025
+"""Chance of so large a gain if there were none, one-sided."""
+
+
+@dataclass(frozen=True, eq=False)
+class Retuned:
+    """A network's last layer tried anew."""
+
+    model: ArmModel
+    """The model with the new layer, or the old one where that was not rewarded."""
+    kept: bool
+    """Whether held-out motion rewards the new layer."""
+    gain: float
+    """Fall of the held-out squared error, as a share of it."""
+
+
+@torch.no_grad()
+def retune(model: ArmModel, problem: Problem) -> Retuned:
+    """Re-tune the last layer of a model's network on a problem's rows; the given one stays."""
+    network = model.network
+    if not isinstance(network, HawNN):
+        return Retuned(model, False, 0.0)
+    problem = problem.with_model(model)
+    trace = model.trace(problem.history)
+    hidden = _hidden(
+        network,
+        problem.rows(trace.behind["material"]),
+        problem.rows(trace.direction),
+    )
+    count = len(hidden)
+    anywhere = _hidden(network, *_over_range(model))
+    held = np.cov(anywhere.T, bias=True)
+    held += 1e-6 * np.trace(held) / len(held) * np.eye(len(held))
+    residual = problem.residual.reshape(count, -1)
+    part = held_out_parts(problem)
+    found = [_held_out(hidden, residual, part, ridge * held) for ridge in RIDGES]
+    best = int(np.argmin([np.square(left).sum() for left in found]))
+    gain = _gain_by_block(residual, found[best], problem.block)
+    total = float(np.nansum(np.square(residual)))
+    share = float(gain.sum()) / max(total, 1e-30)
+    chance = stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue
+    if not (share >= LEAST_GAIN and chance < CHANCE):
+        return Retuned(model, False, share)
+    change = torch.from_numpy(_ridge(hidden, residual, RIDGES[best] * held)).float()
+    last = network.layers[-1]
+    network = copy.deepcopy(network)
+    network.layers[-1].weight.copy_(last.weight + change[:-1].T / network.scale[:, None])
+    network.layers[-1].bias.copy_(last.bias + change[-1] / network.scale)
+    fresh = model.replace(network=network).eval().requires_grad_(False)
+    better = np.nansum(np.square(problem.with_model(fresh).residual)) < total
+    return Retuned(fresh if better else model, bool(better), share)
+
+
+def _hidden(network: HawNN, actuation: Tensor, direction: Tensor) -> np.ndarray:
+    """(S, H + 1) activations before the last layer, and 1."""
+    x = (actuation - network.centre) / network.half_range
+    if network.directions:
+        x = torch.cat([x, direction * network.use], dim=-1)
+    hidden = network.layers[:-1](x).double().numpy()
+    return np.concatenate([hidden, np.ones((len(hidden), 1))], axis=1)
+
+
+def _over_range(model: ArmModel) -> tuple[Tensor, Tensor]:
+    """Random actuations over the arm's range and random directions, (K, m) each."""
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(model.spec.low), torch.tensor(model.spec.high)
+    actuation = low + (high - low) * torch.rand(RANGE_ROWS, len(low), generator=generator)
+    direction = torch.randint(0, 2, actuation.shape, generator=generator) * 2.0 - 1.0
+    return actuation, direction
+
+
+def _ridge(hidden: np.ndarray, residual: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """(H + 1, 3n) change of the layer; a row with a missing key point does not count for it."""
+    answer = np.zeros((hidden.shape[1], residual.shape[1]))
+    known: dict[bytes, list[int]] = {}
+    for k in range(residual.shape[1]):
+        known.setdefault(np.isfinite(residual[:, k]).tobytes(), []).append(k)
+    for columns in known.values():
+        seen = np.isfinite(residual[:, columns[0]])
+        inside = hidden[seen]
+        normal = inside.T @ inside + held * seen.sum()
+        answer[:, columns] = np.linalg.solve(normal, inside.T @ residual[seen][:, columns])
+    return answer
+
+
+def _held_out(
+    hidden: np.ndarray, residual: np.ndarray, part: np.ndarray, held: np.ndarray
+) -> np.ndarray:
+    """(S, 3n) what is left of each row by the layer that was fitted without its part, mm."""
+    left = np.zeros_like(residual)
+    for number in np.unique(part):
+        rows = part == number
+        left[rows] = residual[rows] - hidden[rows] @ _ridge(hidden[~rows], residual[~rows], held)
+    return np.nan_to_num(left)
+
+
+def _gain_by_block(before: np.ndarray, after: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """(B,) fall of the sum of squares of each block of time, mm^2."""
+    gain = (np.square(np.nan_to_num(before)) - np.square(after)).sum(1)
+    return np.bincount(block, weights=gain)

@@ -1,1 +1,0 @@
-"""All parameters of an amended model, fitted through the whole chain."""

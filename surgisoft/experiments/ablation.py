@@ -1,0 +1,115 @@
+"""What the task `circle_ablation` offers for experiments."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from surgisoft.experiments.task import Condition, ExperimentTask, Row
+from surgisoft.scene.folder import Scene
+from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+
+
+class AblationSupervision:
+    """`Supervision` of a circle ablation, in simulation or on rigs."""
+
+    def __init__(self, task: CircleAblation):
+        self.task, self.clearance_limit_mm = task, task.spec.limits.clearance_mm
+
+    def in_sight(self, state: TaskState) -> Tensor:
+        """(B,) bool: the endoscope sees as much of the ring as the scene requires."""
+        return state.world.scene.view.fraction >= self.task.spec.limits.view_fraction
+
+    def clearance_mm(self, state: TaskState) -> Tensor:
+        """(B,) mm: least clearance to bodies and between arms."""
+        return state.world.scene.clearance.least_mm
+
+    def collides(self, state: TaskState) -> Tensor:
+        """(B,) bool: an arm touches a body, the other arm or itself."""
+        return state.world.scene.clearance.collides
+
+    def fires(self, state: TaskState) -> Tensor:
+        """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
+        return self.task.fires(state)
+
+    def fired(self, state: TaskState) -> Tensor:
+        """(B,) bool: the beam was on in the step that led here."""
+        return state.goal.fired
+
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor], fired: Tensor) -> TaskState:
+        """Advance one step; the beam burns where `fired` (B,) bool is set."""
+        return self.task.advance(state, actions, fired)
+
+    def action_through(self, agent: str, state: TaskState, target_mm: Tensor) -> Tensor:
+        """(B, m) kPa: inverse kinematics of the arm's axis through targets (B, 3) mm."""
+        return self.task.pointing[agent].action(state.world.arms[agent], target_mm)
+
+
+def _centred(task: CircleAblation, state: TaskState, within: float) -> Tensor:
+    view = state.world.scene.view
+    return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
+
+
+def _aimed(task: CircleAblation, state: TaskState, within: float) -> Tensor:
+    return task.beam_error_mm(state) <= within
+
+
+def _cut(task: CircleAblation, state: TaskState, within: float) -> Tensor:
+    return task.scene.ablation.report(state.world.scene.dose).completion >= within
+
+
+def _retracted(task: CircleAblation, state: TaskState, within: float) -> Tensor:
+    first = task.world.arms["laser"].first
+    return (state.world.arms["laser"].pressure - first).abs().amax(1) <= within
+
+
+def _never(task: CircleAblation, state: TaskState, within: float) -> Tensor:
+    return torch.zeros_like(state.world.failed)
+
+
+def _built(config: CircleAblationConfig, scene: Scene) -> CircleAblation:
+    """The task in an open scene; its configuration keeps the scene's folder."""
+    task = CircleAblation(dataclasses.replace(config, scene=scene))
+    task.config = config
+    return task
+
+
+def _badness(row: Row) -> tuple:
+    """Success first, then the share that was cut, then the beam's error."""
+    error = row.get("beam_error_mean_mm")
+    return (1.0 - row["success"], 1.0 - row["completion"], error or 0.0)
+
+
+ABLATION = ExperimentTask(
+    name="circle_ablation",
+    config=CircleAblationConfig,
+    conditions={
+        "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
+        "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
+        "cut": Condition("this share of the ring is cut (0..1)", 1.0, _cut),
+        "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),
+        "never": Condition("only the time ends the phase", 0.0, _never),
+    },
+    build=_built,
+    supervise=AblationSupervision,
+    numbers={
+        "success": "success",
+        "completion": "share cut",
+        "beam_error_mean_mm": "beam error, mean [mm]",
+        "beam_error_p95_mm": "beam error, 95 % [mm]",
+        "healthy_mm2": "healthy tissue [mm2]",
+        "in_view": "time in sight",
+        "clearance_mm": "least clearance [mm]",
+        "time_s": "time [s]",
+        "beam_s": "beam on [s]",
+        "beam_unsafe_longest_s": "beam on while unsafe, longest [s]",
+    },
+    per_episode=("completion", "beam_error_mean_mm", "clearance_mm", "time_s"),
+    swept=("success", "completion", "beam_error_mean_mm", "in_view"),
+    badness=_badness,
+)
+"""The ring cut of two arms, the only task that experiments are made with so far."""

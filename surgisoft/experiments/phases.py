@@ -1,0 +1,216 @@
+"""Phases, interlock, limits and faults of an experiment, laid over a task that offers them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+from surgisoft.experiments.spec import EXPERIMENT_TASK, Experiment
+from surgisoft.experiments.task import Supervision
+from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.parts import Event
+from surgisoft.tasks.world.random_streams import Stream
+
+RUNNING, CLOSE, LOST, LATE = range(4)
+REASONS = ("", "too close", "lesion out of sight", "phase took too long")
+"""Reasons of an abort, by number."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseState:
+    """How far a batch of episodes is."""
+
+    goal: Any
+    """The goal of the task itself."""
+    phase: Tensor
+    """(B,) int64: number of the phase; one more than the last: all are done."""
+    since: Tensor
+    """(B,) int64: steps in this phase."""
+    held: Tensor
+    """(B,) int64: steps in a row that its condition has held."""
+    lost: Tensor
+    """(B,) int64: steps in a row without the lesion in sight, in phases with the beam."""
+    reason: Tensor
+    """(B,) int64: why it was aborted, see `REASONS`."""
+    where: Tensor
+    """(B,) int64: the phase in which it was aborted."""
+
+
+class PhasedTask:
+    """A `Task` in the phases of an experiment, with its interlock, limits and faults.
+
+    Observations, rewards and the expert are those of the task beneath, so that its policies fit.
+    """
+
+    def __init__(self, supervision: Supervision, spec: Experiment):
+        self.supervision, self.experiment = supervision, spec
+        base = self.base = supervision.task
+        self.name, self.agents, self.world, self.config = (
+            base.name,
+            base.agents,
+            base.world,
+            base.config,
+        )
+        dt_s, limits, device = base.world.config.dt_s, spec.limits, base.world.device
+        self.dt_s, self.steps = dt_s, round(limits.time_s / dt_s)
+        self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
+        self.lost_steps = round(limits.view_lost_s / dt_s)
+        self.phases = spec.phases
+        names = [phase.name for phase in spec.phases]
+        self.retreat = names.index(limits.retreat) if limits.retreat else len(names)
+
+        def row(values, dtype=torch.int64) -> Tensor:
+            return torch.tensor([*values, 0], dtype=dtype, device=device)
+
+        self.timeouts = row(max(1, round(p.timeout_s / dt_s)) for p in spec.phases)
+        self.holds = row(round(p.hold_s / dt_s) for p in spec.phases)
+        self.beam = row((p.beam for p in spec.phases), torch.bool)
+        self.strict = row((p.on_timeout == "abort" for p in spec.phases), torch.bool)
+        for fault in spec.faults:
+            chambers = self.world.arms[fault.arm].chambers
+            if fault.chamber > chambers:
+                raise InputError(
+                    f"fault: chamber {fault.chamber} of arm '{fault.arm}', expected 1 to {chambers}"
+                )
+
+    def plain(self, state: TaskState) -> TaskState:
+        """The state as the task beneath has it."""
+        return replace(state, goal=state.goal.goal)
+
+    def goal(self, stream: Stream) -> tuple[Stream, PhaseState]:
+        """See `Task`."""
+        stream, goal = self.base.goal(stream)
+        zero = torch.zeros_like(stream.count)
+        return stream, PhaseState(goal, zero, zero, zero, zero, zero, zero)
+
+    def in_sight(self, state: TaskState) -> Tensor:
+        """(B,) bool: the target is seen well enough to work on it."""
+        return self.supervision.in_sight(self.plain(state))
+
+    def safe(self, state: TaskState) -> Tensor:
+        """(B,) bool: the target is in sight and everything is clear; else the beam stays off."""
+        supervision, plain = self.supervision, self.plain(state)
+        clear = supervision.clearance_mm(plain) >= self.clear_mm
+        clear = clear & ~supervision.collides(plain)
+        return supervision.in_sight(plain) & clear & ~state.world.failed
+
+    def released(self, state: TaskState) -> Tensor:
+        """(B,) bool: phase and interlock permit the beam; it is never on without."""
+        goal = state.goal
+        return self.beam[goal.phase] & (goal.reason == RUNNING) & self.safe(state)
+
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
+        """See `Task`."""
+        plain = self.plain(state)
+        fired = self.supervision.fires(plain) & self.released(state)
+        after = self.supervision.advance(plain, self._with_faults(state, actions), fired)
+        return replace(after, goal=self.progressed(state.goal, after))
+
+    def _with_faults(self, state: TaskState, actions: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The actions after the faults: a chamber whose valve stays open goes to 0 kPa."""
+        done = dict(actions)
+        for fault in self.experiment.faults:
+            place = fault.chamber - 1
+            broken = state.world.steps * self.dt_s >= fault.at_s - 1e-6
+            venting = -state.world.arms[fault.arm].command[:, place]
+            action = done[fault.arm].clone()
+            action[:, place] = action[:, place].where(~broken, venting)
+            done[fault.arm] = action
+        return done
+
+    def progressed(self, old: PhaseState, after: TaskState) -> PhaseState:
+        """Phases and limits after a step that led to `after`, a state of the task beneath."""
+        supervision = self.supervision
+        holds = torch.zeros_like(after.world.failed)
+        for number, phase in enumerate(self.phases):
+            here = old.phase == number
+            if here.any():
+                known = EXPERIMENT_TASK.conditions[phase.until]
+                within = known.within if phase.within < 0.0 else phase.within
+                holds = holds | (here & known.holds(self.base, after, within))
+        since, held = old.since + 1, (old.held + 1) * holds
+        lost = (old.lost + 1) * (self.beam[old.phase] & ~supervision.in_sight(after))
+        met = holds & (held >= self.holds[old.phase])
+        late = (since >= self.timeouts[old.phase]) & ~met
+        reason = torch.zeros_like(old.reason)
+        reason = reason.where(~(late & self.strict[old.phase]), LATE)
+        reason = reason.where(lost <= self.lost_steps, LOST)
+        least_mm = self.experiment.limits.abort_clearance_mm
+        reason = reason.where(supervision.clearance_mm(after) >= least_mm, CLOSE)
+        newly = (reason > RUNNING) & (old.reason == RUNNING)
+        phase = old.phase + (met | late).long()
+        phase = phase.where((old.reason == RUNNING) | (phase == old.phase), len(self.phases))
+        phase = phase.where(~newly, self.retreat)
+        moved = (phase != old.phase) | newly
+        return PhaseState(
+            goal=after.goal,
+            phase=phase.clamp(max=len(self.phases)),
+            since=since * ~moved,
+            held=held * ~moved,
+            lost=lost,
+            reason=reason.where(newly, old.reason),
+            where=old.phase.where(newly, old.where),
+        )
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The observations of the task beneath."""
+        return self.base.observe(self.plain(state))
+
+    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
+        """The rewards of the task beneath."""
+        return self.base.rewards(self.plain(state))
+
+    def ended(self, state: TaskState) -> Tensor:
+        """(B,) bool: all phases are done, or something is hit."""
+        done = state.goal.phase >= len(self.phases)
+        return done | self.supervision.collides(self.plain(state))
+
+    def measures(self, state: TaskState) -> dict[str, Tensor]:
+        """The measures of the task beneath; success also requires that nothing was aborted.
+
+        `beam` is 1 where it was on in the step before, `beam_unsafe` where that step ended unsafe.
+        """
+        goal, plain = state.goal, self.plain(state)
+        values = self.base.measures(plain)
+        fired = self.supervision.fired(plain)
+        return values | {
+            "success": values["success"] * (goal.reason == RUNNING),
+            "phase": goal.phase.float(),
+            "reason": goal.reason.float(),
+            "reason_phase": goal.where.float(),
+            "beam": fired.float(),
+            "beam_unsafe": (fired & ~self.safe(state)).float(),
+            "safe": self.safe(state).float(),
+        }
+
+    def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
+        """See `Task`."""
+        return self.base.trace(self.plain(state))
+
+    def script(self, state: TaskState) -> dict[str, Tensor]:
+        """The expert of the task beneath, whatever the phase."""
+        return self.base.script(self.plain(state))
+
+
+def with_phase_events(spec: Experiment, log: EpisodeLog) -> EpisodeLog:
+    """The log of a phased episode with phases, faults and the abort's reason among its events."""
+    phase, reason = (log.measures[name].astype(int) for name in ("phase", "reason"))
+    names = [f"phase {phase.name}" for phase in spec.phases] + ["all phases done"]
+    begins = [0, *(np.flatnonzero(np.diff(phase)) + 1)]
+    found = [Event(float(log.time_s[row]), "info", names[phase[row]]) for row in begins]
+    for row in np.flatnonzero(reason > RUNNING)[:1]:
+        text = f"aborted: {REASONS[reason[row]]}"
+        found.append(Event(float(log.time_s[row]), "error", text))
+    for fault in spec.faults:
+        if fault.at_s <= log.time_s[-1]:
+            text = f"fault: chamber {fault.chamber} of {fault.arm} goes to 0 kPa"
+            found.append(Event(fault.at_s, "warning", text))
+    events = sorted((*log.events, *found), key=lambda event: event.time_s)
+    return replace(log, events=tuple(events))

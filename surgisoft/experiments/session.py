@@ -1,0 +1,139 @@
+"""An experiment from its file to its report: find, extend, roll out, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from surgisoft.agents.run_folder import RunFolder
+from surgisoft.config import read_toml
+from surgisoft.errors import InputError
+from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
+from surgisoft.experiments.pictures import film, write_pictures
+from surgisoft.experiments.plan import settings
+from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
+from surgisoft.experiments.run import open_results, run_experiment
+from surgisoft.experiments.spec import SCRIPTED, TASK, Experiment, load_experiment
+from surgisoft.files import write_atomically
+from surgisoft.replay.episode_view import write_replay
+from surgisoft.report import write_page
+from surgisoft.scene.packaged import PHANTOM, packaged_scene
+from surgisoft.scene.spec import FILE as SCENE_FILE
+
+PACKAGED = PHANTOM / "experiments"
+"""The experiments that come with the package."""
+REPLAY_PICTURES_HZ = 1.0
+"""Endoscope pictures in a second of the replays beside a report, 1/s."""
+
+Report = Callable[[float, float, str], None]
+"""Called with (done, to do, note)."""
+
+
+def find_experiment(name: str | Path) -> Path:
+    """The file of an experiment, by its path or by the name of a packaged one (`liver`)."""
+    path = Path(name)
+    named = PACKAGED / f"{path.name}.toml"
+    return named if len(path.parts) == 1 and not path.exists() and named.is_file() else path
+
+
+def experiments_of(folder: str | Path | None = None) -> list[Path]:
+    """The experiment files of a folder, or of a scene's `experiments`; default: the packaged."""
+    folder = PACKAGED if folder is None else packaged_scene(folder)
+    if (folder / SCENE_FILE).is_file():
+        folder = folder / "experiments"
+    files = sorted(folder.glob("*.toml"))
+    if not files:
+        raise InputError(f"{folder}: no experiment (*.toml) there")
+    return files
+
+
+def open_experiment(name: str | Path) -> Experiment:
+    """Read an experiment, by its path or a packaged name, and check all its settings."""
+    file = find_experiment(name)
+    spec = load_experiment(file)
+    settings(spec, read_toml(file)[1])
+    return spec
+
+
+def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
+    """The experiment with one more case for each scripted one: the policy of a training run."""
+    trained = RunFolder(folder).config["task"]
+    if trained != TASK:
+        raise InputError(f"{folder}: was trained on {trained}; expected a run of {TASK}")
+    path = Path(folder).resolve()
+    twins = tuple(
+        replace(case, name=f"{case.name}-{path.name}", policy=str(path))
+        for case in spec.cases
+        if case.policy == SCRIPTED
+    )
+    names = [case.name for case in (*spec.cases, *twins)]
+    if len(set(names)) < len(names):
+        raise InputError(f"{folder}: a case of that name is there already; rename the folder")
+    return replace(spec, cases=(*spec.cases, *twins))
+
+
+def start_experiment(
+    name: str | Path,
+    output: str | Path | None = None,
+    policies: Iterable[str | Path] = (),
+    repeats: int | None = None,
+    *,
+    resume: bool = False,
+    force: bool = False,
+) -> tuple[Experiment, Path]:
+    """The experiment and its folder of results, made or found ready to be resumed.
+
+    output: default `results/NAME`. policies: folders of training runs, each in a case of its own.
+    repeats: episodes of each setting. resume: go on with results that are there; force: begin anew.
+    """
+    if resume and force:
+        raise InputError("--resume goes on, --force begins anew: give one of them")
+    spec = open_experiment(name)
+    for folder in policies:
+        spec = with_policy(spec, folder)
+    spec = spec if repeats is None else replace(spec, repeats=repeats)
+    place = Path(output) if output else Path("results") / spec.name
+    open_results(spec, place, resume, force)
+    return spec, place
+
+
+def finish_experiment(
+    spec: Experiment,
+    folder: Path,
+    processes: int = 1,
+    replays: bool = True,
+    about: str = "",
+    progress: Report | None = None,
+) -> tuple[Results, list[Path]]:
+    """Roll out what is not there yet and write tables, pictures, replays and the report.
+
+    Returns the results and the files that were written. about: the command, for the report.
+    """
+    rows = run_experiment(spec, folder, processes, progress)
+    results = sum_up(spec, folder, rows)
+    files = write_tables(results)
+    films = {
+        (label, episode): film(results.log(label, episode))
+        for label, episode in shown_episodes(results)
+    }
+    files += write_pictures(results, films)
+    files.append(write_page(experiment_page(results, films, about), folder / "report.html"))
+    drop_logs(results)
+    if replays:
+        files += _write_replays(results, progress)
+    summary = folder / "summary.md"
+    write_atomically(summary, markdown(results))
+    return results, [*files, summary]
+
+
+def _write_replays(results: Results, progress: Report | None) -> list[Path]:
+    """Replays of the first and of the worst episode."""
+    files = []
+    worst = ("worst", *results.worst)
+    for name, label, episode in (("first", results.settings[0].label, 0), worst):
+        path = results.folder / "replays" / f"{name}.rrd"
+        path.parent.mkdir(exist_ok=True)
+        write_replay(results.log(label, episode), path, REPLAY_PICTURES_HZ, progress)
+        files.append(path)
+    return files

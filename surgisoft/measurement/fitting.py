@@ -1,0 +1,58 @@
+"""Fit an arm model to recordings: system identification with a grey-box model."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from surgisoft.measurement.histories import arm_spec, check_fits, history_of
+from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
+from surgisoft.surrogate.effects import named_effect
+from surgisoft.surrogate.fit import FitConfig, FitResult
+from surgisoft.surrogate.fit import fit as fit_histories
+from surgisoft.workers import torch_threads
+
+Recordings = Iterable[Recording | str | Path] | Recording | str | Path
+"""Recordings, their files, or folders of them."""
+
+
+def fit(
+    recordings: Recordings,
+    valid: Recordings | None = None,
+    config: FitConfig | None = None,
+    *,
+    actuation: str = "measured",
+    threads: int = 1,
+    progress: Callable[[str, int, int, float], None] | None = None,
+    **fields: Any,
+) -> FitResult:
+    """Fit an arm model (HAW-NN, optionally with effects) to recordings of one arm.
+
+    Returns the model with the account of its fit; `save_model(result.model, folder,
+    result.report())` writes both.
+
+    valid: held-out recordings that choose the model; without them whole runs, or blocks of time,
+    of the training recordings are held out.
+    actuation: `measured` or `commanded`, what the model takes.
+    threads: threads of torch; their number changes the last digits.
+    progress: called with (stage, epoch, epochs, held-out loss in mm^2).
+    fields: fields of `FitConfig`, such as `effects=["hysteresis"]`, `epochs=100`. An effect may be
+    the path of a file with a user-defined one, which is run.
+    """
+    config = replace(config or FitConfig(), **fields)
+    effects = [config.effects] if isinstance(config.effects, str) else config.effects
+    config = replace(config, effects=tuple(map(named_effect, effects)), hidden=tuple(config.hidden))
+    train = load_recordings(recordings)
+    held = None if valid is None else load_recordings(valid)
+    check_same_arm(train)
+    spec = arm_spec(train, actuation)
+    if held:
+        check_fits(spec, held)
+    with torch_threads(threads):
+        return fit_histories(
+            history_of(train, actuation),
+            history_of(held, actuation) if held else None,
+            spec,
+            config,
+            progress,
+        )

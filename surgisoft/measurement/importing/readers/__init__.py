@@ -1,0 +1,89 @@
+"""Readers of raw formats by the name that a map's `format` gives.
+
+A new reader is one file here with a `READER`, and its line in READERS. A reader outside this
+package is an entry point of the group `surgisoft.readers`: its name is the format, its object a
+Reader.
+"""
+
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from surgisoft.errors import InputError
+from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
+from surgisoft.measurement.importing.readers import motive, parquet, text
+
+AUTO = "auto"
+"""The format that stands for: by the name's ending, else text."""
+GROUP = "surgisoft.readers"
+"""Entry points of readers that other packages bring."""
+
+READERS: dict[str, Reader] = {
+    "text": text.READER,
+    "parquet": parquet.READER,
+    "motive": motive.READER,
+}
+"""The readers of this package."""
+
+NOT_READ = {
+    "c3d": "a C3D file (motion capture)",
+    "bag": "a ROS bag",
+    "db3": "a ROS 2 bag",
+    "mcap": "an MCAP file (ROS 2)",
+    "mat": "a MATLAB file",
+    "h5": "an HDF5 file",
+    "hdf5": "an HDF5 file",
+    "xlsx": "an Excel workbook",
+    "xls": "an Excel workbook",
+}
+"""Known formats that no reader of this package reads, by their files' ending."""
+
+ADVICE = "export it as CSV, or add a reader (docs/recordings.md)"
+"""What to do with a format that no reader reads."""
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def formats() -> list[str]:
+    """Every name that a map's `format` may give."""
+    return [AUTO, *READERS, *(name for name in _plugins() if name not in READERS)]
+
+
+def reader(name: str) -> Reader:
+    """The reader of this name, this package's or one from another package."""
+    if name in READERS:
+        return READERS[name]
+    entry = _plugins()[name]
+    try:
+        found = entry.load()
+    except Exception as error:
+        raise InputError(
+            f"reader '{name}' of {entry.value}: cannot be loaded ({type(error).__name__}: {error})"
+        ) from error
+    if not isinstance(found, Reader):
+        raise InputError(f"reader '{name}' of {entry.value}: is no Reader; expected an instance")
+    return found
+
+
+def chosen(path: Path, role: FileRole) -> Reader:
+    """The reader of a file: the role's, or for "auto" the one that claims the name's ending."""
+    if role.format != AUTO:
+        return reader(role.format)
+    for name in formats()[1:]:
+        if path.suffix.lower() in (known := reader(name)).suffixes:
+            return known
+    kind = NOT_READ.get(path.suffix.lower().removeprefix("."))
+    if kind and _is_binary(path):
+        raise InputError(f"{path}: {kind}, which no reader reads; {ADVICE}")
+    return text.READER
+
+
+def _is_binary(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b"\0" in file.read(4096)
+
+
+def open_raw(path: Path, role: FileRole) -> RawTable:
+    """The raw table of a file."""
+    return chosen(path, role).read(path, role)

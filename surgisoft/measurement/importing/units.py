@@ -1,0 +1,45 @@
+"""Units that raw files come in, and conversion between units of one quantity."""
+
+from surgisoft.config import Where
+from surgisoft.measurement.recordings.columns import MM_PER
+
+SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+"""Seconds in each unit of time."""
+
+_KPA_PER = {
+    "Pa": 1e-3,
+    "hPa": 0.1,
+    "kPa": 1.0,
+    "MPa": 1e3,
+    "mbar": 0.1,
+    "bar": 100.0,
+    "psi": 6.894757293168361,  # 0.45359237 kg * 9.80665 m/s2 / (0.0254 m)^2, NIST SP 811 (2008) B.8
+    "atm": 101.325,  # NIST SP 811 (2008) B.8
+    "mmHg": 0.133322387415,  # 13595.1 kg/m3 * 9.80665 m/s2 * 1 mm, NIST SP 811 (2008) B.8
+}
+_DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
+_VOLTS_PER = {"V": 1.0, "mV": 1e-3}
+_NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
+_QUANTITIES = (_KPA_PER, _DEGREES_PER, MM_PER | {"in": 25.4}, _VOLTS_PER, _NEWTONS_PER)
+
+
+def factor(unit: str, to: str) -> float | None:
+    """How many of `to` one `unit` is; None where they do not measure the same quantity."""
+    if unit == to:
+        return 1.0
+    for quantity in _QUANTITIES:
+        if unit in quantity and to in quantity:
+            return quantity[unit] / quantity[to]
+    return None
+
+
+def check_conversion(unit: str, to: str, where: Where) -> None:
+    """Raise where a unit cannot be converted."""
+    if factor(unit, to) is None:
+        known = next((q for q in _QUANTITIES if unit in q), None)
+        expected = (
+            f"one of {', '.join(known)}, to convert from '{unit}'"
+            if known
+            else f"'{unit}' itself, a unit that nothing converts to; use scale and offset"
+        )
+        raise where.error(f"got '{to}'", expected)

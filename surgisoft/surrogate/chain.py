@@ -1,0 +1,442 @@
+"""The chain of the arm model: line, chambers, direction, material, network, body, sensor.
+
+`Chain.walk` is the one place where a signal passes through these links. What happens in a link
+depends on the mode of the walk: one time step (`Stepping`), a whole recording (`Scanning`), an arm
+without history (`Resting`), an arm that has stood for a while (`Standing`), or memories that are
+given (`Holding`). First-order sensitivities use the signals that a scan has recorded.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.effects import Context, Effect, Memoryless, Stage
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.networks import RecurrentArm
+from surgisoft.surrogate.scan import direction_scan, direction_step
+
+STOOD_S = 10.0
+"""Time for which an arm has stood where a run begins away from rest, s."""
+NETWORK = "network"
+"""Key of a recurrent network's state in `ArmState.memory`."""
+
+
+class Link(NamedTuple):
+    """One place of the chain."""
+
+    stage: str
+    """Stage of an effect, `chambers` or `network`."""
+    name: str
+    """Name of the effect in its model; of the other two the stage."""
+    part: Effect | nn.Module | None = None
+    """The effect, or the network, that acts there."""
+
+
+CHAMBERS_LINK = Link("chambers", "chambers")
+BEHIND: dict[str, tuple[Stage, ...]] = {
+    "line": ("line",),
+    "chambers": ("line", "material"),
+    "material": ("material",),
+    NETWORK: ("body", "sensor"),
+    "body": ("body", "sensor"),
+    "sensor": ("sensor",),
+}
+"""Stages whose last signal so far is the one behind a link of each kind."""
+
+
+@dataclass(eq=False)
+class Signal:
+    """What a walk carries from link to link. Leading shape (B,) of a step, (R, T) of a scan."""
+
+    value: Tensor
+    """(..., m) actuation in front of the network, (..., n, 3) key points in mm behind it."""
+    pressure: Tensor | None = None
+    """(..., m) chamber pressure, once the chambers are passed, in the arm's unit."""
+    direction: Tensor | None = None
+    """(..., m) direction of change, once the chambers are passed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """What was seen along a walk; leading shape (B,) of one instant, (R, T) of a scan."""
+
+    pressure: Tensor
+    """(..., m) chamber pressure, behind the line effects, in the arm's unit."""
+    direction: Tensor
+    """(..., m) direction of change."""
+    memory: dict[str, Tensor]
+    """(..., ...) memory of each effect that the walk has passed."""
+    behind: dict[Stage, Tensor]
+    """Signal behind the effects of each stage that the walk has passed: (..., m) actuation in the
+    arm's unit behind `line` and `material`, (..., n, 3) key points in mm behind `body` and
+    `sensor`. An effect that is added to a stage sees it."""
+
+
+class Resting:
+    """Mode: an arm without history at a constant actuation."""
+
+    def __init__(self):
+        self.memory: dict[str, Tensor] = {}
+
+    def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
+        """(B, m) no direction yet."""
+        return torch.zeros_like(chamber)
+
+    def effect(self, link: Link, signal: Signal) -> Tensor:
+        """Signal behind an effect whose memory is that of rest."""
+        self.memory[link.name] = link.part.rest(signal.value)
+        return link.part.apply(signal.value, self.memory[link.name])
+
+    def network(self, link: Link, signal: Signal) -> Tensor:
+        """(B, n, 3) key points in mm."""
+        network = link.part
+        if not isinstance(network, RecurrentArm):
+            return network(signal.value, signal.direction)
+        self.memory[NETWORK] = network.rest(signal.value)
+        return network(signal.value, signal.direction, self.memory[NETWORK])
+
+
+class Stepping:
+    """Mode: one time step of a batch of arms."""
+
+    def __init__(self, state: ArmState, context: Context):
+        """state: before the step; context: duration of the step and temperature."""
+        self.anchor, self.last = state.anchor, state.direction
+        self.memory, self.context = dict(state.memory), context
+
+    def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
+        """(B, m) direction of change after the step."""
+        self.anchor, direction = direction_step(self.anchor, self.last, chamber, chain.band)
+        self.context = replace(self.context, pressure=chamber)
+        return direction
+
+    def effect(self, link: Link, signal: Signal) -> Tensor:
+        """Signal behind an effect whose memory has followed for the step."""
+        name = link.name
+        self.memory[name], value = link.part.step(self.memory[name], signal.value, self.context)
+        return value
+
+    def network(self, link: Link, signal: Signal) -> Tensor:
+        """(B, n, 3) key points in mm."""
+        network = link.part
+        if not isinstance(network, RecurrentArm):
+            return network(signal.value, signal.direction)
+        hidden = network.advance(self.memory[NETWORK], signal.value, signal.direction)
+        self.memory[NETWORK] = hidden
+        return network(signal.value, signal.direction, hidden)
+
+
+class Standing(Stepping):
+    """Mode: arms that came straight from rest and have stood for STOOD_S.
+
+    Lags and oscillations in front of and behind the material have died away; the material and a
+    recurrent network have followed for that time.
+    """
+
+    def __init__(self, state: ArmState):
+        """state: arms at rest."""
+        super().__init__(state, Context(state.pressure.new_full((len(state.pressure),), STOOD_S)))
+
+    def effect(self, link: Link, signal: Signal) -> Tensor:
+        """Signal behind an effect that has settled, or whose material has followed."""
+        if link.stage == "material":
+            return super().effect(link, signal)
+        self.memory[link.name] = link.part.rest(signal.value)
+        return link.part.apply(signal.value, self.memory[link.name])
+
+    def network(self, link: Link, signal: Signal) -> Tensor:
+        """(B, n, 3) key points in mm; a recurrent network's own state stays that of rest."""
+        if not isinstance(link.part, RecurrentArm):
+            return link.part(signal.value, signal.direction)
+        hidden = link.part.advance(self.memory[NETWORK], signal.value, signal.direction)
+        return link.part(signal.value, signal.direction, hidden)
+
+
+class Scanning:
+    """Mode: every row of a history at once."""
+
+    def __init__(
+        self,
+        start: dict[str, Tensor],
+        context: Context,
+        rows: Callable[[Tensor], Tensor] | None = None,
+        direction: Tensor | None = None,
+    ):
+        """start: (R, ...) memory of each effect before the first row; context: (R, T) times and
+        temperatures; rows: picks the rows (S, ...) of a (R, T, ...) tensor that the network and
+        all effects behind it compute, which must then have no memory (None: every row);
+        direction: (R, T, m) of change where it is known, as in a window of a longer scan."""
+        self.start, self.context, self.rows, self.given = start, context, rows, direction
+        self.memory: dict[str, Tensor] = {}
+
+    def context_at(self, signal: Signal) -> Context:
+        """Times, temperatures and, behind the line, the chambers' pressure along a signal."""
+        if signal.pressure is None:
+            return self.context
+        return replace(self.context, pressure=signal.pressure)
+
+    @torch.no_grad()
+    def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
+        """(R, T, m) direction of change; every run starts from rest."""
+        if self.given is not None:
+            return self.given
+        return direction_scan(chamber, chain.band, chain.rest)[1]
+
+    def effect(self, link: Link, signal: Signal) -> Tensor:
+        """Signal behind an effect whose memory has followed every row."""
+        if self.rows is not None and link.stage in ("body", "sensor"):
+            return link.part.apply(signal.value, signal.value[..., :0, 0])
+        memory = link.part.scan(self.start[link.name], signal.value, self.context_at(signal))
+        self.memory[link.name] = memory
+        return link.part.apply(signal.value, memory)
+
+    def network(self, link: Link, signal: Signal) -> Tensor:
+        """(R, T, n, 3), or (S, n, 3), key points in mm."""
+        actuation, direction = signal.value, signal.direction
+        if self.rows is not None:
+            actuation, direction = self.rows(actuation), self.rows(direction)
+        network = link.part
+        if isinstance(network, RecurrentArm):
+            return network(actuation, direction, network.scan(actuation, direction))
+        return network(actuation, direction)
+
+
+class Holding:
+    """Mode: memories are given, as those of rows of an earlier scan."""
+
+    def __init__(self, memory: dict[str, Tensor]):
+        self.memory = memory
+
+    def effect(self, link: Link, signal: Signal) -> Tensor:
+        """Signal behind an effect with its given memory."""
+        return link.part.apply(signal.value, self.memory[link.name])
+
+    def network(self, link: Link, signal: Signal) -> Tensor:
+        """(..., n, 3) key points in mm of a static network."""
+        return link.part(signal.value, signal.direction)
+
+
+Mode = Resting | Stepping | Standing | Scanning | Holding
+
+
+class Chain:
+    """The links of one arm model and the ways to walk them. Holds references, owns nothing."""
+
+    def __init__(
+        self,
+        network: nn.Module,
+        effects: nn.ModuleDict,
+        rest: Tensor,
+        band: Tensor,
+        still: Tensor,
+        idle: Tensor,
+    ):
+        """effects: in the order of the stages. By chamber, (m,), in the arm's unit: rest, the
+        actuation at rest; band, half width of the direction's dead band; still, which chambers
+        never moved, and idle, where those stood."""
+        self.net, self.rest, self.band, self.still, self.idle = network, rest, band, still, idle
+        links = [Link(effect.stage, name, effect) for name, effect in effects.items()]
+        behind = next((i for i, e in enumerate(links) if e.stage in ("body", "sensor")), len(links))
+        line = next((i for i, e in enumerate(links) if e.stage != "line"), len(links))
+        self.inner = (*links[:line], CHAMBERS_LINK, *links[line:behind])
+        self.outer = tuple(links[behind:])
+        self.static = (*links[line:behind], Link(NETWORK, NETWORK, network))
+        self.links = (*self.inner, self.static[-1], *self.outer)
+
+    def chambers(self, pressure: Tensor) -> Tensor:
+        """Chamber pressure (..., m); a chamber that never moved in the data stays where it was."""
+        return torch.where(self.still, self.idle, pressure)
+
+    def walk(
+        self,
+        signal: Signal,
+        mode: Mode,
+        links: tuple[Link, ...] | None = None,
+        behind: dict[Stage, Tensor] | None = None,
+    ) -> Signal:
+        """Carry a signal through links of the chain (default: all); returns what comes out.
+
+        behind: is filled with the signal behind each stage that the walk has passed.
+        """
+        for link in self.links if links is None else links:
+            if link is CHAMBERS_LINK:
+                chamber = self.chambers(signal.value)
+                signal = Signal(chamber, chamber, mode.direction(self, chamber))
+            else:
+                through = mode.network if link.stage == NETWORK else mode.effect
+                signal = Signal(through(link, signal), signal.pressure, signal.direction)
+            if behind is not None:
+                behind.update(dict.fromkeys(BEHIND[link.stage], signal.value))
+        return signal
+
+    def at_rest(self, pressure: Tensor, taps: bool = False) -> tuple[ArmState, Taps | None]:
+        """(B) arms without history at `pressure` (B, m), and on request what each stage sees.
+
+        Without taps the network is left out where no effect behind it needs its key points.
+        """
+        mode, behind = Resting(), {}
+        links = self.links if taps or self.outer else self.inner
+        signal = self.walk(Signal(pressure), mode, links, behind if taps else None)
+        if NETWORK not in mode.memory and isinstance(self.net, RecurrentArm):
+            mode.memory[NETWORK] = self.net.rest(pressure)
+        state = ArmState(pressure, pressure, torch.zeros_like(pressure), mode.memory)
+        if not taps:
+            return state, None
+        return state, Taps(signal.pressure, signal.direction, mode.memory, behind)
+
+    def standing(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
+        """Arms before the first row of runs that begin at `pressure` (R, m), and their signals.
+
+        An arm that begins away from rest is taken to have come straight from rest and to have
+        stood for STOOD_S. The signals are those behind each stage, (R, m) for line and material,
+        (R, n, 3) in mm for body and sensor; behind the material that of rest, because an effect
+        that is added there starts from rest too (`first_memory`).
+        """
+        state, taps = self.at_rest(self.rest.expand(len(pressure), -1), taps=True)
+        seen = taps.behind
+        away = (pressure != self.rest).any(-1)
+        if not away.any():
+            return state, seen
+        mode, there = Standing(state), {}
+        signal = self.walk(Signal(pressure), mode, behind=there)
+        for stage in ("line", "body", "sensor"):
+            wide = away.view(-1, *[1] * (there[stage].ndim - 1))
+            seen[stage] = there[stage].where(wide, seen[stage])
+        stood = ArmState(pressure, mode.anchor, signal.direction, mode.memory)
+        return state.where(away, stood), seen
+
+    def first_memory(
+        self, effect: Effect, seen: dict[Stage, Tensor], at_first: Tensor, pressure: Tensor
+    ) -> Tensor:
+        """(R, ...) memory before the first row of an effect added behind the others of its stage.
+
+        seen: signals of `standing`; at_first (R, ...): what the effect sees in the first row;
+        pressure (R, m): actuation at which each run begins.
+        """
+        memory = effect.rest(seen[effect.stage])
+        away = (pressure != self.rest).any(-1)
+        if effect.stage != "material" or not away.any():
+            return memory
+        time = pressure.new_full((len(pressure),), STOOD_S)
+        context = Context(time, None, None, self.chambers(pressure))
+        stood = effect.advance(memory, at_first, context)
+        return stood.where(away.view(-1, *[1] * (memory.ndim - 1)), memory)
+
+    def step(self, state: ArmState, pressure: Tensor, context: Context) -> tuple[ArmState, Tensor]:
+        """State and key points (B, n, 3) in mm after `pressure` (B, m) was held for one step."""
+        mode = Stepping(state, context)
+        signal = self.walk(Signal(pressure), mode)
+        return ArmState(pressure, mode.anchor, signal.direction, mode.memory), signal.value
+
+    def scan(self, history: History, first: Tensor, links: tuple[Link, ...] | None = None) -> Taps:
+        """What every stage sees in each row of a history whose runs begin at `first`, (R, m).
+
+        links: those to walk; default all.
+        """
+        mode = Scanning(self.standing(first)[0].memory, context_of(history))
+        behind = {}
+        signal = self.walk(Signal(history.pressure), mode, links, behind)
+        return Taps(signal.pressure, signal.direction, mode.memory, behind)
+
+    def hold(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
+        """Key points (..., n, 3) in mm behind the network, of given memories.
+
+        pressure, direction: (..., m) chamber pressure and direction of change.
+        """
+        return self.walk(Signal(pressure, pressure, direction), Holding(memory), self.static).value
+
+    def around(self, name: str, taps: Taps) -> tuple[Tensor, Tensor]:
+        """(..., m) actuation in front of and behind a material effect along an earlier walk."""
+        place = next(i for i, link in enumerate(self.static) if link.name == name)
+        mode = Holding(taps.memory)
+        start = Signal(taps.pressure, taps.pressure, taps.direction)
+        before = self.walk(start, mode, self.static[:place])
+        return before.value, self.walk(before, mode, self.static[place : place + 1]).value
+
+    @torch.no_grad()
+    def network_slope(self, actuation: Tensor, direction: Tensor) -> Tensor:
+        """(S, n, 3, m) derivative of the key points by the effective actuation, mm a unit.
+
+        actuation, direction: (S, m) in front of a static network. By forward differentiation.
+        """
+        slopes = [
+            torch.func.jvp(
+                lambda at: self.net(at, direction), (actuation,), (unit.expand_as(actuation),)
+            )[1]
+            for unit in torch.eye(actuation.shape[-1], dtype=actuation.dtype)
+        ]
+        return torch.stack(slopes, dim=-1)
+
+    @torch.no_grad()
+    def sensitivities(
+        self,
+        effect: Effect,
+        at: Tensor,
+        memory: Tensor,
+        slope: Tensor | None,
+    ) -> Tensor:
+        """(K, S, n, 3) derivative of the key points by each amplitude of an effect at zero, mm.
+
+        at: (S, m) actuation or (S, n, 3) key points, mm, that the effect sees; memory: (S, ...)
+        its memory; slope: (S, n, 3, m) `network_slope` on those rows, which line and material
+        effects act through. Effects behind the effect are taken to hand the change on as it is.
+        """
+        changes = effect.sensitivities(at, memory)
+        if effect.stage in ("line", "material"):
+            changes = torch.einsum("snjm,ksm->ksnj", slope, changes)
+        return changes
+
+
+class RepeatedScan:
+    """`repeated()` is the prediction (S, n, 3) in mm while parameters of some effects change.
+
+    What stands before the first link that may change is computed once. Memories follow every row;
+    the network, and effects behind it unless one of them remembers, compute the looked-at rows
+    alone. Autograd runs through parameters that require it.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        history: History,
+        first: Tensor,
+        keys: set[str],
+        rows: Callable[[Tensor], Tensor],
+    ):
+        """first: (R, m) actuation at which each run begins; keys: names of the effects whose
+        parameters change (empty: those of the network); rows: picks the looked-at rows (S, ...)
+        of a (R, T, ...) tensor."""
+        self.chain, self.history, self.rows = chain, history, rows
+        self.first_pressure = first
+        # Runs that begin alike have one memory before their first row.
+        self.first = first[:1] if (first == first[:1]).all() else first
+        self.thin = all(isinstance(link.part, Memoryless) for link in chain.outer)
+        wanted = keys or {NETWORK}
+        place = next(i for i, link in enumerate(chain.links) if link.name in wanted)
+        self.links = chain.links[place:]
+        with torch.no_grad():
+            self.start = self._walk(Signal(history.pressure), chain.links[:place])
+
+    def __call__(self) -> Tensor:
+        """(S, n, 3) key points in mm, base frame."""
+        points = self._walk(self.start, self.links).value
+        return points if self.thin else self.rows(points)
+
+    def mode(self) -> Scanning:
+        """The scan from the memories before the first row that the present parameters give."""
+        runs = self.history.runs
+        start = self.chain.standing(self.first)[0].memory
+        start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
+        return Scanning(start, context_of(self.history), self.rows if self.thin else None)
+
+    def _walk(self, signal: Signal, links: tuple[Link, ...]) -> Signal:
+        return self.chain.walk(signal, self.mode(), links)
+
+
+def context_of(history: History) -> Context:
+    """(R, T) times and temperatures of a history, for the effects' memories."""
+    return Context(history.dt_s, history.t_s.float(), history.temperature_C)

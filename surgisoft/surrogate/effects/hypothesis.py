@@ -1,0 +1,78 @@
+"""What identification needs to know of an effect, beside the effect's physics.
+
+A file of an effect ends with its `HYPOTHESIS`. An effect without one is tried as it is built by
+default; `hypothesis_of` then also reads the class attributes that older user-defined effects have.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surgisoft.surrogate.effects.base import ArmFacts, Effect
+
+
+def all_together(some: list[Effect]) -> list[list[int]]:
+    """One combination of all candidates, as for a spectrum of time constants."""
+    return [list(range(len(some)))]
+
+
+def no_combinations(some: list[Effect]) -> list[list[int]]:
+    """No combination: several candidates of the effect at once make no sense."""
+    return []
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """How identification tries an effect that a model may lack."""
+
+    effect: type[Effect]
+    """The effect's class."""
+    grid: Callable[[ArmFacts, Tensor], list[Effect]] | None = None
+    """Gives effects of zero amplitude over a coarse grid of the nonlinear parameters, from what is
+    known of the arm and the predicted key points (S, n, 3) in mm of the recordings, base frame.
+    None: the effect as its class builds it by default."""
+    grid_further: Callable[[ArmFacts, Tensor], list[Effect]] | None = None
+    """Gives the same where the model has the effect already: effects that add up with any other of
+    the kind. None: there can only be more or less of the present one."""
+    combinations: Callable[[list[Effect]], list[list[int]]] = all_together
+    """Sets of candidates, by number, that are also tried side by side."""
+    needs_reversals: bool = False
+    """Whether the effect can only be learned from data with inner reversals."""
+    exact_form: bool = False
+    """Whether real arms have exactly this formula, as with a turned frame or a weight. Then the
+    effect must explain more before it is named, because nothing but noise may be left of it."""
+
+    def candidates(self, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        """Effects of zero amplitude to try on an arm whose model lacks the effect.
+
+        points: (S, n, 3) predicted key points of the recordings, mm, base frame.
+        """
+        return [self.effect(facts)] if self.grid is None else self.grid(facts, points)
+
+    def further(self, facts: ArmFacts, points: Tensor) -> list[Effect]:
+        """Effects of zero amplitude to try on an arm whose model has the effect already."""
+        return [] if self.grid_further is None else self.grid_further(facts, points)
+
+
+def hypothesis_of(effect: Effect | type[Effect]) -> Hypothesis:
+    """The hypothesis of an effect or its class.
+
+    It is the `HYPOTHESIS` of the effect's file. Without one it is made from the class attributes
+    `candidates`, `further`, `together`, `side_by_side`, `needs_reversals` and `settled_form`, as
+    far as the class has them.
+    """
+    kind = effect if isinstance(effect, type) else type(effect)
+    stated = getattr(sys.modules.get(kind.__module__), "HYPOTHESIS", None)
+    if isinstance(stated, Hypothesis) and stated.effect is kind:
+        return stated
+    side_by_side = all_together if getattr(kind, "side_by_side", True) else no_combinations
+    return Hypothesis(
+        kind,
+        getattr(kind, "candidates", None),
+        getattr(kind, "further", None),
+        getattr(kind, "together", side_by_side),
+        bool(getattr(kind, "needs_reversals", False)),
+        bool(getattr(kind, "settled_form", False)),
+    )

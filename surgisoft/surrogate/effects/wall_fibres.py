@@ -1,0 +1,88 @@
+"""Wall fibres: lines along an arm's wall whose material remembers, stiffens or flows.
+
+A fibre carries a load u of its own, a mixture of the loads x of the chambers: a chamber that bends
+the arm shortens the wall on the other side. What a fibre holds back acts on the chambers by the
+transpose of that mixture (virtual work).
+"""
+
+import math
+from abc import ABC
+
+import torch
+from torch import Tensor, nn
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.effects.base import Effect
+
+RINGS = (3, 4)
+"""Numbers of chambers that are taken to stand in one ring; of other numbers nothing is known."""
+
+
+class WallFibres(Effect, ABC):
+    """An effect on the loads of wall fibres; a subclass calls `set_fibres` when it is built."""
+
+    stage = "material"
+    version = 2
+    """1: one fibre along each chamber; 2: also a ring of fibres, and `others` redefined."""
+
+    def set_fibres(self, others: float, ring: bool) -> None:
+        """Add the parameter of the mixture; the arguments are those of `fibre_matrix`."""
+        self.ring = bool(ring)
+        self.others = nn.Parameter(torch.tensor([float(others)]))
+
+    @property
+    def fibres(self) -> Tensor:
+        """(K, m) loads of the fibres by those of the chambers."""
+        return fibre_matrix(self.others, len(self.reach), self.ring)
+
+    def fibre_loads(self, signal: Tensor) -> Tensor:
+        """(..., K) load of each fibre from the actuation (..., m)."""
+        return self.load(signal) @ self.fibres.T
+
+    def config(self) -> dict:
+        return {"ring": self.ring}
+
+    @classmethod
+    def migrated(cls, config: dict, version: int | None) -> dict:
+        # Models that were written before versions were kept have version 2 if they name the ring.
+        if version == 1 or (version is None and "ring" not in config):
+            raise InputError(
+                "an earlier surgisoft fitted its parameters, which then had another meaning"
+            )
+        return super().migrated(config, version)
+
+
+def fibre_matrix(others: Tensor, chambers: int, ring: bool = False) -> Tensor:
+    """(K, m) matrix A / |A| that gives the fibres' loads u = A x / |A| from the chambers' loads x.
+
+    others: () or (1,) share of a neighbouring chamber's load in the load of the fibre along a
+    chamber, whose own share is 1. ring: 2 m fibres, one along each chamber and one between any two;
+    plane sections stay plane, so that the fibre at the azimuth f carries
+    c sum_i x_i + (1 - c) sum_i x_i cos(f - f_i). Otherwise m fibres, one along each chamber, with
+    the same share of all others. |A| is the largest singular value, so that all fibres together
+    hold back no more than there is.
+    """
+    m = chambers
+    if m == 1:
+        return torch.ones(1, 1, dtype=others.dtype, device=others.device)
+    if not ring:
+        eye = torch.eye(m, dtype=others.dtype, device=others.device)
+        most = torch.maximum((1 + (m - 1) * others).abs(), (1 - others).abs())
+        return (eye + others * (1 - eye)) / most
+    near = math.cos(2 * math.pi / m)
+    common = (others - near) / (1 - near)
+    step = torch.arange(2 * m, dtype=others.dtype, device=others.device) * (math.pi / m)
+    bent = torch.cos(step[:, None] - step[None, ::2])
+    most = m * torch.maximum(math.sqrt(2.0) * common.abs(), (1 - common).abs() / math.sqrt(2.0))
+    return (common + (1 - common) * bent) / most
+
+
+def fibres_tried(chambers: int, others: float) -> list[tuple[float, bool]]:
+    """(share of the others, ring) of the wall fibres that identification tries on an arm.
+
+    Fibres along the chambers that carry nothing else, and a ring of fibres; where the chambers are
+    not known to stand in a ring, fibres with the given share of the others instead.
+    """
+    if chambers == 1:
+        return [(0.0, False)]
+    return [(0.0, False), (0.0, True) if chambers in RINGS else (others, False)]

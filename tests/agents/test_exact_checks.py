@@ -1,0 +1,83 @@
+"""The referee on contacts that are provoked, and on bodies whose distances are known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.agents.evaluate import evaluate
+from surgisoft.agents.exact_checks import ExactChecks, has_obstacles
+from surgisoft.agents.policies import Random
+from surgisoft.agents.rollout import Instant
+from surgisoft.scene.folder import open_scene
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.circle_ablation import PHANTOM, CircleAblation, CircleAblationConfig
+from surgisoft.tasks.registry import make_task
+
+
+@pytest.fixture(scope="module")
+def task():
+    return CircleAblation()
+
+
+def at(state, line_mm):
+    """The state with the laser's body along a line (K, 3) mm, everything else as it was."""
+    laser = state.world.arms["laser"]
+    arms = {**state.world.arms, "laser": replace(laser, line_mm=line_mm[None])}
+    return replace(state, world=replace(state.world, arms=arms))
+
+
+def looked_at(task, *states):
+    referee = ExactChecks(task)
+    live = torch.ones(1, dtype=torch.bool)
+    for state in states:
+        referee(Instant(torch.tensor([7]), state, None, None, live))
+    (check,) = referee.checks()
+    return check
+
+
+def test_an_arm_driven_into_the_organ_is_found_with_time_and_place(task):
+    state = Episodes(task).seeded(0, 1)
+    organ = open_scene(PHANTOM).organ
+    inside = torch.tensor(organ.world_mesh.vertices_mm.mean(0), dtype=torch.float32)
+    line = state.world.arms["laser"].line_mm[0]
+    into = line[0] + torch.linspace(0.0, 1.0, 21)[:, None] * (inside - line[0])
+    later = at(replace(state, world=replace(state.world, steps=state.world.steps + 4)), into)
+    check = looked_at(task, state, later)
+    assert check.contact.between == ("laser", organ.name)
+    assert check.contact.time_s == pytest.approx(0.4)
+    assert check.steps == 2
+    # The batched path still holds the clearances of the body that was not moved.
+    assert check.contact_differs == 1
+    assert check.clearance_off_mm > 1.0
+
+
+def test_two_straight_arms_are_as_far_apart_as_their_axes_less_radii(task):
+    state = Episodes(task).seeded(0, 1)
+    radii = task.world.scene.geometry.radii_mm
+    far = torch.tensor([0.0, 0.0, 400.0])
+    along = torch.linspace(0.0, 50.0, 21)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    apart = torch.tensor([0.0, 20.0, 0.0])
+    arms = {
+        name: replace(part, line_mm=(far + along + shift)[None])
+        for (name, part), shift in zip(state.world.arms.items(), (0.0 * apart, apart), strict=True)
+    }
+    check = looked_at(task, replace(state, world=replace(state.world, arms=arms)))
+    assert check.contact is None
+    assert check.clearance_mm == pytest.approx(20.0 - sum(radii.values()), abs=1e-4)
+
+
+def test_on_real_episodes_the_batched_path_agrees(task):
+    short = CircleAblation(CircleAblationConfig())
+    short.steps = 40
+    found = evaluate(short, "random", Random(2), 2, seed=1)
+    assert [check.steps for check in found.checks] == [41, 41]
+    for check in found.checks:
+        assert check.contact_differs == check.beam_differs == 0
+        assert check.beam_off_mm < 1e-3
+        assert check.clearance_off_mm < 0.05
+    assert found.per_episode["clearance_mm"].tolist() == [v.clearance_mm for v in found.checks]
+
+
+def test_nothing_around_needs_no_referee():
+    assert not has_obstacles(make_task("track_circle"))

@@ -1,0 +1,219 @@
+"""Effects whose truth is known come back through the whole model, with honest intervals."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.candidates import with_effect
+from surgisoft.diagnosis.estimation.effects import fit_effects
+from surgisoft.diagnosis.estimation.least_squares import (
+    Prediction,
+    free_parameters,
+    repeated_scan,
+    vector,
+)
+from surgisoft.diagnosis.estimation.network import retune
+from surgisoft.diagnosis.estimation.nuisance import kinds
+from surgisoft.diagnosis.residuals import problem_of
+from surgisoft.errors import InputError
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import RecurrentArm
+from tests.diagnosis.synthetic import walk
+
+NOISE_MM = 0.05
+"""Standard deviation of a coordinate."""
+
+
+def bare_arm() -> ArmModel:
+    """The network of the default arm without its memory."""
+    arm = default_arm()
+    arm.network.requires_grad_(False)
+    return arm.replace(effects={}).eval()
+
+
+def measured_on(truth: ArmModel, runs: int = 4, rows: int = 400, seed: int = 0) -> Recording:
+    """What cameras with white noise would record of a model that is the truth, at 10 Hz."""
+    rng = np.random.default_rng(seed)
+    low, high = np.array(truth.spec.low), np.array(truth.spec.high)
+    pressure = np.concatenate([walk(rows, 3, seed * 100 + run) for run in range(runs)])
+    pressure = low + (high - low) * pressure / 10
+    plain = Recording(
+        name="made",
+        t_s=0.1 * np.arange(runs * rows),
+        measured=pressure,
+        key_points_mm=np.zeros((runs * rows, truth.spec.key_points, 3)),
+        run=np.repeat(np.arange(runs), rows),
+        noise_mm=NOISE_MM,
+    )
+    history = history_of([plain])
+    with torch.no_grad():
+        points = history.rows(truth.predict(history)).double().numpy()
+    points += rng.normal(0, NOISE_MM, points.shape)
+    return replace(plain, key_points_mm=points)
+
+
+def with_truth(name: str, strengths: dict, arm: ArmModel | None = None, **config) -> ArmModel:
+    """An arm with an effect whose strengths and shapes are set."""
+    arm = arm or bare_arm()
+    effect = make_effect(name, arm.facts, **config)
+    for key, value in strengths.items():
+        getattr(effect, key).data.copy_(torch.as_tensor(value, dtype=torch.float32))
+    return with_effect(copy.deepcopy(arm), name, effect).eval().requires_grad_(False)
+
+
+TRUTHS = {
+    "creep": with_truth("creep", {"amount": [0.15], "log_tau": [2.0], "log_width": [0.3]}),
+    "line_lag": with_truth("line_lag", {"share": [1.0], "log_up": [-0.7], "log_down": [0.1]}),
+    "gain_mismatch": with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}),
+    "misalignment": with_truth("misalignment", {"turn": [0.02, 0.0, -0.01], "shift": [0.3, 0, 1]}),
+}
+"""An arm for each effect that is tried: one a stage and kind of memory."""
+
+
+def rms(residual: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(residual).sum(-1))))
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_parameters_come_back_and_the_error_falls_to_the_noise(name):
+    truth = TRUTHS[name]
+    recording = measured_on(truth)
+    problem = problem_of(bare_arm(), [recording], part="training")
+    fitted = fit_effects(problem, [name])
+    floor = np.sqrt(3) * NOISE_MM
+    assert rms(problem.residual) > 2 * floor
+    assert rms(problem.with_model(fitted.model).residual) < 1.03 * floor
+    expected = {q.name: q.value for q in truth.effects[name].quantities()}
+    inside, wide = [], []
+    for parameter in fitted.parameters:
+        low, high = np.ravel(parameter.low), np.ravel(parameter.high)
+        true = np.ravel(expected[parameter.name])
+        inside += list((low <= true) & (true <= high))
+        wide += list(high - low)
+    # 95 % intervals: of up to nine values one may lie outside.
+    assert sum(inside) >= len(inside) - 1
+    assert np.isfinite(wide).all()
+    assert max(wide) > 0
+
+
+def test_intervals_shrink_with_the_data():
+    """Four times the rows, half the width (within sampling error)."""
+    truth, widths = TRUTHS["gain_mismatch"], []
+    for rows in (150, 600):
+        problem = problem_of(bare_arm(), [measured_on(truth, rows=rows)], part="training")
+        (parameter,) = fit_effects(problem, ["gain_mismatch"]).parameters
+        widths.append(np.mean(np.subtract(parameter.high, parameter.low)))
+    assert 0.25 < widths[1] / widths[0] < 0.9
+
+
+def test_the_static_error_of_a_network_is_not_taken_for_memory():
+    """A smooth static error of 0.3 mm beside a known creep: its amount still comes back."""
+    truth = copy.deepcopy(TRUTHS["creep"])
+    generator = torch.Generator().manual_seed(3)
+    last = truth.network.layers[-1]
+    last.weight += 0.004 * torch.randn(last.weight.shape, generator=generator)
+    problem = problem_of(bare_arm(), [measured_on(truth)], part="training")
+    amount = fit_effects(problem, ["creep"]).parameters[0]
+    assert amount.name == "amount_share"
+    assert amount.value == pytest.approx(0.15, abs=0.03)
+
+
+def test_forward_is_the_model_and_its_slopes_are_those_of_autograd():
+    arm = with_truth("creep", {"amount": [0.1]}, with_truth("misalignment", {"scale": [0.02]}))
+    problem = problem_of(arm, [measured_on(arm, rows=100)], part="training")
+    parameters = free_parameters(arm, ["creep", "misalignment"])
+    forward = repeated_scan(arm, problem, list(arm.effects))
+    predict = Prediction(forward, parameters)
+    values = vector(parameters)
+    predicted = predict(values)
+    assert np.allclose(predicted, problem.predicted, atol=1e-4)
+    slopes = predict.sensitivities(values, predicted)
+    for place, (name, parameter) in enumerate(parameters.items()):
+        if name not in ("creep.amount", "creep.log_tau"):
+            continue
+        parameter.requires_grad_(True)
+        total = forward()[..., 0].sum()
+        (exact,) = torch.autograd.grad(total, parameter)
+        parameter.requires_grad_(False)
+        assert slopes[..., 0, place].sum() == pytest.approx(float(exact), rel=0.02)
+
+
+def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
+    """Half of the default arm's friction is missing: its weights come back, in one instance."""
+    truth = default_arm()
+    weaker = copy.deepcopy(truth)
+    for strength in weaker.effects["hysteresis"].amplitudes().values():
+        strength.mul_(0.5)
+    recording = measured_on(truth, rows=300)
+    problem = problem_of(weaker, [recording], part="training")
+    fitted = fit_effects(problem, ["hysteresis"])
+    assert list(fitted.model.effects) == ["hysteresis"]
+    assert fitted.refitted == ("hysteresis",)
+    locked = problem_of(weaker, [recording], part="held_out")
+    before, after = rms(locked.residual), rms(locked.with_model(fitted.model).residual)
+    assert before > 2 * np.sqrt(3) * NOISE_MM
+    assert after < 1.1 * np.sqrt(3) * NOISE_MM
+    assert torch.equal(
+        weaker.effects["hysteresis"].weight, 0.5 * truth.effects["hysteresis"].weight
+    )
+
+
+def test_two_effects_are_fitted_together():
+    truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
+    problem = problem_of(bare_arm(), [measured_on(truth)], part="training")
+    fitted = fit_effects(problem, ["creep", "gain_mismatch", "creep"])
+    assert list(fitted.model.effects) == ["creep", "gain_mismatch"]
+    assert rms(problem.with_model(fitted.model).residual) < 1.05 * np.sqrt(3) * NOISE_MM
+    gain = next(p for p in fitted.parameters if p.name == "gain_share")
+    assert gain.value == pytest.approx([0.06, -0.02, -0.05], abs=0.01)
+
+
+def test_missing_key_points_do_no_harm():
+    recording = measured_on(TRUTHS["gain_mismatch"])
+    points = recording.key_points_mm.copy()
+    points[::3, 2] = np.nan
+    points[:, 1] = np.nan
+    problem = problem_of(bare_arm(), [replace(recording, key_points_mm=points)], part="training")
+    gain = fit_effects(problem, ["gain_mismatch"]).parameters[0]
+    assert gain.value == pytest.approx([0.06, -0.02, -0.05], abs=0.01)
+
+
+def test_a_network_is_retuned_only_where_held_out_motion_rewards_it():
+    arm = bare_arm()
+    recording = measured_on(arm)
+    problem = problem_of(arm, [recording], part="training")
+    untouched = retune(arm, problem)
+    assert not untouched.kept
+    assert untouched.model is arm
+    off = copy.deepcopy(arm)
+    off.network.layers[-1].bias += 0.02
+    found = retune(off, problem_of(off, [recording], part="training"))
+    assert found.kept
+    locked = problem_of(off, [recording], part="held_out")
+    after = locked.with_model(found.model)
+    assert rms(after.residual) < 1.1 * np.sqrt(3) * NOISE_MM < 0.7 * rms(locked.residual)
+
+
+def test_a_recurrent_baseline_takes_no_effects():
+    arm = bare_arm()
+    low, high = torch.tensor(arm.spec.low), torch.tensor(arm.spec.high)
+    recurrent = ArmModel(arm.spec, RecurrentArm(low, high, 5, 8), {}, arm.rest_mm).eval()
+    problem = problem_of(recurrent, [measured_on(arm, rows=100)], part="training")
+    with pytest.raises(InputError, match="recurrent baseline takes none"):
+        fit_effects(problem, ["creep"])
+
+
+def test_runs_that_repeat_each_other_are_left_out_together():
+    """Three runs of one schedule with noise, then one at other chambers, one at half the height."""
+    rng = np.random.default_rng(0)
+    saw = np.abs(np.linspace(-1, 1, 50))[:, None]
+    shapes = [saw * [1, 0, 0]] * 3 + [saw * [0, 1, 0], saw * [0.5, 0, 0]]
+    pressure = np.concatenate([s + rng.normal(0, 0.01, s.shape) for s in shapes])
+    assert kinds(pressure, np.repeat(np.arange(5), 50)).tolist() == [0, 0, 0, 1, 2]

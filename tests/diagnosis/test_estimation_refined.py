@@ -1,0 +1,122 @@
+"""Rivals at fitted shapes: a lag that no grid holds, in an arm whose wall remembers."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis import selection
+from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.estimation.effects import refined
+from surgisoft.diagnosis.residuals import problem_of
+from surgisoft.diagnosis.selection import ModelSelection
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.synthetic import backlash, walk
+
+PERIOD_S, SUBSTEPS, NOISE_MM = 0.05, 20, 0.05
+
+
+def lagged(signal: np.ndarray, time_s: float) -> np.ndarray:
+    """(T, m) first-order lag of a signal that goes straight from row to row, in small steps."""
+    answer, y = [signal[0]], signal[0].copy()
+    for before, after in itertools.pairwise(signal):
+        for k in range(SUBSTEPS):
+            u = before + (k + 0.5) / SUBSTEPS * (after - before)
+            y = u + (y - u) * np.exp(-PERIOD_S / SUBSTEPS / time_s)
+        answer.append(y.copy())
+    return np.array(answer)
+
+
+def made(commands: np.ndarray, pressure: np.ndarray) -> Recording:
+    """What the default arm does under a pressure (T, m), recorded as if under the commands."""
+    arm, time_s = default_arm(), PERIOD_S * np.arange(len(commands))
+    blank = np.zeros((len(commands), arm.spec.key_points, 3))
+    history = history_of([Recording("made", time_s, measured=pressure, key_points_mm=blank)])
+    points = arm.predict(history)[0].numpy()
+    noise = np.random.default_rng(1).normal(0, NOISE_MM, points.shape)
+    return Recording(
+        "made", time_s, measured=commands, key_points_mm=points + noise, noise_mm=NOISE_MM
+    )
+
+
+@pytest.fixture(scope="module", params=[0.24, 0.6])
+def lagging(request):
+    """An arm whose pressure lags behind what is taken for it; the grid has 0.15, 0.4 and 1 s."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + (0.1 + 0.05 * walk(6000, 3)) * (high - low)
+    return made(commands, lagged(commands, request.param))
+
+
+def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
+    """A dead travel of one kPa, in tubes or gears, is narrower than the arm's own loops."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + (0.1 + 0.05 * walk(6000, 3)) * (high - low)
+    behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
+    found = diagnose(default_arm(), [made(commands, behind)])
+    assert found.verdict.effects == ("hysteresis",)
+    assert found.ranking[0].gain_alone > 0.8
+
+
+def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
+    found = diagnose(default_arm(), [lagging])
+    assert found.verdict.effects == ("line_lag",)
+    monkeypatch.setattr(selection, "refined", lambda *_: [])
+    grid = diagnose(default_arm(), [lagging])
+    fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
+    rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
+    assert fine["line_lag"] < 0.7 * rough["line_lag"]
+
+
+def test_what_is_fitted_is_plausible_small_and_new(lagging):
+    problem = problem_of(default_arm(), [lagging], part="training")
+    race = ModelSelection.of(
+        problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"])
+    )
+    first = race.scores()
+    assert {standing.effect for standing in first} >= {"line_lag", "hysteresis"}
+    fitted = refined(problem, race.starts(first))
+    names = [candidate.name for candidate in fitted]
+    assert "line_lag" in names
+    assert "hysteresis" not in names  # the model has it already
+    assert all(candidate.effect.plausible() for candidate in fitted)
+    assert all(candidate.columns.shape[3] == 1 for candidate in fitted)
+    twice = next(c for c in fitted if c.name == "line_lag")
+    half = twice.with_amplitudes(np.array([0.5]))
+    assert half.share.item() == pytest.approx(0.5 * twice.effect.share.item())
+
+
+def test_a_fit_leaves_the_shapes_of_the_grid_as_they_are(lagging):
+    problem = problem_of(default_arm(), [lagging], part="training")
+    race = ModelSelection.of(problem, candidates(problem, ["line_lag"]))
+    standing = race.scores()[0]
+    effect = race.in_place(standing.option)
+    before = {name: p.detach().clone() for name, p in effect.named_parameters()}
+    assert refined(problem, race.starts([standing]))
+    after = dict(race.in_place(standing.option).named_parameters())
+    assert all(after[name].equal(value) for name, value in before.items())
+
+
+def ramps_from_rest(rows: int) -> np.ndarray:
+    """(rows, 3) some of the chambers up to a load and back to rest, again and again, in 0 to 1."""
+    rng, answer = np.random.default_rng(0), []
+    while len(answer) < rows:
+        top = rng.uniform(0.3, 0.9) * (rng.random(3) < 0.6)
+        way = np.concatenate([np.linspace(0, 1, 60), np.linspace(1, 0, 60)])
+        answer += list(way[:, None] * top)
+    return np.array(answer[:rows])
+
+
+def test_loops_do_not_stand_for_what_the_actuation_explains():
+    """A gain, on ramps that begin at rest: loops explain it, and are refused; a backlash not."""
+    low, high = np.array(default_arm().spec.low), np.array(default_arm().spec.high)
+    commands = low + ramps_from_rest(3600) * (high - low)
+    behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
+    for pressure, allowed in ((0.94 * commands, False), (behind, True)):
+        problem = problem_of(default_arm(), [made(commands, pressure)])
+        race = ModelSelection.of(problem, candidates(problem, ["hysteresis"]))
+        best = min(race.options["hysteresis"], key=lambda way: race.losses(way.picked).sum())
+        assert race.losses(best.picked).sum() < 0.2 * race.losses().sum()
+        assert race.plausible(best) == allowed

@@ -1,0 +1,192 @@
+"""Every mode of the chain's walk agrees with every other, for every registered effect."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of
+from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
+from tests.surrogate.effects.test_in_models import ALL, history, model
+
+SETS = pytest.mark.parametrize("names", [(), *((name,) for name in ALL), ALL], ids="+".join)
+EACH = pytest.mark.parametrize("name", ALL)
+
+
+@pytest.fixture(scope="module")
+def away():
+    """Runs of which the first begins away from rest."""
+    stood = torch.tensor([[30.0, 25.0, 20.0], [0.0, 0.0, 0.0]])
+    return replace(history(2, 40), stood=stood)
+
+
+def stepped(arm: ArmModel, seen) -> list:
+    """(state, key points (R, n, 3)) after each row, one step a row."""
+    state = arm.first_state(arm.first_pressure(seen))
+    rows = []
+    for t in range(seen.pressure.shape[1]):
+        dp = seen.pressure[:, t] - state.pressure
+        state, points = arm.step(state, dp, seen.dt_s[:, t], seen.temperature_C[:, t])
+        rows.append((state, points))
+    return rows
+
+
+@SETS
+def test_steps_end_where_a_scan_does(names, away):
+    """Key points, directions and memories row by row, also of runs that begin away from rest."""
+    arm = model(names)
+    assert arm.first_pressure(away)[0].all()
+    taps = arm.chain.scan(away, arm.first_pressure(away))
+    predicted = arm.predict(away)
+    assert torch.equal(taps.behind["sensor"], predicted)
+    for t, (state, points) in enumerate(stepped(arm, away)):
+        assert torch.allclose(points, predicted[:, t], atol=2e-3)
+        assert torch.equal(state.direction, taps.direction[:, t])
+        assert state.memory.keys() == taps.memory.keys() == set(names)
+        for name, memory in state.memory.items():
+            # A drift's elapsed time is that of the recording, and the sum of steps in a world.
+            assert torch.allclose(memory, taps.memory[name][:, t], rtol=1e-4, atol=2e-3), name
+
+
+@SETS
+def test_taps_are_what_each_stage_sees(names, away):
+    """The signal behind each stage, from its effects one by one as their files give them."""
+    arm = model(names)
+    taps = arm.chain.scan(away, arm.first_pressure(away))
+    start = arm.first_state(arm.first_pressure(away)).memory
+    signal, context = away.pressure, context_of(away)
+    for stage in ("line", "material", "body", "sensor"):
+        if stage == "body":
+            signal = arm.network(signal, taps.direction)
+        for name, effect in arm.stage(stage):
+            memory = effect.scan(start[name], signal, context)
+            assert torch.equal(memory, taps.memory[name])
+            signal = effect.apply(signal, memory)
+        if stage == "line":
+            context = replace(context, pressure=signal)
+            assert torch.equal(signal, taps.pressure)
+        assert torch.equal(signal, taps.behind[stage])
+    trace = arm.trace(away)
+    assert torch.equal(trace.behind["material"], taps.behind["material"])
+    held = arm.shape(trace.pressure, trace.direction, trace.memory)
+    assert torch.equal(held, arm.network(taps.behind["material"], taps.direction))
+    for name, _ in arm.stage("material"):
+        before, after = arm.chain.around(name, taps)
+        assert torch.equal(arm.effects[name].apply(before, taps.memory[name]), after)
+
+
+@SETS
+def test_the_state_before_the_first_row_is_the_one_that_its_taps_belong_to(names, away):
+    """An arm that stands still for no time, from that state, sees what the taps say."""
+    arm = model(names)
+    chain, first = arm.chain, arm.first_pressure(away)
+    state, seen = chain.standing(first)
+    assert torch.equal(state.pressure, first)
+    start = Signal(first)
+    held = chain.walk(
+        start, _Held(state), chain.links[: len(chain.inner) - len(arm.stage("material"))]
+    )
+    assert torch.equal(held.value, seen["line"])
+    points = chain.walk(start, _Held(state), chain.links).value
+    assert torch.allclose(points, seen["sensor"], atol=1e-4)
+
+
+class _Held(Holding):
+    """Memories and directions of a state."""
+
+    def __init__(self, state):
+        super().__init__(state.memory)
+        self.state = state
+
+    def direction(self, chain, chamber):
+        return self.state.direction
+
+
+@SETS
+@pytest.mark.parametrize("begin", ["start", "last"])
+def test_a_repeated_scan_is_the_prediction_on_its_rows(names, begin, away):
+    """From the first link, and from the last effect on; after its parameters have changed, too."""
+    arm = model(names)
+    keys = set(names) if begin == "start" else set(list(arm.effects)[-1:])
+
+    def rows(tensor):
+        return away.rows(tensor)[::7]
+
+    repeated = RepeatedScan(arm.chain, away, arm.first_pressure(away), keys, rows)
+    assert torch.allclose(repeated(), rows(arm.predict(away)), atol=1e-4)
+    for name in keys:
+        for parameter in arm.effects[name].amplitudes().values():
+            parameter.mul_(1.3)
+    assert torch.allclose(repeated(), rows(arm.predict(away)), atol=1e-4)
+
+
+@EACH
+def test_sensitivities_are_finite_differences_of_the_prediction(name, away):
+    """Of an effect added behind the others of its stage and of the stages before, in float64."""
+    points = away.rows(model(()).predict(away))
+    kind = effect_class(name)
+    tried = hypothesis_of(kind).candidates(model(()).facts, points)
+    effect = tried[len(tried) // 2].double()
+    others = {"line_lag": 0, "creep": 1, "payload": 2, "misalignment": 3}
+    arm = model(
+        [other for other, at in others.items() if at <= STAGES.index(effect.stage)]
+    ).double()
+    seen = replace(away, pressure=away.pressure.double(), stood=away.stood.double())
+    first = arm.first_pressure(seen)
+    taps, at_rest = arm.chain.scan(seen, first), arm.chain.standing(first)[1]
+    at = taps.behind[effect.stage]
+    before = arm.chain.first_memory(effect, at_rest, at[:, 0], first)
+    context = replace(context_of(seen), pressure=taps.pressure)
+    memory = seen.rows(effect.scan(before, at, context))
+    material = seen.rows(taps.behind["material"]), seen.rows(taps.direction).double()
+    slope = arm.chain.network_slope(*material)
+    found = arm.chain.sensitivities(effect, seen.rows(at), memory, slope)
+    place, size = 0, 1e-4
+    for parameter in effect.amplitudes().values():
+        for number in range(min(parameter.numel(), 3)):
+            sides = []
+            for step in (size, -size):
+                parameter.data.view(-1)[number] = step
+                more = arm.replace(effects={**arm.effects, "added": effect})
+                sides.append(seen.rows(more.predict(seen)))
+                parameter.data.view(-1)[number] = 0.0
+            measured = (sides[0] - sides[1]) / (2 * size)
+            expected = found[place + number]
+            assert measured.abs().max() > 0
+            assert (measured - expected).norm() <= 1e-4 * measured.norm()
+        place += parameter.numel()
+    assert place == len(found)
+
+
+def test_the_networks_slope_is_that_of_reverse_differentiation():
+    """Forward against reverse differentiation, for every static network."""
+    arm = model(())
+    curved = ConstantCurvature(*(torch.tensor(x) for x in (arm.spec.low, arm.spec.high)), 5)
+    curved.set_rest(arm.rest_mm)
+    torch.nn.init.normal_(curved.table, std=0.3)
+    generator = torch.Generator().manual_seed(2)
+    at = 40 * torch.rand(6, 3, generator=generator)
+    direction = torch.ones(6, 3)
+    for network in (arm.network, curved):
+        chain = arm.replace(network=network).chain
+        rows = [
+            torch.autograd.functional.jacobian(lambda x, d=d, of=network: of(x, d), x)
+            for x, d in zip(at, direction, strict=True)
+        ]
+        assert torch.allclose(chain.network_slope(at, direction), torch.stack(rows), atol=1e-6)
+
+
+def test_a_replaced_part_is_new_and_all_others_are_shared():
+    arm = model(("creep", "payload"))
+    spec = replace(arm.spec, gravity=None)
+    other = arm.replace(spec=spec, effects={"creep": arm.effects["creep"]})
+    assert other.spec is spec
+    assert list(other.effects) == ["creep"]
+    assert other.effects["creep"] is arm.effects["creep"]
+    assert other.network is arm.network
+    assert other.validation is arm.validation
+    assert torch.equal(other.rest_mm, arm.rest_mm)
+    assert not other.training
+    assert list(arm.effects) == ["creep", "payload"]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from surgisoft.agents.distributed import processes
-from surgisoft.agents.evaluate import Evaluation
+from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import POLICIES, check_policy, open_policy
@@ -31,9 +31,6 @@ from surgisoft.tasks.registry import (
     with_fields,
 )
 from surgisoft.workers import torch_threads
-
-CONFIDENCE = 0.95
-"""Share of the intervals of an evaluation that hold the true mean."""
 
 
 def task_config(
@@ -279,7 +276,9 @@ def evaluate(
     results = []
     for number, (name, policy) in enumerate(opened.items()):
 
-        def tell(done: float, total: float, first: int = number, name: str = name) -> None:
+        def tell(
+            done: float, total: float, note: str = "", first: int = number, name: str = name
+        ) -> None:
             progress(first * total + done, len(opened) * total, name)
 
         result = evaluate_policy(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tabl
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, TASK, Experiment, load_experiment
 from surgisoft.files import write_atomically
+from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
 from surgisoft.scene.packaged import PHANTOM, packaged_scene
@@ -25,9 +26,6 @@ PACKAGED = PHANTOM / "experiments"
 """The experiments that come with the package."""
 REPLAY_PICTURES_HZ = 1.0
 """Endoscope pictures in a second of the replays beside a report, 1/s."""
-
-Report = Callable[[float, float, str], None]
-"""Called with (done, to do, note)."""
 
 
 def find_experiment(name: str | Path) -> Path:
@@ -104,7 +102,7 @@ def finish_experiment(
     processes: int = 1,
     replays: bool = True,
     about: str = "",
-    progress: Report | None = None,
+    progress: Progress = silent,
 ) -> tuple[Results, list[Path]]:
     """Roll out what is not there yet and write tables, pictures, replays and the report.
 
@@ -127,7 +125,7 @@ def finish_experiment(
     return results, [*files, summary]
 
 
-def _write_replays(results: Results, progress: Report | None) -> list[Path]:
+def _write_replays(results: Results, progress: Progress) -> list[Path]:
     """Replays of the first and of the worst episode."""
     files = []
     worst = ("worst", *results.worst)

@@ -5,14 +5,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from surgisoft.errors import InputError
+from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import Replay, write_replay
 from surgisoft.replay.find import find_replay, moment
 from surgisoft.replay.screenshot import parse_size, take_screenshot
 from surgisoft.replay.viewer import open_viewer, serve_viewer, temporary_recording
 from surgisoft.tasks.episodes.file import load_episode
 
-Report = Callable[[float, float, str], None]
-"""Called with (done, to do, note)."""
 WINDOW = "1600x1000"
 """Size of a picture's window, in points."""
 
@@ -26,7 +25,7 @@ def open_replay(
     size: str = WINDOW,
     time_s: float | None = None,
     view: str | None = None,
-    progress: Report | None = None,
+    progress: Progress = silent,
     on_address: Callable[[str], None] = print,
 ) -> Replay | None:
     """Open an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events.
@@ -57,7 +56,7 @@ def open_replay(
 
 
 @contextlib.contextmanager
-def _recording(found: Path, progress: Report | None) -> Iterator[Path]:
+def _recording(found: Path, progress: Progress) -> Iterator[Path]:
     """A replay itself; the replay of a log for the time of the block."""
     if found.suffix == ".rrd":
         yield found

@@ -1,13 +1,14 @@
 """A recording from a rig by the name of a protocol; without a rig from the virtual one."""
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
 from surgisoft.rig.interface import Rig
 from surgisoft.rig.virtual import VirtualRig
@@ -41,7 +42,7 @@ def collect(
     trial: int = 0,
     points: int | None = None,
     hidden: Iterable[str | tuple[str, float]] = (),
-    progress: Callable[[float, float], None] | None = None,
+    progress: Progress = silent,
     **mount: Any,
 ) -> Recording:
     """Record a protocol: its name, a schedule file (.csv), or a `Protocol`.

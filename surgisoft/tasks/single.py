@@ -1,8 +1,7 @@
 """Tasks of one agent as Gymnasium Env and VectorEnv: adapters over a batch.
 
-`import surgisoft` registers them as `surgisoft/NAME-v0` for `gymnasium.make` and
-`gymnasium.make_vec`.
-The id `surgisoft.tasks.single:surgisoft/NAME-v0` imports the module by itself.
+`import surgisoft` registers them as `surgisoft/NAME-v0`. `gymnasium.make_vec` makes the batched
+one.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
 
 FLOORS = {
     "diagnosis": (
-        ("body_frame", "criteria", "effect_knowledge", "history_features", "statistics", "weight"),
+        ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("discrepancy", "data_quality", "error_axes", "inputs"),
         ("cross_validation",),

@@ -19,7 +19,7 @@ from benchmarks.hidden_effect.rates import by_rate
 from benchmarks.hidden_effect.rigs import Bench
 from surgisoft.diagnosis.amend import amend, fall_of
 from surgisoft.diagnosis.design.next_experiment import recommend
-from surgisoft.diagnosis.design.schedules import ON_THE_RIG
+from surgisoft.diagnosis.design.schedules import on_the_rig
 from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
 from surgisoft.diagnosis.improve import next_effects
 from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
@@ -215,7 +215,7 @@ class Study:
             plan = None
             if found[0].verdict.kind == "ambiguous":
                 rivals = found[0].verdict.effects[:MOST_RIVALS]
-                asked = recommend(problem_of(model, [seen]), rivals, settings=ON_THE_RIG)
+                asked = recommend(problem_of(model, [seen]), rivals, settings=on_the_rig())
                 more = bench.record(asked.protocol, FURTHER_TAKE, asked.setting)
                 found.append(diagnose(model, [seen, more]))
                 plan = asked.to_json()

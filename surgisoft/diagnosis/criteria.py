@@ -165,7 +165,7 @@ class Calibration:
     Fitted, with a ridge of 1, to 425 statements about virtual robots (robots 104 to 111, drawn as
     seeds 3, 4, 6 and 7 of `benchmarks/diagnosis` draw them), 96 % of which were right. Nearly all
     that were wrong are about robots whose effect is outside the list. The mimicked effects have
-    log odds of their own (`effect_knowledge`).
+    log odds of their own (`Hypothesis.mimic_log_odds`).
     """
 
     constant: float = 5.38

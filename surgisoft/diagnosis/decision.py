@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 
 from surgisoft.diagnosis.criteria import CRITERIA, Calibration, Criteria, DecisionCriteria
-from surgisoft.diagnosis.effect_knowledge import knowledge_of
 from surgisoft.diagnosis.selection import Findings
 from surgisoft.diagnosis.statistics import studentised, win_shares
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
@@ -237,7 +236,7 @@ def confidence(evidence: Evidence, calibration: Calibration = CRITERIA.calibrati
         calibration.constant
         + calibration.runner_up * min(max(runner_up, 0.0), MOST_RUNNER_UP)
         + calibration.relaxed * relaxed
-        + knowledge_of(evidence.effects[0]).mimic_log_odds
+        + hypothesis_of(known_effects()[evidence.effects[0]]).mimic_log_odds
     )
     chance = 1.0 / (1.0 + math.exp(-odds))
     return min(chance, calibration.ambiguous) if evidence.rivals else chance

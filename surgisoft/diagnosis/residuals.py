@@ -445,10 +445,10 @@ def model_discrepancy(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
     """
     spec, stated = model.spec, model.validation
     validated = np.array(
-        [value or 0.0 for value in stated.get("per_key_point_mm", [])]
+        [value or 0.0 for value in stated.per_key_point_mm]
         or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
     )
-    own = stated.get("noise_mm")
+    own = stated.noise_mm
     noise = noise_mm if own is None else np.full(len(validated), np.sqrt(3.0) * own)
     return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_DISCREPANCY * validated) ** 2))
 

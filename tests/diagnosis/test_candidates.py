@@ -92,14 +92,16 @@ def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
     assert [c.more for c in candidates(problem.with_model(fresh), ["creep"])] == [True]
 
 
-def test_open_and_locked_parts_share_no_row(recording, problem):
-    """The last runs are locked away, and both parts together are everything."""
-    locked = held_out_rows([recording])
+def test_training_and_held_out_parts_share_no_row(recording, problem):
+    """The last runs are held out, and both parts together are everything."""
+    held_out = held_out_rows([recording])
     last = recording.runs[-1]
-    assert locked[last].all()
-    assert not locked[: last.start].any()
+    assert held_out[last].all()
+    assert not held_out[: last.start].any()
     model = problem.model
-    parts = [problem_of(model, [recording], rows=10**6, part=part) for part in ("open", "locked")]
+    parts = [
+        problem_of(model, [recording], rows=10**6, part=part) for part in ("training", "held_out")
+    ]
     indices = [set(part.index.tolist()) for part in parts]
     assert not indices[0] & indices[1]
     everything = problem_of(model, [recording], rows=10**6)

@@ -19,20 +19,19 @@ from surgisoft.diagnosis.design.next_experiment import (
 )
 from surgisoft.diagnosis.design.schedules import (
     AS_IT_STANDS,
-    EXCITATIONS,
-    ON_THE_RIG,
     RUN_S,
     SETUPS,
     bench_minutes,
     draw_run,
     limits_within,
+    on_the_rig,
     schedule,
     schedule_text,
     words_for,
 )
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
-from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
+from surgisoft.measurement.protocols import SIGNALS, Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
@@ -55,7 +54,7 @@ def problem(arm, lagging):
     return problem_of(arm, [lagging])
 
 
-@pytest.mark.parametrize("name", EXCITATIONS)
+@pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize(
     "limits", [[[-15.0, 54.0]] * 3, [[0.0, 1.0]], [[-90.0, 90.0]] * 6, [[2.0, 9.0], [0.0, 30.0]]]
 )
@@ -132,7 +131,7 @@ def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(proble
     assert pair.before < 0.95 < pair.after
     assert answer.setting == "short_tube"
     assert answer.by_hand
-    assert not recommend(problem, ["line_lag", "rate_dependence"], 5.0, ON_THE_RIG).by_hand
+    assert not recommend(problem, ["line_lag", "rate_dependence"], 5.0, on_the_rig()).by_hand
     assert answer.minutes <= 15.0
     assert any("tube" in step for step in answer.steps)
     left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))
@@ -263,7 +262,7 @@ def test_a_bench_is_spoken_of_in_its_own_words(arm, unit, said):
 def test_every_word_of_the_catalogue_is_filled_in():
     for unit in ("kPa", "deg", "V"):
         words = asdict(words_for(unit))
-        for thing in (*SETUPS.values(), *EXCITATIONS.values()):
+        for thing in (*SETUPS.values(), *SIGNALS.values()):
             assert "{" not in thing.about.format(**words)
         if unit != "kPa":
             texts = " ".join(thing.about.format(**words) for thing in SETUPS.values())

@@ -35,7 +35,7 @@ from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import centre_and_half
-from surgisoft.surrogate.effects import ArmFacts, Effect, known_effects, make_effect
+from surgisoft.surrogate.effects import ArmFacts, Effect, hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.history import History, pack
 from surgisoft.surrogate.model import ArmModel
 
@@ -273,7 +273,7 @@ def shapes_of(
         kind = known[name] if name in known else type(make_effect(name, facts))
         if name in model.effects:
             answer.append(Shape(name, model.effects[name], True))
-        answer += [Shape(name, effect) for effect in kind.candidates(facts, points)]
+        answer += [Shape(name, effect) for effect in hypothesis_of(kind).candidates(facts, points)]
     return answer
 
 

@@ -45,7 +45,6 @@ from surgisoft.diagnosis.design.isolability import (
 )
 from surgisoft.diagnosis.design.schedules import (
     AS_IT_STANDS,
-    EXCITATIONS,
     RUN_S,
     SETUPS,
     Setup,
@@ -55,7 +54,6 @@ from surgisoft.diagnosis.design.schedules import (
     schedule,
     words_for,
 )
-from surgisoft.diagnosis.effect_knowledge import gravity_load, knowledge_of
 from surgisoft.diagnosis.estimation.effects import with_fitted
 from surgisoft.diagnosis.inputs import (
     Model,
@@ -64,12 +62,13 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
 )
 from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.weight import gravity_load
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
-from surgisoft.measurement.protocols import Protocol
+from surgisoft.measurement.protocols import SIGNALS, Protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
-from surgisoft.surrogate.effects import Effect, known_effects, make_effect
+from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
@@ -378,7 +377,7 @@ def make_plans(
     """The best runs on the bench as it stands and in every setting that touches a competing
     effect."""
     model = question.model
-    runs = [draw_run(name, limits, 0) for name in EXCITATIONS]
+    runs = [draw_run(name, limits, 0) for name in SIGNALS]
     design = design_of(model, planned_history(model, runs), RUN_ROWS * len(runs))
     run = design.history.run_of_row[design.index].numpy()
     own = columns_on(design, question.shapes)
@@ -400,7 +399,7 @@ def make_plans(
                 question.uncertainty,
                 worth * RUN_S,
             )
-            for k, figure in enumerate(EXCITATIONS)
+            for k, figure in enumerate(SIGNALS)
         }
         answer.append(_greedy(question, name, parts, minutes - setting.minutes))
     return answer
@@ -413,7 +412,8 @@ def _changed(question: Question, design: Design, own, setting: Setup):
     if setting.moves_weight and gravity is None:
         return None
     facts = replace(question.model.facts, gravity=setting.gravity(gravity))
-    absent = [j for j, shape in enumerate(question.shapes) if shape.name in setting.removes]
+    removed = setting.removes
+    absent = [j for j, shape in enumerate(question.shapes) if shape.name in removed]
     other = [
         j
         for j, shape in enumerate(question.shapes)
@@ -451,7 +451,7 @@ def _own_weight(question: Question, design: Design, setting: Setup) -> tuple[np.
     pull = np.asarray(was) if setting.payload_g else np.subtract(setting.gravity(was), was)
     name = gravity_load()
     load = make_effect(name, replace(model.facts, gravity=tuple(float(v) for v in pull)))
-    known = knowledge_of(name)
+    known = hypothesis_of(load)
     amplitude = known.tip_mass if setting.payload_g else known.own_weight
     column = list(load.amplitudes()).index(amplitude)
     motion = columns_on(design, [Shape(name, load)])[0][..., column : column + 1]
@@ -740,7 +740,7 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
         options = options.format(gravity=" ".join(f"{v:.4f}" for v in gravity))
     words = asdict(words_for(question.model.spec.unit))
     what = "; ".join(
-        f"{plan.figures.count(f)} x {EXCITATIONS[f].about.format(**words)}"
+        f"{plan.figures.count(f)} x {SIGNALS[f].about.format(**words)}"
         for f in dict.fromkeys(plan.figures)
     )
     about = setting.about.format(**words)

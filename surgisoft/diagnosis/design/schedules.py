@@ -1,113 +1,26 @@
 """What can be done on a bench: schedules of actuation, and experimental setups.
 
 A schedule is put together from excitation signals of two minutes, each a run of its own that starts
-from a vented, rested arm. A experimental setup leaves the actuation alone: it moves the weight or
+from a vented, rested arm. An experimental setup leaves the actuation alone: it moves the weight or
 takes the support away, and so speaks about effects that no actuation tells apart.
 """
 
-import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from surgisoft.diagnosis.effect_knowledge import absent_in
-from surgisoft.measurement.protocols import Protocol, continuous
-from surgisoft.measurement.protocols.continuous import Knots
+from surgisoft.measurement.protocols import SIGNALS, Knots, Protocol
+from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
 SPAN = 69.0
 """Width of the range that the rates of the excitation signals are meant for, kPa; others are scaled
 to it."""
 RUN_S = 120.0
-"""Length of a excitation signal, s."""
+"""Length of an excitation signal, s."""
 REST_MINUTES = 0.5
 """Time that the arm is vented and rests before each run, minutes."""
 INSET = 0.02
 """Share of the range that is left free at both ends, so that no command leaves the arm's range."""
-QUICK = 60.0
-"""Rate of a step, kPa/s on the scale of SPAN."""
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """One kind of run."""
-
-    about: str
-    """What is done, in words; {channels} stands for what the actuation goes to."""
-    draw: Callable[[Knots, float, np.random.Generator], None]
-    """Writes at least so many seconds into knots."""
-
-
-def _some(rng: np.random.Generator, chambers: int) -> np.ndarray:
-    """(m,) 1 for the chambers of a random single, pair or larger set, 0 for the others."""
-    number = int(rng.integers(1, chambers + 1))
-    return (rng.permutation(chambers) < number).astype(float)
-
-
-def two_speeds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """The same path slowly and fast: what depends on time changes, what does not is the same."""
-    while knots.now < seconds:
-        chosen = _some(rng, len(knots.low))
-        top = chosen * rng.uniform(0.5, 1.0) * knots.high
-        for rate in rng.permutation([3.0, 20.0, 60.0]):
-            for target in (top, 0.4 * top, 0.8 * top, 0.0 * top):
-                knots.go(target, rate)
-
-
-def steps(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """Quick steps to random actuations, held for 1.5 to 4 s."""
-    while knots.now < seconds:
-        knots.go(rng.uniform(knots.low, knots.high), QUICK)
-        knots.hold(rng.uniform(1.5, 4.0))
-
-
-def long_holds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """A quick step to a high load held for 40 s, then 20 s at rest."""
-    while knots.now < seconds:
-        chosen = _some(rng, len(knots.low))
-        knots.go(chosen * rng.uniform(0.6, 1.0) * knots.high, QUICK)
-        knots.hold(40.0)
-        knots.go(np.zeros_like(chosen), QUICK)
-        knots.hold(20.0)
-
-
-def returns(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """To the same two postures and back to rest, again and again."""
-    postures = [rng.uniform(0.0, 0.9, len(knots.high)) * knots.high for _ in range(2)]
-    for posture in itertools.cycle(postures):
-        if knots.now >= seconds:
-            return
-        for target in (posture, np.zeros_like(posture)):
-            knots.go(target, 20.0)
-            knots.hold(4.0)
-
-
-def sets(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """Each chamber alone, each pair, all together, up and down in steady sweeps."""
-    m = len(knots.high)
-    chosen = [c for c in itertools.product([0.0, 1.0], repeat=m) if any(c)] if m <= 4 else []
-    while knots.now < seconds:
-        order = rng.permutation(len(chosen)) if chosen else range(8)
-        for k in order:
-            pick = np.array(chosen[k]) if chosen else _some(rng, m)
-            for level in (1.0, 0.5, 1.0, 0.0):
-                knots.go(pick * level * knots.high, 16.0)
-                knots.hold(0.5)
-
-
-EXCITATIONS: dict[str, Excitation] = {
-    "ramps": Excitation("ramps at four speeds", continuous.ramps),
-    "two_speeds": Excitation("the same paths slowly and fast", two_speeds),
-    "steps": Excitation("quick steps with short stops", steps),
-    "long_holds": Excitation("high loads held for 40 s, then rest", long_holds),
-    "holds": Excitation("steps held for 5 to 40 s", continuous.holds),
-    "reversals": Excitation("small reversals about many mean loads", continuous.reversals),
-    "ladder": Excitation("triangles of growing and shrinking amplitude", continuous.ladder),
-    "returns": Excitation("the same two postures and rest, again and again", returns),
-    "sets": Excitation("single, pair and all {channels} in steady sweeps", sets),
-    "wander": Excitation("straight legs between random loads at random rates", continuous.wander),
-}
-"""Every excitation signal by name."""
 
 REFERENCE = ("ramps", "steps", "holds", "reversals", "ladder", "wander")
 """Excitation signals of the varied schedule on which the plausible size of an effect is stated."""
@@ -117,6 +30,8 @@ REFERENCE = ("ramps", "steps", "holds", "reversals", "ladder", "wander")
 class Setup:
     """How the bench stands while a schedule is played."""
 
+    name: str
+    """Its name, as `Hypothesis.absent_in` gives it."""
     about: str
     """What a person does to the bench, with the places of `Words`; empty: nothing is to be done."""
     minutes: float
@@ -129,8 +44,12 @@ class Setup:
     """Whether the bench stands on its head."""
     payload_g: float = 0.0
     """Known mass hung on the tip, g."""
-    removes: tuple[str, ...] = ()
-    """Effects that are then absent."""
+
+    @property
+    def removes(self) -> tuple[str, ...]:
+        """Known effects that cannot act in it (`Hypothesis.absent_in`)."""
+        known = known_effects()
+        return tuple(n for n, kind in known.items() if hypothesis_of(kind).absent_in == self.name)
 
     @property
     def moves_weight(self) -> bool:
@@ -151,46 +70,60 @@ class Setup:
 AS_IT_STANDS = "as_it_stands"
 """The bench as it was when the model was fitted."""
 
-_SETUPS: dict[str, Setup] = {
-    AS_IT_STANDS: Setup("", 0.0),
-    "roll_90": Setup(
-        "turn the arm's base by 90 degrees about its own axis", 2.0, "--roll-deg 90", 90.0
+_EVERY_SETUP = (
+    Setup(AS_IT_STANDS, "", 0.0),
+    Setup(
+        "roll_90",
+        "turn the arm's base by 90 degrees about its own axis",
+        2.0,
+        "--roll-deg 90",
+        90.0,
     ),
-    "roll_180": Setup(
-        "turn the arm's base by 180 degrees about its own axis", 2.0, "--roll-deg 180", 180.0
+    Setup(
+        "roll_180",
+        "turn the arm's base by 180 degrees about its own axis",
+        2.0,
+        "--roll-deg 180",
+        180.0,
     ),
-    "upside_down": Setup(
+    Setup(
+        "upside_down",
         "turn the bench upside down, so that the weight pulls the other way",
         3.0,
         "--gravity {gravity}",
         flipped=True,
     ),
-    "known_mass": Setup(
+    Setup(
+        "known_mass",
         "hang a known mass on the tip, about a fifth of the arm's own (2 g on the virtual rig)",
         1.0,
         "--payload-g 2",
         payload_g=2.0,
     ),
-    "no_support": Setup("move everything away that the arm's body may lean on", 1.0),
-    "bare_tip": Setup(
+    Setup("no_support", "move everything away that the arm's body may lean on", 1.0),
+    Setup(
+        "bare_tip",
         "take everything off the tip and the body that is no part of the arm",
         2.0,
     ),
-    "short_tube": Setup(
+    Setup(
+        "short_tube",
         "{short_line}",
         3.0,
     ),
-    "new_frame": Setup(
+    Setup(
+        "new_frame",
         "measure the base frame anew with the cameras, with a {resting}",
         3.0,
     ),
-}
-SETUPS = {name: replace(setup, removes=absent_in(name)) for name, setup in _SETUPS.items()}
+)
+SETUPS: dict[str, Setup] = {setup.name: setup for setup in _EVERY_SETUP}
 """Every experimental setup by name."""
 
 
-ON_THE_RIG = tuple(name for name, setting in SETUPS.items() if not setting.removes)
-"""Experimental setups that the virtual rig has an option for."""
+def on_the_rig() -> tuple[str, ...]:
+    """Names of the experimental setups that the virtual rig has an option for."""
+    return tuple(name for name, setup in SETUPS.items() if not setup.removes)
 
 
 def draw_run(
@@ -201,8 +134,8 @@ def draw_run(
     limits = np.asarray(limits, float)
     scale = SPAN / max(float(np.ptp(limits, axis=1).max()), 1e-12)
     knots = Knots(limits * scale)
-    rng = np.random.default_rng([seed, list(EXCITATIONS).index(name)])
-    EXCITATIONS[name].draw(knots, seconds, rng)
+    rng = np.random.default_rng([seed, list(SIGNALS).index(name)])
+    SIGNALS[name].draw(knots, seconds, rng)
     times, rows = knots.cut(seconds)
     return times, np.clip(rows / scale, *limits.T)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.problem import own_error, pose
+from surgisoft.diagnosis.residuals import model_discrepancy, problem_of
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.noise import known_noise
 from surgisoft.surrogate.fit import FitConfig, fit
@@ -22,16 +22,16 @@ def validated_model(**more):
 def test_noise_of_the_validation_is_taken_out_whatever_the_noise_is_now():
     now = np.full(3, 0.45)
     expected = np.sqrt(np.square(VALIDATED) - 3 * 0.2**2)
-    found = own_error(validated_model(noise_mm=0.2), now)
+    found = model_discrepancy(validated_model(noise_mm=0.2), now)
     assert found == pytest.approx(expected)
-    assert own_error(validated_model(), now) == pytest.approx(
+    assert model_discrepancy(validated_model(), now) == pytest.approx(
         np.sqrt(np.square(VALIDATED) - 0.45**2)
     )
 
 
 def test_some_of_the_validated_error_is_the_models_own():
     """Noise that is said to be all of the error or more leaves three tenths."""
-    assert own_error(validated_model(noise_mm=3.0), np.zeros(3)) == pytest.approx(
+    assert model_discrepancy(validated_model(noise_mm=3.0), np.zeros(3)) == pytest.approx(
         0.3 * np.array(VALIDATED)
     )
 
@@ -39,13 +39,13 @@ def test_some_of_the_validated_error_is_the_models_own():
 def test_a_louder_recording_does_not_make_the_model_better():
     pressure = walk(600)
     quiet, loud = (
-        pose(
+        problem_of(
             validated_model(noise_mm=0.05),
             [recording(np.zeros(600), pressure, seed=seed, noise_mm=noise)],
         )
         for seed, noise in ((1, 0.05), (2, 0.5))
     )
-    np.testing.assert_array_equal(quiet.surrogate_mm, loud.surrogate_mm)
+    np.testing.assert_array_equal(quiet.discrepancy_mm, loud.discrepancy_mm)
 
 
 def test_a_fit_keeps_the_noise_that_its_recordings_state_or_show_in_holds():
@@ -65,7 +65,7 @@ def test_a_fit_keeps_the_noise_that_its_recordings_state_or_show_in_holds():
 def test_a_long_recording_is_cut_into_blocks_of_enough_fitted_rows():
     """An hour at 10 Hz, every 18th row fitted: blocks of 14.4 s with 8 of them, not of 5 s."""
     pressure = walk(36_000)
-    problem = pose(validated_model(), [recording(np.zeros(36_000), pressure)])
+    problem = problem_of(validated_model(), [recording(np.zeros(36_000), pressure)])
     assert len(problem.block) == 2000
     assert np.bincount(problem.block).min() >= 7
     assert 240 <= problem.block.max() + 1 <= 250

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg
 
 LENGTHS = ((0.45, 0.45), (1.2, 0.45))
-"""Length scales of the surrogate's error, in half ranges of the actuation, and their shares; what
+"""Length scales of the model discrepancy, in half ranges of the actuation, and their shares; what
 is left is a constant."""
 TURNS = 0.3
 """Share of the error that depends on the direction of change."""
@@ -54,7 +54,7 @@ def body_covariance(rmse_mm: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The surrogate's error on given rows, its key points made independent."""
+    """The model discrepancy on given rows, its key points made independent."""
 
     values: np.ndarray
     """(S,) eigenvalues of the kernel over the rows."""
@@ -66,11 +66,11 @@ class Prior:
     """(n,) prior variance of each output over its noise."""
 
     @classmethod
-    def of(cls, x, d, surrogate_mm: np.ndarray, noise_mm: np.ndarray) -> "Prior":
+    def of(cls, x, d, discrepancy_mm: np.ndarray, noise_mm: np.ndarray) -> "Prior":
         """For rows x, d (S, m), RMS errors and noise (n,) of each key point's distance, mm."""
         values, vectors = linalg.eigh(kernel(x, d, x, d))
         noise = np.diag(np.asarray(noise_mm, float) ** 2 / 3.0)
-        ratio, mix = linalg.eigh(body_covariance(surrogate_mm), noise)
+        ratio, mix = linalg.eigh(body_covariance(discrepancy_mm), noise)
         return cls(np.maximum(values, 0.0), vectors, mix.T, np.maximum(ratio, 0.0))
 
     def turned(self, field: np.ndarray) -> np.ndarray:

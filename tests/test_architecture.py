@@ -48,6 +48,21 @@ GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
 """Modules that every part may use; they import no part."""
 
 FLOORS = {
+    "diagnosis": (
+        ("body_frame", "criteria", "history_features", "statistics", "weight"),
+        ("residuals",),
+        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("cross_validation",),
+        ("black_box", "candidates"),
+        ("estimation",),
+        ("selection",),
+        ("decision",),
+        ("design",),
+        ("diagnose",),
+        ("compare", "amend"),
+        ("improve",),
+        ("pages",),
+    ),
     "scene": (
         ("frames",),
         ("mesh", "capsules", "camera"),
@@ -73,6 +88,11 @@ FLOORS = {
     "report": (("parts", "style"), ("charts", "page")),
 }
 """Floors of a part, from the ground up: its modules and folders import from floors below only."""
+
+ROOMS = {
+    "diagnosis/design": ("schedules", "isolability", "next_experiment"),
+}
+"""Modules of a folder in order: each imports from those before it only."""
 
 ONLY_IN = {
     "rerun": "replay",
@@ -143,6 +163,12 @@ def _floor_breaks(folder: Path, floors: tuple[tuple[str, ...], ...]) -> list[str
 @pytest.mark.parametrize("part", FLOORS)
 def test_imports_inside_a_part_run_down(part):
     assert _floor_breaks(PACKAGE / part, FLOORS[part]) == []
+
+
+@pytest.mark.parametrize("folder", ROOMS)
+def test_imports_inside_a_folder_run_down(folder):
+    floors = tuple((name,) for name in ROOMS[folder])
+    assert _floor_breaks(PACKAGE / folder, floors) == []
 
 
 def test_an_import_that_runs_up_is_found(tmp_path, monkeypatch):

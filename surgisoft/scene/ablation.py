@@ -245,8 +245,8 @@ class AblationMap:
         """The state dt_s later, the beam having swept from its last place to this one.
 
         point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
-        (B,), constant over the step. Where the beam was on the organ at one end of the step only, half
-        of the step's energy goes there. With in_place the old state's tensors are overwritten.
+        (B,), constant over the step. If the beam was on the organ at one end of the step only, it
+        receives half of the step's energy. With in_place the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
         power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)

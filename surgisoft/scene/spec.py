@@ -1,7 +1,7 @@
 """The scene file `scene.toml` as frozen dataclasses: bodies, lesion, mounts, laser, camera.
 
 Lengths are in mm, times in s. Angles are in degrees in the file, where the field's name ends in
-`_deg`, and in radians everywhere else. World frame: z up. An arm's base frame: z along the arm at rest.
+`_deg`, else in radians. World frame: z up. An arm's base frame: z along the arm at rest.
 """
 
 import re

@@ -85,7 +85,7 @@ def test_the_far_side_of_a_ball_is_hidden_by_the_ball():
         assert seen.fraction == float(angle < limit)
 
 
-def test_batched_view_agrees_with_the_referee(tmp_path):
+def test_batched_view_agrees_with_fcl(tmp_path):
     bodies = [Body("organ", "organ", lumpy(4))]
     engine = BatchedScene(bodies, {"laser": 5.0, "scope": 5.0}, most_nodes=20_000, cache=tmp_path)
     checker = CollisionChecker(bodies)

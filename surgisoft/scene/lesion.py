@@ -207,6 +207,12 @@ OPEN_CONE_RAD = np.radians(60.0)
 SITES = 6
 """Number of places that are passed to the search for mounts."""
 
+MOST_RINGS = 80
+"""Most places, best first, at which a ring is tried."""
+SITES_APART = 1.5
+"""Smallest distance between two places, in diameters of the ring."""
+OPEN_WEIGHT, FLAT_WEIGHT, TOP_WEIGHT = 2.0, 2.0, 0.7
+"""Weights, chosen by hand, of a place's quality: openness, flatness (0 to 1), upward normal."""
 QUICK_RING = 12
 """Ring points that are tried before the whole ring in the search for a diameter that fits."""
 FAR_POINT_MM = 20.0
@@ -340,10 +346,11 @@ def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
     normals = mesh.face_normals[faces]
     openness = _openness([body.mesh for body in bodies], points, normals)
     evenness = _evenness(mesh, points, normals, 0.5 * diameter_mm)
-    quality = 2.0 * openness + 2.0 * evenness + 0.7 * normals[:, 2]
+    quality = OPEN_WEIGHT * openness + FLAT_WEIGHT * evenness + TOP_WEIGHT * normals[:, 2]
     sites: list[Site] = []
-    for i in np.argsort(-quality, kind="stable")[:80]:
-        if any(np.linalg.norm(points[i] - site.point_mm) < 1.5 * diameter_mm for site in sites):
+    for i in np.argsort(-quality, kind="stable")[:MOST_RINGS]:
+        apart = [float(np.linalg.norm(points[i] - site.point_mm)) for site in sites]
+        if min(apart, default=np.inf) < SITES_APART * diameter_mm:
             continue
         ring = circle_on(mesh, points[i], int(faces[i]), diameter_mm)
         if ring is not None and not surface.is_lid(ring.faces, diameter_mm).any():

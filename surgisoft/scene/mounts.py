@@ -40,6 +40,38 @@ ROUNDS, TRIES = 3, 60
 """Rounds of local search, and mounts per round, if no candidate is sufficient."""
 NEAR_RAD, NEAR_MM = np.radians(12.0), 6.0
 """Spread of the local search in its first round: about the lesion (rad), along the beam (mm)."""
+
+
+@dataclass(frozen=True)
+class ScoreWeights:
+    """Weights in the score of a mount: covering the ring decides, the others rank what covers it.
+
+    The weights were chosen by hand.
+    """
+
+    covered: float = 100.0
+    """Fraction of the ring that the laser can cut, or that the endoscope sees without contact."""
+    clearance: float = 1.0
+    """Smallest clearance as a share of COMFORT_MM, from -1 to 1."""
+    above: float = 0.7
+    """Vertical component of the unit vector from the lesion to the base."""
+    incidence_per_rad: float = 1.0
+    """Cost of the beam's mean angle to the surface's normal."""
+    spare: float = 0.5
+    """Median distance of the commands from their limits, as a share of their range."""
+    standoff: float = 2.0
+    """Cost of the largest deviation from the middle of the allowed standoff, as a share of it."""
+    axis_error_per_rad: float = 2.0
+    """Cost of the angle between the camera's axis and the lesion's centre."""
+    distance: float = 0.3
+    """Cost of the deviation from the middle of the camera's range, as a share of it."""
+    slant_per_rad: float = 0.5
+    """Cost of the angle between the camera's axis and the lesion's normal."""
+    ports: float = 3.0
+    """Distance between the shafts of a pair as a share of PORTS_MM, at most 1."""
+
+
+WEIGHTS = ScoreWeights()
 COMFORT_MM = 10.0
 """Clearance beyond this does not improve the score (mm)."""
 
@@ -216,12 +248,12 @@ def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limit
     spare = np.min(np.abs(cut.commands[:, None] - arm.reach.bounds) / arm.reach.span, axis=(1, 2))
     base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
     score = (
-        100.0 * good.mean()
-        + min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
-        - cut.incidence_rad.mean()
-        + 0.7 * base[2]
-        + 0.5 * np.median(spare)
-        - 2.0
+        WEIGHTS.covered * good.mean()
+        + WEIGHTS.clearance * min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
+        - WEIGHTS.incidence_per_rad * cut.incidence_rad.mean()
+        + WEIGHTS.above * base[2]
+        + WEIGHTS.spare * np.median(spare)
+        - WEIGHTS.standoff
         * np.abs(cut.standoff_mm - 0.5 * sum(laser.standoff_mm)).max()
         / (laser.standoff_mm[1] - laser.standoff_mm[0])
     )
@@ -257,7 +289,9 @@ def endoscope_sites(
 
 def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
     """Whether the endoscope sees sufficient of the ring without touching anything."""
-    return bool(site.visible.mean() >= limits.view_fraction and site.score > 50.0)
+    # without clearance the coverage does not count, and the score stays far below
+    clear = site.score > 0.5 * WEIGHTS.covered
+    return bool(site.visible.mean() >= limits.view_fraction and clear)
 
 
 def _evaluate_endoscope(
@@ -273,12 +307,12 @@ def _evaluate_endoscope(
     base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
     middle = 0.5 * (camera.range_mm[0] + camera.range_mm[1])
     score = (
-        100.0 * visible.mean() * (least >= needed)
-        + min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
-        - 2.0 * look.axis_error_rad
-        - 0.3 * abs(look.distance_mm - middle) / middle
-        + 0.7 * base[2]
-        - 0.5 * frames.angle_between(-look.direction, ring.normal)
+        WEIGHTS.covered * visible.mean() * (least >= needed)
+        + WEIGHTS.clearance * min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
+        - WEIGHTS.axis_error_per_rad * look.axis_error_rad
+        - WEIGHTS.distance * abs(look.distance_mm - middle) / middle
+        + WEIGHTS.above * base[2]
+        - WEIGHTS.slant_per_rad * frames.angle_between(-look.direction, ring.normal)
     )
     return EndoscopeSite(arm, look, visible, least, float(score))
 
@@ -386,8 +420,9 @@ def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
             steps = [np.linalg.norm(np.diff(a, axis=0), axis=-1).max() for a in (work, way)]
             if apart < max(limits.clearance_mm, 0.5 * max(steps)):
                 continue
-            score = laser.score + look.score + min(apart, COMFORT_MM) / COMFORT_MM
-            score += 3.0 * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
+            score = laser.score + look.score
+            score += WEIGHTS.clearance * min(apart, COMFORT_MM) / COMFORT_MM
+            score += WEIGHTS.ports * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
             pairs.append(Pair(laser, look, float(look.visible.mean()), score))
     pairs.sort(key=lambda pair: -pair.score)
     seen_pairs = []

@@ -288,7 +288,7 @@ def endoscope_sites(
 
 
 def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
-    """Whether the endoscope sees sufficient of the ring without touching anything."""
+    """Whether the endoscope sees enough of the ring and keeps its clearance."""
     # without clearance the coverage does not count, and the score stays far below
     clear = site.score > 0.5 * WEIGHTS.covered
     return bool(site.visible.mean() >= limits.view_fraction and clear)

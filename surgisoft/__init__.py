@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from surgisoft.agents.session import evaluate, train
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
+    from surgisoft.diagnosis.design.next_experiment import next_experiment
     from surgisoft.diagnosis.diagnose import diagnose
     from surgisoft.diagnosis.improve import improve
-    from surgisoft.diagnosis.next_experiment.propose import next_experiment
     from surgisoft.measurement.fitting import fit
     from surgisoft.measurement.recordings import (
         load_recording,
@@ -63,7 +63,7 @@ _PLACES = {
     "load_recording": "measurement.recordings",
     "load_recordings": "measurement.recordings",
     "make": "tasks.make",
-    "next_experiment": "diagnosis.next_experiment.propose",
+    "next_experiment": "diagnosis.design.next_experiment",
     "open_replay": "replay.show",
     "open_scene": "scene.folder",
     "parallel_env": "tasks.parallel",

@@ -47,6 +47,52 @@ MAY_IMPORT = {
 GROUND = {"__version__"} | {path.stem for path in PACKAGE.glob("*.py")}
 """Modules that every part may use; they import no part."""
 
+FLOORS = {
+    "diagnosis": (
+        ("body_frame", "criteria", "history_features", "statistics", "weight"),
+        ("residuals",),
+        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("cross_validation",),
+        ("black_box", "candidates"),
+        ("estimation",),
+        ("selection",),
+        ("decision",),
+        ("design",),
+        ("diagnose",),
+        ("compare", "amend"),
+        ("improve",),
+        ("pages",),
+    ),
+    "scene": (
+        ("frames",),
+        ("mesh", "capsules", "camera"),
+        ("meshio", "bvh", "rays", "plate"),
+        ("field", "distance", "torch_queries", "inside", "render"),
+        ("batched", "collision"),
+        ("reach", "spec"),
+        ("lesion", "repair", "dose_patch"),
+        ("folder", "mounted_arm", "ablation"),
+        ("mounts", "check"),
+        ("author",),
+    ),
+    "replay": (
+        ("colours", "shapes", "surfaces"),
+        ("plots",),
+        ("recording",),
+        ("arms", "endoscope"),
+        ("episode_view", "scene_view", "reach_map"),
+        ("comparison", "viewer"),
+        ("show",),
+    ),
+    "report": (("parts", "style"), ("charts", "page")),
+}
+"""Floors of a part, from the ground up: its modules and folders import from floors below only."""
+
+ROOMS = {
+    "diagnosis/design": ("schedules", "isolability", "next_experiment"),
+}
+"""Modules of a folder in order: each imports from those before it only."""
+
 ONLY_IN = {
     "rerun": "replay",
     "pettingzoo": "tasks/parallel",
@@ -91,6 +137,51 @@ def test_imports_run_one_way(path):
         library = name.split(".")[0]
         if library in ONLY_IN:
             assert relative.startswith(ONLY_IN[library]), f"{relative} imports {library}"
+
+
+def _floor_breaks(folder: Path, floors: tuple[tuple[str, ...], ...]) -> list[str]:
+    """Imports that do not run down the floors of a folder, and modules that stand on none."""
+    prefix = "surgisoft." + ".".join(folder.relative_to(PACKAGE).parts)
+    level = {name: number for number, floor in enumerate(floors) for name in floor}
+    broken = []
+    for path in sorted(folder.rglob("*.py")):
+        own = path.relative_to(folder).parts[0].removesuffix(".py")
+        if own == "__init__":
+            continue
+        if own not in level:
+            broken.append(f"{path.relative_to(PACKAGE)} stands on no floor")
+            continue
+        for name in sorted(_imports(path)):
+            other = name.removeprefix(f"{prefix}.").split(".")[0]
+            inside = name.startswith(f"{prefix}.") and other in level and other != own
+            if inside and level[other] >= level[own]:
+                broken.append(f"{path.relative_to(PACKAGE)} imports {name}")
+    return broken
+
+
+@pytest.mark.parametrize("part", FLOORS)
+def test_imports_inside_a_part_run_down(part):
+    assert _floor_breaks(PACKAGE / part, FLOORS[part]) == []
+
+
+@pytest.mark.parametrize("folder", ROOMS)
+def test_imports_inside_a_folder_run_down(folder):
+    floors = tuple((name,) for name in ROOMS[folder])
+    assert _floor_breaks(PACKAGE / folder, floors) == []
+
+
+def test_an_import_that_runs_up_is_found(tmp_path, monkeypatch):
+    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
+    (tmp_path / "part").mkdir()
+    (tmp_path / "part/low.py").write_text("from surgisoft.part.high import x\n")
+    (tmp_path / "part/high.py").write_text("from surgisoft.part import beside\n")
+    (tmp_path / "part/beside.py").write_text("import numpy\n")
+    broken = _floor_breaks(tmp_path / "part", (("low",), ("high", "beside")))
+    assert broken == [
+        "part/high.py imports surgisoft.part.beside",
+        "part/low.py imports surgisoft.part.high",
+        "part/low.py imports surgisoft.part.high.x",
+    ]
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.name)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from benchmarks.diagnosis.experiment import Settled
 from benchmarks.diagnosis.study import Outcome
-from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS
+from surgisoft.diagnosis.design.schedules import AS_IT_STANDS
 
 SHOWS = 1.1
 """Least factor by which a hidden effect raises the error of the locked quarter to be judged by."""
@@ -46,7 +46,7 @@ def judged_amendments(some: list[Outcome]) -> list[Outcome]:
         o
         for o in some
         if o.amended is not None
-        and o.effect_mm >= o.surrogate_mm
+        and o.effect_mm >= o.discrepancy_mm
         and o.amended.before >= SHOWS * o.amended.oracle
     ]
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.diagnosis.robots import Recorded
-from surgisoft.diagnosis.amend import EVERY_ROW, amend
+from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.model import ArmModel
 
@@ -41,14 +41,14 @@ def amended(model: ArmModel, recorded: Recorded, effects: tuple[str, ...]) -> Am
     before = after = locked_error(model, recorded.recording)
     if effects:
         found = amend(model, [recorded.recording], list(effects))
-        fall = found.locked
+        fall = found.held_out
         before, after = fall.before, fall.after if found.claimed else fall.before
     plain = recorded.plain
-    oracle = retune(model, pose(model, [plain], part="open")).model
+    oracle = retune(model, problem_of(model, [plain], part="training")).model
     return Amended(effects, before, after, locked_error(oracle, plain))
 
 
 def locked_error(model: ArmModel, recording: Recording) -> float:
     """RMS distance of a key point on the locked quarter of a recording, mm."""
-    problem = pose(model, [recording], EVERY_ROW, part="locked")
+    problem = problem_of(model, [recording], EVERY_ROW, part="held_out")
     return float(np.sqrt(np.nanmean(np.square(problem.residual).sum(2))))

@@ -63,7 +63,7 @@ class Case:
     """Seed of the specimen."""
     hidden: tuple[tuple[str, float], ...]
     """Hidden effects and strengths."""
-    surrogate_mm: float
+    discrepancy_mm: float
     """Validated error that the surrogate is bent to, mm; 0: as it was fitted."""
     noise: str
     """`white`, `loud` or `correlated`."""
@@ -106,7 +106,7 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
             Case(
                 robot=int(rng.choice(robots)),
                 hidden=hidden,
-                surrogate_mm=float(rng.choice([0.0, 0.0, 0.25])),
+                discrepancy_mm=float(rng.choice([0.0, 0.0, 0.25])),
                 noise=str(rng.choice(["white", "white", "loud", "correlated"])),
                 excitation=str(rng.choice(["poor", "medium", "rich", "rich"])),
                 take=1000 * seed + take,

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 
 from benchmarks.diagnosis.cases import Case
 from benchmarks.diagnosis.robots import record_experiment
-from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
-from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
-from surgisoft.diagnosis.next_experiment.propose import recommend
-from surgisoft.diagnosis.next_experiment.reading import effect_left
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.design.next_experiment import recommend
+from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS
+from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose, effect_left
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
@@ -43,11 +42,11 @@ def settle(
     known: KnownError,
     recording: Recording,
     rivals: tuple[str, ...],
-    settings: tuple[str, ...] = tuple(SETTINGS),
+    settings: tuple[str, ...] = tuple(SETUPS),
 ) -> Settled:
     """Record the recommended experiment on the same robot, and diagnose again."""
-    advice = recommend(pose(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
-    new = record_experiment(case, SETTINGS[advice.setting], advice.protocol)
+    advice = recommend(problem_of(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
+    new = record_experiment(case, SETUPS[advice.setting], advice.protocol)
     some = [new] if advice.by_hand else [recording, new]
     said = diagnose(model, some, reference=known, without=advice.removes)
     left = effect_left(advice, said)

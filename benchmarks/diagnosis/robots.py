@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, Case
-from surgisoft.diagnosis.next_experiment.catalogue import Setting
+from surgisoft.diagnosis.design.schedules import Setup
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording
@@ -113,7 +113,7 @@ EXPERIMENT_TAKE = 500_000
 """Added to a case's take: the noise of a later recording is another."""
 
 
-def record_experiment(case: Case, setting: Setting, protocol: Protocol) -> Recording:
+def record_experiment(case: Case, setting: Setup, protocol: Protocol) -> Recording:
     """A schedule played on a case's robot after a change of the bench.
 
     Where that takes something away, the hidden effect that it takes away is switched off.

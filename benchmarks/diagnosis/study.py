@@ -38,7 +38,7 @@ class Outcome:
     confidence: float
     effect_mm: float
     """RMS change of the key points by what is hidden, mm."""
-    surrogate_mm: float
+    discrepancy_mm: float
     """Validated error of the surrogate, mm."""
     seconds: float
     """Processor time of the diagnosis, s."""
@@ -63,8 +63,8 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     begin = time.process_time()
     torch.set_num_threads(1)
     model = base_model(case.robot, folder, case.undertrained)
-    if case.surrogate_mm > model.validation.rmse_mm:
-        model = bent(model, case.robot, case.surrogate_mm, case.take)
+    if case.discrepancy_mm > model.validation.rmse_mm:
+        model = bent(model, case.robot, case.discrepancy_mm, case.take)
     known = KnownError.of(model, [validation_of(case.robot)])
     recorded = record(case)
     ready = time.process_time()
@@ -83,7 +83,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
         ranking=tuple(row.effect for row in found.ranking),
         confidence=found.ranking[0].confidence if found.ranking else 0.0,
         effect_mm=recorded.effect_mm,
-        surrogate_mm=model.validation.rmse_mm,
+        discrepancy_mm=model.validation.rmse_mm,
         seconds=seconds,
         statistics=found.statistics,
         settled=settled,

@@ -57,12 +57,12 @@ def statement_right(outcome: Outcome) -> bool:
 
 def _goals(outcomes: list[Outcome]) -> str:
     some = single(outcomes)
-    at_least = [o for o in some if o.effect_mm >= o.surrogate_mm]
-    twice = [o for o in some if o.effect_mm >= 2 * o.surrogate_mm]
+    at_least = [o for o in some if o.effect_mm >= o.discrepancy_mm]
+    twice = [o for o in some if o.effect_mm >= 2 * o.discrepancy_mm]
     rich = [o for o in at_least if o.case.excitation == "rich"]
     clean = [o for o in outcomes if not o.case.hidden and not o.case.undertrained]
     unknown = [o for o in outcomes if "unknown" in o.case.truth]
-    seen = [o for o in unknown if o.effect_mm >= o.surrogate_mm]
+    seen = [o for o in unknown if o.effect_mm >= o.discrepancy_mm]
     known = [o for o in outcomes if "unknown" not in o.case.truth and not o.case.undertrained]
     under = [o for o in outcomes if o.case.undertrained]
     pairs = [o for o in outcomes if len(o.case.hidden) == 2]

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from surgisoft.diagnosis.amend import EVERY_ROW
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 
@@ -27,7 +26,7 @@ def by_rate(models: dict[str, Path], recording: Recording) -> list[dict]:
     rate = np.abs(_slope(recording.measured, recording.t_s, width)).max(1)
     velocity = _slope(recording.key_points_mm, recording.t_s, width)
     first, *_ = models.values()
-    problem = pose(load_model(first), [recording], EVERY_ROW, part="all")
+    problem = problem_of(load_model(first), [recording], EVERY_ROW, part="all")
     rows = problem.index.numpy()
     left = {key: problem.with_model(load_model(folder)).residual for key, folder in models.items()}
     answer = []

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.cache import Cache
-from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS
+from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
 from surgisoft.progress import Progress
@@ -86,7 +86,7 @@ class Bench:
         about["commands"] = protocol.commands.tolist()
         file = Path(f"{self.kept.place(f'recordings/{protocol.name}', about)}.parquet")
         if not file.is_file():
-            change = SETTINGS[setting]
+            change = SETUPS[setting]
             rig = VirtualRig(
                 self.specimen,
                 gravity=tuple(-x for x in MOUNT) if change.flipped else MOUNT,

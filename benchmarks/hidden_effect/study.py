@@ -17,12 +17,12 @@ from benchmarks.cache import Cache, model_digest
 from benchmarks.hidden_effect.policies import PLAY, TRAIN, PolicyEvaluation
 from benchmarks.hidden_effect.rates import by_rate
 from benchmarks.hidden_effect.rigs import Bench
-from surgisoft.diagnosis.amend import EVERY_ROW, amend, fall_of
+from surgisoft.diagnosis.amend import amend, fall_of
+from surgisoft.diagnosis.design.next_experiment import recommend
+from surgisoft.diagnosis.design.schedules import on_the_rig
 from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose
 from surgisoft.diagnosis.improve import next_effects
-from surgisoft.diagnosis.next_experiment.catalogue import ON_THE_RIG
-from surgisoft.diagnosis.next_experiment.propose import recommend
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.residuals import EVERY_ROW, problem_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -215,7 +215,7 @@ class Study:
             plan = None
             if found[0].verdict.kind == "ambiguous":
                 rivals = found[0].verdict.effects[:MOST_RIVALS]
-                asked = recommend(pose(model, [seen]), rivals, settings=ON_THE_RIG)
+                asked = recommend(problem_of(model, [seen]), rivals, settings=on_the_rig())
                 more = bench.record(asked.protocol, FURTHER_TAKE, asked.setting)
                 found.append(diagnose(model, [seen, more]))
                 plan = asked.to_json()
@@ -237,7 +237,7 @@ class Study:
 
         def make() -> dict:
             result = amend(load_model(before), [seen], effects)
-            if result.locked.claimed:
+            if result.held_out.claimed:
                 save_model(result.model, folder, result.to_json(), force=True)
             return result.to_json()
 
@@ -269,7 +269,7 @@ class Study:
 
         def make() -> dict:
             test = bench.mixed(JUDGING_TAKE)
-            first = pose(load_model(models["before"]), [test], EVERY_ROW, part="all")
+            first = problem_of(load_model(models["before"]), [test], EVERY_ROW, part="all")
             falls = {
                 key: fall_of(first, first.with_model(load_model(models[key])))
                 for key in ("after", "oracle")
@@ -306,7 +306,9 @@ class Study:
         def make() -> dict:
             result = amend(load_model(before), [seen], effects)
             save_model(result.model, folder, result.to_json(), force=True)
-            first = pose(load_model(before), [bench.mixed(JUDGING_TAKE)], EVERY_ROW, part="all")
+            first = problem_of(
+                load_model(before), [bench.mixed(JUDGING_TAKE)], EVERY_ROW, part="all"
+            )
             return result.to_json() | {
                 "mixed_mm": fall_of(first, first.with_model(result.model)).after
             }

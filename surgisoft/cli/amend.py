@@ -81,7 +81,7 @@ def amend(
         write_json(json_file, result.to_json())
         written.append(json_file)
     if report:
-        from surgisoft.diagnosis.pages.amend import amend_page
+        from surgisoft.diagnosis.pages.amendment import amend_page
         from surgisoft.report import write_page
 
         title = f"{model.name} with {' + '.join(result.effects)}"

@@ -86,7 +86,7 @@ def _show(result) -> None:
         print(f"  {what}{rivals}: error on the training part {done.error_open_mm:.4f} mm")
     if result.steps:
         show_parameters(result.parameters)
-        fall = result.locked
+        fall = result.held_out
         width = max(len(name) for name, _ in result.steps) + 2
         print(f"{'before':{width}s} {fall.before:8.4f} mm on the held-out part")
         for name, error in result.steps:
@@ -96,14 +96,13 @@ def _show(result) -> None:
 
 def _write_report(result, folder: Path, name: str) -> list[Path]:
     """Write the page and the waterfall chart."""
-    from surgisoft.diagnosis.pages.improve import improve_page
-    from surgisoft.diagnosis.pages.waterfall import write_waterfall
+    from surgisoft.diagnosis.pages.amendment import improve_page, write_waterfall
     from surgisoft.report import write_page
 
     added = " + ".join(step for step, _ in result.steps) or "no more effects"
     page = improve_page(result, f"{name} with {added}", result.model.summary())
     written = [write_page(page, folder / "report.html")]
     if result.steps:
-        fall, path = result.locked, folder / "waterfall.png"
+        fall, path = result.held_out, folder / "waterfall.png"
         written.append(write_waterfall(fall.before, result.steps, fall.floor, path))
     return written

@@ -56,13 +56,13 @@ def next_experiment(
     check_model(model)
     measured = read_recordings(recordings) if recordings else []
 
-    from surgisoft.diagnosis.next_experiment.catalogue import AS_IT_STANDS, SETTINGS, schedule_text
-    from surgisoft.diagnosis.next_experiment.propose import next_experiment as find_experiment
+    from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
+    from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
     from surgisoft.surrogate.checkpoint import load_model
 
     arm = load_model(model)
     competing = [name for item in between or [] for name in item.split(",") if name] or None
-    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETTINGS)
+    settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
     answer = find_experiment(arm, measured, competing, minutes, settings)
     warn_all(answer.notes)
     write_atomically(output, schedule_text(answer.protocol))
@@ -72,7 +72,7 @@ def next_experiment(
 
 
 def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> None:
-    from surgisoft.diagnosis.isolability.matrix import SURE
+    from surgisoft.diagnosis.design.isolability import SURE
 
     print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
     print(f"why: {answer.why}")

@@ -1,8 +1,9 @@
-"""`amend`: put a named effect into a model and say what it is worth on data that took no part.
+"""`amend`: put a named effect into a model and evaluate it on held-out data.
 
-Fitted is on the open three quarters of the recordings; the locked quarter is looked at once, for
-the error before and after. A fall is claimed only where its interval, from a bootstrap of blocks
-of time, leaves out zero and where it is worth having.
+The parameters are fitted to the training rows, three quarters of each recording. The held-out
+quarter is evaluated once, for the error before and after. A fall of the error is claimed only where
+its 95 % interval, from a bootstrap of blocks of time, is above zero and where the fall is large
+enough to matter.
 """
 
 import time
@@ -15,17 +16,14 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.problem import Problem, pose
+from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
 LEAST_FALL = 0.05
 """Least fall of the error that is claimed, as a share of what stands above the noise floor."""
-DRAWS = 2000
-"""Draws of the bootstrap."""
-EVERY_ROW = 10**9
-"""More rows than any recording has: the final check leaves none out."""
 
 Progress = Callable[[str], None]
 """Called with what is being done."""
@@ -33,12 +31,12 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Fall:
-    """The error of two models on the same rows, which took no part in their fits."""
+    """The error of two models on the same rows, which were not used in their fits."""
 
     before: float
     """RMS distance of a key point by the old model, mm."""
     after: float
-    """The same by the new model, mm."""
+    """RMS distance of a key point by the new model, mm."""
     floor: float
     """RMS measurement noise, mm."""
     fall: float
@@ -46,13 +44,13 @@ class Fall:
     ci95: tuple[float, float]
     """95 % interval of the fall by blocks of time, mm."""
     rows: int
-    """Rows that judged."""
+    """Held-out rows."""
     blocks: int
     """Blocks of time that they make."""
 
     @property
     def claimed(self) -> bool:
-        """Whether the fall is beyond chance and worth having."""
+        """Whether the fall is significant and large enough to matter."""
         room = max(self.before - self.floor, 0.1 * self.before)
         return self.ci95[0] > 0 and self.fall >= LEAST_FALL * room
 
@@ -61,12 +59,12 @@ class Fall:
         """The fall in words."""
         low, high = self.ci95
         numbers = (
-            f"{self.before:.3f} to {self.after:.3f} mm on data that took no part "
+            f"{self.before:.3f} to {self.after:.3f} mm on held-out data "
             f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
         )
         if self.claimed:
             return f"error {numbers}"
-        why = "is too little" if low > 0 else "is not beyond chance"
+        why = "is too small" if low > 0 else "is not significant"
         return f"no fall of the error is claimed: {numbers} {why}"
 
 
@@ -79,7 +77,7 @@ class Track:
     before_mm: np.ndarray
     """(S,) RMS distance over the key points by the old model, mm; NaN where not measured."""
     after_mm: np.ndarray
-    """(S,) the same by the new one."""
+    """(S,) RMS distance over the key points by the new model, mm."""
     start: np.ndarray
     """(S,) bool: first row of a run."""
 
@@ -96,16 +94,16 @@ class Amendment:
     """Those that the model had before: their parameters were fitted anew."""
     parameters: tuple[Parameter, ...]
     """The fitted parameters in physical units."""
-    locked: Fall
-    """The error on the locked quarter."""
+    held_out: Fall
+    """The error on the held-out rows."""
     alone: Fall
-    """The same by the effects alone, the network left as it was."""
-    opened: Fall
-    """The error on the open part, to which the parameters were fitted."""
+    """The error on the held-out rows with the effects alone, the network left as it was."""
+    training: Fall
+    """The error on the training rows, to which the parameters were fitted."""
     retuned: bool
     """Whether the network's last layer was re-tuned too."""
     tracks: tuple[Track, Track]
-    """The error along the open and along the locked part."""
+    """The error along the training and along the held-out rows."""
     seconds: float
     """Time that it took, s."""
     notes: tuple[str, ...] = ()
@@ -114,27 +112,27 @@ class Amendment:
     @property
     def claimed(self) -> bool:
         """Whether a fall of the error is claimed for the effects, and for the new model."""
-        return self.alone.claimed and self.locked.claimed
+        return self.alone.claimed and self.held_out.claimed
 
     @property
     def sentence(self) -> str:
         """The outcome in words."""
-        said = f"{' + '.join(self.effects)}: {self.alone.sentence}"
+        text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
         if not self.retuned:
-            return said
-        return f"{said}; {self.locked.after:.3f} mm with the network's last layer re-tuned behind"
+            return text
+        return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned behind"
 
     def to_json(self) -> dict:
         """Plain values, as `amend --json` writes them and as the new model's folder keeps them."""
-        locked, opened = self.locked, self.opened
+        held_out, training = self.held_out, self.training
         return {
             "effects": list(self.effects),
             "refitted": list(self.refitted),
             "claimed": self.claimed,
             "sentence": self.sentence,
-            "error_mm": asdict(locked) | {"ci95": list(locked.ci95)},
+            "error_mm": asdict(held_out) | {"ci95": list(held_out.ci95)},
             "error_effects_alone_mm": asdict(self.alone) | {"ci95": list(self.alone.ci95)},
-            "error_open_mm": asdict(opened) | {"ci95": list(opened.ci95)},
+            "error_open_mm": asdict(training) | {"ci95": list(training.ci95)},
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
             "notes": list(self.notes),
@@ -163,7 +161,8 @@ def amend(
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
-    problem = pose(model, recordings, part="open")
+    table = residual_table(model, recordings)
+    problem = table.training()
     tell(f"fitting {' + '.join(names)}")
     fitted = fit_effects(problem, names)
     better, retuned = fitted.model, False
@@ -171,22 +170,22 @@ def amend(
         tell("re-tuning the network")
         tried = retune(better, problem)
         better, retuned = tried.model, tried.kept
-    tell("judging on the locked part")
-    locked = pose(model, recordings, EVERY_ROW, part="locked")
-    alone = fall_of(locked, locked.with_model(fitted.model))
-    if retuned and not (alone.claimed and fall_of(locked, locked.with_model(better)).claimed):
+    tell("evaluating on the held-out part")
+    held_out = table.final_check()
+    alone = fall_of(held_out, held_out.with_model(fitted.model))
+    if retuned and not (alone.claimed and fall_of(held_out, held_out.with_model(better)).claimed):
         better, retuned = fitted.model, False
     # The residuals of the fit say nothing of a network that was re-tuned since.
     better.training_residuals = None if retuned else model.training_residuals
-    pairs = [(part, part.with_model(better)) for part in (problem, locked)]
+    pairs = [(part, part.with_model(better)) for part in (problem, held_out)]
     return Amendment(
         model=better,
         effects=tuple(dict.fromkeys(names)),
         refitted=fitted.refitted,
         parameters=fitted.parameters,
-        locked=fall_of(*pairs[1]),
+        held_out=fall_of(*pairs[1]),
         alone=alone,
-        opened=fall_of(*pairs[0]),
+        training=fall_of(*pairs[0]),
         retuned=retuned,
         tracks=(track_of(*pairs[0]), track_of(*pairs[1])),
         seconds=time.perf_counter() - begin,
@@ -194,28 +193,31 @@ def amend(
     )
 
 
-def fall_of(before: Problem, after: Problem, seed: int = 0) -> Fall:
+def fall_of(before: Problem, after: Problem) -> Fall:
     """The fall of the error between two models on the same rows, with its interval."""
-    count = np.bincount(before.block, weights=np.isfinite(before.residual).all(2).sum(1))
+    seen = np.isfinite(before.residual).all(2).sum(1)
     sums = [
-        np.bincount(before.block, weights=np.nansum(np.square(problem.residual), axis=(1, 2)))
+        block_sums(np.nansum(np.square(problem.residual), axis=(1, 2)), before.block)
         for problem in (before, after)
     ]
-    rng = np.random.default_rng(seed)
-    blocks = len(count)
-    drawn = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=DRAWS)
-    levels = [np.sqrt(drawn @ each / np.maximum(drawn @ count, 1)) for each in sums]
-    low, high = np.quantile(levels[0] - levels[1], [0.025, 0.975])
+    count = block_sums(seen.astype(float), before.block)
+    low, high = block_interval(_fall, (*sums, count))
     rmse = [float(np.sqrt(each.sum() / count.sum())) for each in sums]
     return Fall(
         before=rmse[0],
         after=rmse[1],
-        floor=float(np.sqrt(np.mean(before.noise_mm**2))),
+        floor=before.floor_mm,
         fall=rmse[0] - rmse[1],
         ci95=(float(low), float(high)),
         rows=len(before.index),
-        blocks=blocks,
+        blocks=len(count),
     )
+
+
+def _fall(before: np.ndarray, after: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """(...) fall of the RMS error from sums of squares and counts (...)."""
+    count = np.maximum(count, 1)
+    return np.sqrt(before / count) - np.sqrt(after / count)
 
 
 def track_of(before: Problem, after: Problem) -> Track:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.chain import Taps, context_of
 from surgisoft.surrogate.effects import (
     ArmFacts,

@@ -1,27 +1,43 @@
-"""`compare`: a model's error on recordings, where it sits, and how much of it is explainable."""
+"""`compare`: a model's error on recordings, what it depends on, and the best achievable error."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.body_frame import COMPONENTS
-from surgisoft.diagnosis.bootstrap import block_bootstrap, block_sums, blocks
-from surgisoft.diagnosis.comparing.axes import AxisShare, shares
-from surgisoft.diagnosis.comparing.bands import Band, bands
-from surgisoft.diagnosis.comparing.ceiling import Ceiling, ceiling
-from surgisoft.diagnosis.comparing.floor import Floor, hold_floor, noise_floor, repeat_floor
-from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.residuals import Residuals, residuals
+from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.error_axes import AxisShare, Band, bands, shares
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    open_inputs,
+    with_known_residuals,
+)
+from surgisoft.diagnosis.residuals import (
+    LEAST_BLOCKS,
+    Floor,
+    Part,
+    Problem,
+    ResidualTable,
+    repeat_floor,
+    residual_table,
+)
+from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
+from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.known_error import KnownError
+from surgisoft.workers import torch_threads
 
 WORST = 5
 """Worst moments that are listed."""
 LEAST_ROWS = 60
-"""Fewest measured rows from which shares and a ceiling are computed."""
+"""Fewest measured rows from which shares and a best achievable error are computed."""
 AT_FLOOR = 1.05
-"""An error below this multiple of the floor stands at it."""
+"""An error below this multiple of the noise floor is at the floor."""
 LEAST_SHARE = 0.05
 """Smallest share of the error for which an axis is named."""
 
@@ -42,36 +58,38 @@ class Moment:
 
 @dataclass(frozen=True)
 class TimeShift:
-    """By how much time the arm trails the model, as far as that fits the residual."""
+    """Delay of the arm behind the model that fits the residual best."""
 
     seconds: float
-    """Positive: the arm trails, s."""
+    """Delay, s; positive: the arm is behind the model."""
     ci95_s: tuple[float, float]
     """95 % interval from a bootstrap of blocks, s."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A model against recordings."""
+    """A model's error on recordings."""
 
     rmse_mm: float
     """RMS distance between predicted and measured key points, over all of them, mm."""
     rmse_ci95_mm: tuple[float, float]
     """95 % interval of it from a bootstrap of blocks of time, mm."""
     tip_rmse_mm: float
-    """The same of the last key point, mm."""
+    """RMS error of the last key point, mm."""
     per_key_point_mm: tuple[float, ...]
-    """The same of each key point, base to tip, mm."""
+    """RMS error of each key point, base to tip, mm."""
     components_mm: dict[str, float]
     """RMS of the residual along the body, in its bending plane and out of it, mm."""
     mse_mm2: float
     """Mean squared error of a coordinate (the paper's MSE), mm^2."""
     floor: Floor
-    """The noise floor: what the lab states, else from holds, else from repeats."""
+    """The noise floor: what the lab states, else from holds, else from second differences."""
     floors: tuple[Floor, ...]
     """Every estimate of the floor that the recordings allow."""
-    ceiling: Ceiling | None
-    """What a black box with memory reaches; None for too few rows."""
+    ceiling: BestAchievable | None
+    """Best achievable error, the same that `diagnose` reports on the same rows: the least that the
+    model, a black box, any effect or the selected effects leave on held-out blocks. None for too
+    few rows."""
     axes: tuple[AxisShare, ...]
     """How much of the error each axis explains, most first."""
     time_shift: TimeShift | None
@@ -89,10 +107,10 @@ class Comparison:
 
     @property
     def explainable(self) -> float | None:
-        """Share (0..1) of the squared error above the floor that the black box removes.
+        """Share (0..1) of the squared error above the floor that is achievable.
 
-        None without a ceiling, or where the error stands at the floor. An unknown floor counts as
-        zero.
+        None without a best achievable error, or where the error is at the floor. An unknown floor
+        counts as zero.
         """
         noise = self.floor.rmse_mm or 0.0
         excess = self.rmse_mm**2 - noise**2
@@ -109,14 +127,14 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """The verdict: error, floor, ceiling, and what the error depends on."""
+        """Error, noise floor, best achievable error, and what the error depends on."""
         noise = self.floor.rmse_mm
         text = f"error {_mm(self.rmse_mm)}, floor {'unknown' if noise is None else _mm(noise)}"
         if noise is not None and self.rmse_mm <= AT_FLOOR * noise:
-            return f"{text}: the error stands at the floor"
+            return f"{text}: the error is at the floor"
         if self.ceiling is None:
             return f"{text}; too few rows to say what it depends on"
-        text += f", a black box would reach {_mm(self.ceiling.rmse_mm)}"
+        text += f", best achievable {_mm(self.ceiling.rmse_mm)}"
         what = "error" if noise is None else "excess"
         text += f": {100 * (self.explainable or 0):.0f} % of the {what} is explainable"
         return f"{text}; {self._depends()}"
@@ -131,7 +149,7 @@ class Comparison:
         return text
 
     def to_json(self) -> dict:
-        """Plain values: `rmse_mm`, `per_key_point_mm`, `tip_rmse_mm`, `floor_mm` and the rest."""
+        """Plain values: `rmse_mm`, `per_key_point_mm`, `tip_rmse_mm`, `floor_mm` and the table."""
         values = asdict(self)
         floor, top = values.pop("floor"), values.pop("ceiling")
         values |= {
@@ -146,19 +164,30 @@ class Comparison:
         return json_safe(values)
 
 
-def compare(model: Model, recordings: Recordings) -> tuple[Comparison, Residuals]:
-    """Evaluate a model on recordings; both may be given by their paths."""
+@torch_threads(1)
+def compare(
+    model: Model,
+    recordings: Recordings,
+    part: Part = "all",
+    reference: Sequence[Recording] | KnownError | None = None,
+) -> tuple[Comparison, ResidualTable]:
+    """Evaluate a model on recordings; both may be given by their paths.
+
+    part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
+    for `diagnose`, which takes it into account for the best achievable error.
+    """
     model, recordings, notes = open_inputs(model, recordings)
-    rest = residuals(model, recordings)
-    square = np.square(rest.error_mm)
-    seen = ~np.isnan(square).all(axis=1)
-    if not np.isfinite(rest.predicted_mm).all():
-        raise InputError("the model predicts values that are not finite; fit it again")
-    if not seen.any():
+    whole = residual_table(model, recordings)
+    if np.isnan(whole.only(part).measured_mm).all():
         raise InputError("no key point was measured in any row of the recordings")
-    block = blocks(rest.run)
+    problem = with_known_residuals(whole.view(part, least_blocks=1), reference)
+    table, block = problem.table, problem.block_of_row
+    square = np.square(table.error_mm)
+    seen = ~np.isnan(square).all(axis=1)
+    looked_at = np.full(len(seen), True)
+    if part != "all":
+        looked_at = table.held_out == (part == "held_out")
     per_point = np.sqrt([_nanmean(square[:, k]) for k in range(square.shape[1])])
-    floors = _floors(rest, recordings)
     enough = int(seen.sum()) >= LEAST_ROWS
     return (
         Comparison(
@@ -167,65 +196,72 @@ def compare(model: Model, recordings: Recordings) -> tuple[Comparison, Residuals
             tip_rmse_mm=float(per_point[-1]),
             per_key_point_mm=tuple(float(value) for value in per_point),
             components_mm={
-                name: float(np.sqrt(_nanmean(np.square(rest.body_mm[..., k]))))
+                name: float(np.sqrt(_nanmean(np.square(table.body_mm[..., k]))))
                 for k, name in enumerate(COMPONENTS)
             },
             mse_mm2=_nanmean(square) / 3,
-            floor=floors[0] if floors else Floor(None, "unknown"),
-            floors=floors,
-            ceiling=black_box(rest) if enough else None,
-            axes=tuple(shares(rest)) if enough else (),
-            time_shift=time_shift(rest, block),
+            floor=table.floor,
+            floors=_floors(problem),
+            ceiling=achievable(problem) if enough else None,
+            axes=tuple(shares(problem)) if enough else (),
+            time_shift=time_shift(table, block),
             samples=int(seen.sum()),
-            missing=int((~seen).sum()),
-            bands=tuple(bands(rest)),
-            worst=tuple(_worst(rest, recordings)),
+            missing=int((looked_at & ~seen).sum()),
+            bands=tuple(bands(problem)),
+            worst=tuple(_worst(table)),
             notes=notes,
         ),
-        rest,
+        table,
     )
 
 
-def black_box(rest: Residuals, seed: int = 0) -> Ceiling:
-    """The explainable ceiling of residuals."""
-    gates = np.concatenate([rest.scaled_pressure, rest.direction], axis=1)
-    return ceiling(rest.residual_mm, rest.features, gates, blocks(rest.run), seed)
+def achievable(problem: Problem) -> BestAchievable | None:
+    """The best achievable error of a problem; None where it has too few blocks of time.
+
+    Effects count where the model's network is static: a recurrent one takes none.
+    """
+    if len(problem.motion) < LEAST_BLOCKS:
+        return None
+    selected = None
+    if not problem.model.remembers:
+        selected = select(problem, candidates(problem), lambda text: None)
+    return best_achievable(problem, black_box(problem), selected)
 
 
-def time_shift(rest: Residuals, block: np.ndarray) -> TimeShift | None:
+def time_shift(table: ResidualTable, block: np.ndarray) -> TimeShift | None:
     """The delay tau for which residual = -tau x predicted velocity fits best, in least squares.
 
     The velocity is the predicted motion over the row before and the row after.
     """
-    inside = np.zeros(len(rest.run), bool)
-    inside[1:-1] = (rest.run[2:] == rest.run[:-2]) & rest.timed[1:-1]
+    inside = np.zeros(len(table.run), bool)
+    inside[1:-1] = (table.run[2:] == table.run[:-2]) & table.timed[1:-1] & (block[1:-1] >= 0)
     rows = np.flatnonzero(inside)
     if not len(rows):
         return None
-    motion = np.zeros_like(rest.predicted_mm)
-    dt = rest.t_s[rows + 1] - rest.t_s[rows - 1]
-    step = rest.predicted_mm[rows + 1] - rest.predicted_mm[rows - 1]
+    motion = np.zeros_like(table.predicted_mm)
+    dt = table.t_s[rows + 1] - table.t_s[rows - 1]
+    step = table.predicted_mm[rows + 1] - table.predicted_mm[rows - 1]
     motion[rows] = step / dt[:, None, None]
-    motion = np.where(np.isnan(rest.residual_mm), 0.0, motion)
-    won = block_sums(-(np.nan_to_num(rest.residual_mm) * motion).sum((1, 2)), block)
+    motion = np.where(np.isnan(table.residual_mm), 0.0, motion)
+    won = block_sums(-(np.nan_to_num(table.residual_mm) * motion).sum((1, 2)), block)
     power = block_sums(np.square(motion).sum((1, 2)), block)
     if power.sum() <= 0:
         return None
-    low, high = block_bootstrap(lambda a, b: a / b, (won, power))
+    low, high = block_interval(lambda a, b: a / b, (won, power))
     return TimeShift(float(won.sum() / power.sum()), (float(low), float(high)))
 
 
-def _floors(rest: Residuals, recordings: list[Recording]) -> tuple[Floor, ...]:
-    known = [noise_floor(recordings)]
-    if known[0].source == "sidecar":
-        known.append(hold_floor(recordings))
-    known.append(repeat_floor(rest))
-    return tuple(floor for floor in known if floor.rmse_mm is not None)
+def _floors(problem: Problem) -> tuple[Floor, ...]:
+    """Every estimate of the noise floor, the one in force first."""
+    table = problem.table
+    found = {floor.source: floor for floor in (table.floor, table.holds)}
+    found["repeats"] = repeat_floor(table, problem.block_of_row)
+    return tuple(floor for floor in found.values() if floor.rmse_mm is not None)
 
 
 def _root_interval(square: np.ndarray, block: np.ndarray) -> tuple[float, float]:
     sums = (block_sums(square, block), block_sums(~np.isnan(square), block))
-    low, high = block_bootstrap(lambda a, b: np.sqrt(a.sum(1) / b.sum(1)), sums)
+    low, high = block_interval(lambda a, b: np.sqrt(a.sum(1) / b.sum(1)), sums)
     return float(low), float(high)
 
 
@@ -238,9 +274,9 @@ def _nanmean(values: np.ndarray) -> float:
     return float(seen.mean()) if len(seen) else float("nan")
 
 
-def _worst(rest: Residuals, recordings: list[Recording]):
+def _worst(table: ResidualTable):
     """The rows with the largest errors, no two within 2 % of a run's rows of each other."""
-    error = np.nan_to_num(rest.error_mm, nan=-1.0)
+    error = np.nan_to_num(table.error_mm, nan=-1.0)
     peak = error.max(axis=1)
     apart = max(1, len(peak) // 50)
     free = peak >= 0
@@ -249,8 +285,8 @@ def _worst(rest: Residuals, recordings: list[Recording]):
             return
         row = int(np.argmax(np.where(free, peak, -1.0)))
         yield Moment(
-            recordings[rest.recording[row]].name,
-            float(rest.t_s[row]),
+            table.names[table.recording[row]],
+            float(table.t_s[row]),
             float(peak[row]),
             int(error[row].argmax()),
         )

@@ -1,23 +1,22 @@
-"""`improve`: diagnose, amend, and again, until the gates are silent.
+"""`improve`: diagnose and amend in turn, until no further effect is significant.
 
 Every round adds an effect that a diagnosis names and fits it together with those that were added
 before. The network's last layer is re-tuned at the end, where held-out motion rewards it. All of
-this sees the open part of the recordings only; the locked part is looked at once, at the end, for
-the errors of all rounds, and decides nothing but whether the whole fall is claimed.
+this sees the training rows of the recordings only; the held-out rows are evaluated once, at the
+end, for the errors of all rounds, and decide nothing but whether the whole fall is claimed.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from surgisoft.diagnosis.amend import EVERY_ROW, Fall, Track, fall_of, track_of
-from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.amend import Fall, Track, fall_of, track_of
+from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
 from surgisoft.diagnosis.estimation.effects import fit_effects, fit_plausible
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.verdict import Diagnosis
+from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.known_error import KnownError
@@ -27,15 +26,15 @@ from surgisoft.workers import torch_threads
 MOST_EFFECTS = 6
 """Most effects that are added."""
 PLAUSIBLE_GAIN = 0.95
-"""Least share of the fall of the squared error that an effect must keep at its plausible end: what
-goes beyond it is then not worth having."""
+"""Least share of the fall of the squared error that an effect must keep at the end of its plausible
+range; it is then held there."""
 NETWORK = "network"
 """Name of the step that re-tunes the network."""
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round: what a diagnosis said and what was done."""
+    """One round: the result of a diagnosis and what was done."""
 
     verdict: str
     """Kind of the verdict."""
@@ -48,9 +47,9 @@ class Round:
     confidence: float | None
     """Confidence in it, 0 to 1."""
     error_open_mm: float
-    """RMS distance on the open part after the round, mm."""
+    """RMS distance on the training rows after the round, mm."""
     error_mm: float | None = None
-    """The same on the locked part, known when all rounds have ended, mm."""
+    """RMS distance on the held-out rows after the round, known when all rounds have ended, mm."""
 
 
 Progress = Callable[[Round], None]
@@ -59,18 +58,18 @@ Progress = Callable[[Round], None]
 
 @dataclass(frozen=True, eq=False)
 class Improvement:
-    """A model with every effect that the gates let through."""
+    """A model with every effect that was significant and lowered the error."""
 
     model: ArmModel
     """The new model; the given one where nothing was added."""
     rounds: tuple[Round, ...]
-    """What happened; the last one says why the loop ended."""
+    """What happened; the last one gives the reason why the loop ended."""
     parameters: tuple[Parameter, ...]
     """The fitted parameters of all added effects."""
-    locked: Fall
-    """The error on the locked part, before the first and after the last round."""
+    held_out: Fall
+    """The error on the held-out rows, before the first and after the last round."""
     tracks: tuple[Track, Track]
-    """The error along the open and along the locked part."""
+    """The error along the training and along the held-out rows."""
     seconds: float
     """Time that it took, s."""
     notes: tuple[str, ...] = ()
@@ -78,20 +77,20 @@ class Improvement:
 
     @property
     def steps(self) -> list[tuple[str, float]]:
-        """(what was added, error on the locked part after it in mm), in order."""
+        """(what was added, error on the held-out rows after it in mm), in order."""
         return [(r.step, r.error_mm) for r in self.rounds if r.step is not None]
 
     @property
     def claimed(self) -> bool:
         """Whether something was added and the error fell by it."""
-        return bool(self.steps) and self.locked.claimed
+        return bool(self.steps) and self.held_out.claimed
 
     @property
     def sentence(self) -> str:
         """The outcome in words."""
         if not self.steps:
             return f"nothing was added: {self.rounds[-1].sentence}"
-        return f"{' + '.join(name for name, _ in self.steps)}: {self.locked.sentence}"
+        return f"{' + '.join(name for name, _ in self.steps)}: {self.held_out.sentence}"
 
     def to_json(self) -> dict:
         """Plain values, as `improve --json` writes them."""
@@ -100,7 +99,7 @@ class Improvement:
             "claimed": self.claimed,
             "effects": [name for name, _ in self.steps if name != NETWORK],
             "network_retuned": any(name == NETWORK for name, _ in self.steps),
-            "error_mm": asdict(self.locked) | {"ci95": list(self.locked.ci95)},
+            "error_mm": asdict(self.held_out) | {"ci95": list(self.held_out.ci95)},
             "rounds": [asdict(r) | {"rivals": list(r.rivals)} for r in self.rounds],
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "notes": list(self.notes),
@@ -116,7 +115,7 @@ def improve(
     progress: Progress | None = None,
     reference: Sequence[Recording] | KnownError | None = None,
 ) -> Improvement:
-    """Add effect after effect to a model, until no gate lets another through.
+    """Add effects to a model one by one, until no further one is significant.
 
     Model and recordings may be given by their paths.
 
@@ -128,7 +127,8 @@ def improve(
     tell = progress or (lambda done: None)
     model, recordings, notes = open_inputs(model, recordings)
     reference = model.training_residuals if reference is None else reference
-    problem = pose(model, recordings, part="open")
+    table = residual_table(model, recordings)
+    problem = table.training()
     models, rounds, parameters = [model], [], ()
     added: list[str] = []
 
@@ -140,7 +140,7 @@ def improve(
     while going and len(added) < most_effects:
         found = diagnose(models[-1], recordings, reference=reference)
         error = fall_of(problem, problem.with_model(models[-1])).after
-        said = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
+        current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]
         going = False
         for name in names[: most_effects - len(added)]:
@@ -155,16 +155,16 @@ def improve(
                     if _as_good(less, fall) and not _doubt(name, less, tried.parameters):
                         fitted, fall, doubt = tried, less, ""
             if doubt:
-                said = replace(said, sentence=f"{said.sentence}; but {doubt}")
+                current = replace(current, sentence=f"{current.sentence}; but {doubt}")
                 continue
             going = True
             added.append(name)
             models.append(fitted.model)
             parameters = fitted.parameters
-            note(_step(said, name, found, fall.after))
-            said = replace(said, sentence=f"named beside {name} by the same diagnosis")
+            note(_step(current, name, found, fall.after))
+            current = replace(current, sentence=f"named beside {name} by the same diagnosis")
         if not going:
-            note(said)
+            note(current)
     tuned = retune(models[-1], problem)
     if added and tuned.kept:
         after = fall_of(problem, problem.with_model(tuned.model)).after
@@ -175,18 +175,18 @@ def improve(
         kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         models[-1].training_residuals = model.training_residuals if kept else None
-    locked = pose(model, recordings, EVERY_ROW, part="locked")
-    judged = iter([locked.with_model(one) for one in models[1:]])
-    final, shown = locked, []
+    held_out = table.final_check()
+    after_round = iter([held_out.with_model(one) for one in models[1:]])
+    final, shown = held_out, []
     for done in rounds:
-        final = next(judged) if done.step is not None else final
-        shown.append(replace(done, error_mm=fall_of(locked, final).after))
+        final = next(after_round) if done.step is not None else final
+        shown.append(replace(done, error_mm=fall_of(held_out, final).after))
     return Improvement(
         model=models[-1],
         rounds=tuple(shown),
         parameters=parameters,
-        locked=fall_of(locked, final),
-        tracks=(track_of(problem, problem.with_model(models[-1])), track_of(locked, final)),
+        held_out=fall_of(held_out, final),
+        tracks=(track_of(problem, problem.with_model(models[-1])), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
         notes=notes,
     )
@@ -221,8 +221,10 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     )
 
 
-def _step(said: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
+def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:
     """The round in which the named effect was added."""
     rivals = found.verdict.effects[1:] if found.verdict.kind == "ambiguous" else ()
     sure = next((row.confidence for row in found.ranking if row.effect == name), None)
-    return replace(said, step=name, rivals=tuple(rivals), confidence=sure, error_open_mm=error_mm)
+    return replace(
+        current, step=name, rivals=tuple(rivals), confidence=sure, error_open_mm=error_mm
+    )

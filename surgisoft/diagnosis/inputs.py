@@ -1,9 +1,9 @@
-"""The model and the recordings that every function of a diagnosis begins with."""
+"""The inputs of every command: a model, recordings, and the identification problem they pose."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from surgisoft.diagnosis.problem import Problem, pose, with_reference
+from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import check_fits, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
@@ -38,11 +38,17 @@ def identification_problem(
     recordings: list[Recording],
     reference: Sequence[Recording] | KnownError | None = None,
 ) -> Problem:
-    """The residual table of a model on the training part of recordings.
+    """The training rows of a model's residual table, with its residuals from before.
 
     reference: recordings from before something changed. Without them the residuals that the model
     keeps of its own fit (`ArmModel.training_residuals`), where it has them.
     """
-    problem = pose(model, recordings, part="open")
-    known = model.training_residuals if reference is None else reference
-    return problem if known is None else with_reference(problem, known)
+    return with_known_residuals(residual_table(model, recordings).training(), reference)
+
+
+def with_known_residuals(
+    problem: Problem, reference: Sequence[Recording] | KnownError | None = None
+) -> Problem:
+    """The problem with the residuals of a reference, or those that its model keeps of its fit."""
+    known = problem.model.training_residuals if reference is None else reference
+    return problem if known is None else problem.with_reference(known)

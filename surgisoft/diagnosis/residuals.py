@@ -1,97 +1,273 @@
-"""Where a model is wrong: measured beside predicted key points, row by row, and what goes along."""
+"""The residual table: what was measured and what a model predicts, row by row.
 
-from dataclasses import dataclass
+`compare`, `diagnose`, `amend`, `improve` and `next_experiment` all start from one `ResidualTable`,
+which is built once from a model and recordings. `ResidualTable.view` hands out the training rows,
+the held-out rows or all rows as a `Problem`: the rows of that part alone, thinned, in blocks of
+time and folds, with the measurement noise and the model discrepancy that errors are judged
+against. Key points of rows outside the part are NaN in a view, so that nothing that works on a
+view can see them.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
 
 from surgisoft.diagnosis.body_frame import bending, frames
-from surgisoft.diagnosis.comparing.features import Memory, features, memory_of
+from surgisoft.diagnosis.history_features import Memory, features, memory_of
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_of, check_fits, history_of
+from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.scan import linear_scan
+
+ROWS = 2000
+"""Rows that amplitudes are fitted to; memories follow every row."""
+EVERY_ROW = 10**9
+"""More rows than any recording has: no row is left out."""
+HELD_OUT_SHARE = 0.25
+"""Share of each recording, its last runs or its last rows, that is held out for a final check."""
+RUNS_TO_HOLD_OUT = 4
+"""Fewest runs of a recording of which whole runs are held out."""
+BLOCK_S = 5.0
+"""Length of a block of time, the unit of every test, s."""
+BLOCK_ROWS = 8
+"""Fewest of the fitted rows in a block."""
+LEAST_BLOCKS = 10
+"""Fewest blocks of an identification."""
+FOLDS = 5
+"""Folds that are left out in turn."""
+TOGETHER = 2
+"""Neighbouring motions that are left out together."""
+LEAST_DISCREPANCY = 0.3
+"""Least share of a validated error that counts as model discrepancy, however much of it the noise
+may have been."""
+LEAST_NOISE_MM = 1e-4
+"""Least noise that is reckoned with, mm: below it divisions by the noise lose their digits."""
+
+Part = Literal["training", "held_out", "all"]
+
+
+# Noise ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A noise floor: the error that no model of the arm can go below, and where it comes from."""
+
+    rmse_mm: float | None
+    """RMS distance of a measured key point from its true place, mm; None if it is not known."""
+    source: str
+    """`sidecar`, `holds`, `second differences`, `repeats` or `unknown`."""
+
+
+UNKNOWN = Floor(None, "unknown")
+
+
+def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
+    """(n,) RMS noise of each key point's distance, mm, and where it is known from.
+
+    What the lab states in the sidecar; else the scatter in holds; else second differences in time,
+    which a smooth motion leaves small (their variance is six times that of white noise). A
+    distance has three coordinates' noise.
+    """
+    count = recordings[0].key_points_mm.shape[1]
+    for floor in (_stated_floor(recordings), hold_floor(recordings)):
+        if floor.rmse_mm is not None:
+            return np.full(count, max(floor.rmse_mm, LEAST_NOISE_MM)), floor.source
+    second = [np.diff(r.key_points_mm[run], 2, axis=0) for r in recordings for run in r.runs]
+    second = np.concatenate([part for part in second if len(part)] or [np.zeros((1, count, 3))])
+    seen = np.isfinite(second).any(axis=0)
+    spread = np.zeros(second.shape[1:])
+    if seen.any():
+        median = np.nanmedian(np.abs(second[:, seen]), axis=0)
+        spread[seen] = 1.4826 * median / np.sqrt(6.0)
+    noise = np.sqrt((spread**2).sum(1))
+    source = "second differences" if noise.any() else "unknown"
+    return np.maximum(noise, LEAST_NOISE_MM), source
+
+
+def _stated_floor(recordings: list[Recording]) -> Floor:
+    stated = stated_noise(recordings)
+    return UNKNOWN if stated is None else Floor(float(np.sqrt(3.0) * stated), "sidecar")
+
+
+def hold_floor(recordings: list[Recording]) -> Floor:
+    """The noise floor from the scatter in holds alone."""
+    found = hold_noise(recordings)
+    return UNKNOWN if found is None else Floor(float(np.sqrt(3.0) * found), "holds")
+
+
+# Every row -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
-    """Residuals of a model on recordings, all runs one after another: S rows."""
+class ResidualTable:
+    """Residuals of a model on every row of some recordings, all runs one after another: N rows."""
 
-    spec: ArmSpec
-    """The model's arm."""
-    rest_mm: np.ndarray
-    """(n, 3) key points at rest, base frame, mm."""
+    model: ArmModel
+    """The model in question."""
+    history: History
+    """All runs, every row."""
+    names: tuple[str, ...]
+    """Names of the recordings."""
     predicted_mm: np.ndarray
-    """(S, n, 3) predicted key points, base frame, mm."""
+    """(N, n, 3) predicted key points, base frame, mm."""
     measured_mm: np.ndarray
-    """(S, n, 3) measured key points, base frame, mm; NaN where missing."""
+    """(N, n, 3) measured key points, base frame, mm; NaN where missing, or not to be seen."""
     pressure: np.ndarray
-    """(S, m) actuation, in the arm's unit."""
-    memory: Memory
-    """What the actuation's past amounts to in each row."""
+    """(N, m) actuation, in the arm's unit."""
+    direction: np.ndarray
+    """(N, m) direction of change of the chambers' pressure, as the network sees it: -1, 0, 1."""
     t_s: np.ndarray
-    """(S,) time of the row in its recording, s."""
+    """(N,) time of the row in its recording, s."""
     run: np.ndarray
-    """(S,) number of the run, counted over all recordings."""
+    """(N,) number of the run, counted over all recordings."""
     recording: np.ndarray
-    """(S,) number of the recording."""
+    """(N,) number of the recording."""
     timed: np.ndarray
-    """(S,) whether the row is one of a continuous recording, not a settled point."""
+    """(N,) whether the row is one of a continuous recording, not a steady-state sample."""
     gravity: np.ndarray
-    """(S, 3) unit vector along the weight, base frame; NaN where not known."""
+    """(N, 3) unit vector along the weight, base frame; NaN where not known."""
     temp_C: np.ndarray
-    """(S,) temperature, degrees Celsius; NaN where not known."""
+    """(N,) temperature, degrees Celsius; NaN where not known."""
     payload_g: np.ndarray
-    """(S,) mass attached, g; NaN where not known."""
+    """(N,) mass attached, g; NaN where not known."""
+    held_out: np.ndarray
+    """(N,) whether the row is held out for a final check."""
+    noise_mm: np.ndarray
+    """(n,) RMS noise of each key point's distance, mm."""
+    floor: Floor
+    """The noise over all key points, and where it is known from."""
+    holds: Floor
+    """The noise floor from the scatter in holds alone."""
 
     @property
-    def direction(self) -> np.ndarray:
-        """(S, m) direction of change: -1, 0, 1."""
-        return self.memory.direction
+    def spec(self) -> ArmSpec:
+        """The model's arm."""
+        return self.model.spec
+
+    @property
+    def rest_mm(self) -> np.ndarray:
+        """(n, 3) key points at rest, base frame, mm."""
+        return self.model.rest_mm.double().cpu().numpy()
 
     @property
     def residual_mm(self) -> np.ndarray:
-        """(S, n, 3) measured less predicted, base frame, mm; NaN where missing."""
+        """(N, n, 3) measured less predicted, base frame, mm; NaN where missing."""
         return self.measured_mm - self.predicted_mm
 
     @property
     def error_mm(self) -> np.ndarray:
-        """(S, n) distance between predicted and measured key points, mm; NaN where missing."""
+        """(N, n) distance between predicted and measured key points, mm; NaN where missing."""
         return np.linalg.norm(self.residual_mm, axis=-1)
 
     @cached_property
     def body_mm(self) -> np.ndarray:
-        """(S, n, 3) residual along the predicted body, in its bending plane and out of it, mm."""
+        """(N, n, 3) residual along the predicted body, in its bending plane and out of it, mm."""
         frame = frames(self.predicted_mm, self.rest_mm)
         return (frame @ self.residual_mm[..., None])[..., 0]
 
     @property
     def bending_mm(self) -> np.ndarray:
-        """(S, 2) lateral displacement of the predicted tip from rest, base frame x and y, mm."""
+        """(N, 2) lateral displacement of the predicted tip from rest, base frame x and y, mm."""
         return bending(self.predicted_mm, self.rest_mm)
 
     @property
     def scaled_pressure(self) -> np.ndarray:
-        """(S, m) actuation scaled to [-1, 1] over the model's range."""
-        span = np.array(self.spec.span)
-        return 2 * (self.pressure - np.array(self.spec.low)) / span - 1
+        """(N, m) actuation scaled to [-1, 1] over the model's range."""
+        low, high = np.array(self.spec.low), np.array(self.spec.high)
+        pressure = self.history.rows(self.history.pressure).double().numpy()
+        return (pressure - (low + high) / 2) / half_range(self.spec)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """What the actuation's past amounts to in each row."""
+        return memory_of(self.history, self.spec)
 
     @cached_property
     def features(self) -> np.ndarray:
-        """(S, F) all that the residual may depend on, of order 1 (see `features.features`)."""
-        context = np.stack([self.temp_C, self.payload_g], axis=1)
-        context = np.concatenate([context, self.gravity], axis=1)
-        scale = np.array([10.0, 50.0, 1.0, 1.0, 1.0])  # C, g and unit vectors to order 1
-        return features(self.memory, self.spec, context / scale, bool(self.timed.any()))
+        """(N, F) all that the residual may depend on, of order 1 (`history_features.features`)."""
+        context = None if np.isnan(self.temp_C).all() else self.temp_C[:, None] / 10.0
+        timed = bool((self.history.dt_s > 0).any())
+        return features(self.memory, self.spec, context, timed)
+
+    def only(self, part: Part) -> "ResidualTable":
+        """The table of one part: key points of all other rows are NaN, in the history too."""
+        if part == "all":
+            return self
+        shown = self.held_out if part == "held_out" else ~self.held_out
+        points = self.history.key_points.clone()
+        points[self.history.valid] = points[self.history.valid].masked_fill(
+            ~torch.from_numpy(shown)[:, None, None], torch.nan
+        )
+        return replace(
+            self,
+            measured_mm=np.where(shown[:, None, None], self.measured_mm, np.nan),
+            history=replace(self.history, key_points=points),
+        )
+
+    def view(
+        self, part: Part = "all", rows: int = ROWS, least_blocks: int = LEAST_BLOCKS
+    ) -> "Problem":
+        """The identification problem of one part, thinned to about `rows` rows.
+
+        Memories follow the actuation of every row. least_blocks: fewest blocks of time.
+        """
+        table = self.only(part)
+        seen = np.isfinite(table.measured_mm).all(2).any(1)
+        step = max(1, round(seen.sum() / rows))
+        block = blocks(table.history, seen, step, least_blocks)
+        index = np.flatnonzero(seen)[::step]
+        names = np.unique(block[index])
+        places = np.where(np.isin(block, names), np.searchsorted(names, block), -1)
+        motion = motions(table.history, half_range(self.spec), places)
+        return Problem(
+            model=self.model,
+            table=table,
+            index=torch.from_numpy(index),
+            pressure=table.scaled_pressure[index],
+            direction=table.direction[index],
+            measured=table.measured_mm[index],
+            predicted=table.predicted_mm[index],
+            time_s=table.t_s[index],
+            block=places[index],
+            block_of_row=places,
+            motion=motion,
+            fold=folds(motion),
+            discrepancy_mm=model_discrepancy(self.model, self.noise_mm),
+        )
+
+    def training(self, rows: int = ROWS) -> "Problem":
+        """The training rows: all that a diagnosis or a fit may see."""
+        return self.view("training", rows)
+
+    def final_check(self) -> "Problem":
+        """Every held-out row, for the one look at the end of `amend` and `improve`."""
+        return self.view("held_out", EVERY_ROW)
 
 
-def residuals(model: ArmModel, recordings: list[Recording]) -> Residuals:
+def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTable:
     """Evaluate a model on whole recordings."""
     check_fits(model.spec, recordings)
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
-        predicted = history.rows(model.predict(history)).double().numpy()
+        predicted = history.rows(model.predict(history))
+        direction = history.rows(model.trace(history).direction)
+    if not torch.isfinite(predicted).all():
+        raise InputError("the model predicts values that are not finite; fit it again")
+    noise, source = noise_of(recordings)
+    known = source != "unknown"
 
     def each(pick, width: tuple[int, ...] = ()) -> np.ndarray:
         """One value a row, from what each recording has; NaN where it has nothing."""
@@ -102,14 +278,15 @@ def residuals(model: ArmModel, recordings: list[Recording]) -> Residuals:
             parts.append(np.broadcast_to(value, (recording.samples, *width)))
         return np.concatenate(parts)
 
-    return Residuals(
-        spec=model.spec,
-        rest_mm=model.rest_mm.double().cpu().numpy(),
-        predicted_mm=predicted,
+    return ResidualTable(
+        model=model,
+        history=history,
+        names=tuple(recording.name for recording in recordings),
+        predicted_mm=predicted.double().numpy(),
         # Not through float32: the measured values are compared as they were recorded.
         measured_mm=np.concatenate([recording.key_points_mm for recording in recordings]),
         pressure=np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings]),
-        memory=memory_of(history, model.spec),
+        direction=direction.double().numpy(),
         t_s=history.rows(history.t_s).numpy(),
         run=history.run_of_row.numpy(),
         recording=np.concatenate([np.full(r.samples, i) for i, r in enumerate(recordings)]),
@@ -117,4 +294,312 @@ def residuals(model: ArmModel, recordings: list[Recording]) -> Residuals:
         gravity=each(lambda r: r.gravity, (3,)),
         temp_C=each(lambda r: r.temp_C),
         payload_g=each(lambda r: r.payload_g),
+        held_out=held_out_rows(recordings),
+        noise_mm=noise,
+        floor=Floor(float(np.sqrt(np.mean(noise**2))), source) if known else UNKNOWN,
+        holds=hold_floor(recordings),
     )
+
+
+def problem_of(
+    model: ArmModel, recordings: list[Recording], rows: int = ROWS, part: Part = "all"
+) -> "Problem":
+    """The identification problem of a model and one part of some recordings."""
+    return residual_table(model, recordings).view(part, rows)
+
+
+def half_range(spec: ArmSpec) -> np.ndarray:
+    """(m,) half the width of each chamber's range, in the arm's unit; 1 where it has none."""
+    span = np.array(spec.high) - np.array(spec.low)
+    return np.where(span > 0, span / 2, 1.0)
+
+
+def held_out_rows(recordings: list[Recording]) -> np.ndarray:
+    """(N,) bool: the rows of all recordings, one after another, that are held out."""
+    answer = []
+    for recording in recordings:
+        held = np.zeros(recording.samples, bool)
+        runs = recording.runs
+        if len(runs) >= RUNS_TO_HOLD_OUT:
+            for run in runs[-max(1, round(HELD_OUT_SHARE * len(runs))) :]:
+                held[run] = True
+        else:
+            held[round((1 - HELD_OUT_SHARE) * recording.samples) :] = True
+        answer.append(held)
+    return np.concatenate(answer)
+
+
+# The rows of one part ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Residuals of a model from before the change in question, such as those of its training."""
+
+    pressure: np.ndarray
+    """(S, m) actuation scaled to [-1, 1] over the model's range."""
+    direction: np.ndarray
+    """(S, m) directions of change."""
+    residual: np.ndarray
+    """(S, n, 3) measured less predicted, mm; NaN where missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An identification problem: one part of a residual table, thinned to S rows."""
+
+    model: ArmModel
+    """The model in question."""
+    table: ResidualTable
+    """Every row; key points outside the part are NaN."""
+    index: Tensor
+    """(S,) the fitted rows among all rows of the runs one after the other."""
+    pressure: np.ndarray
+    """(S, m) actuation scaled to [-1, 1] over the model's range."""
+    direction: np.ndarray
+    """(S, m) directions of change."""
+    measured: np.ndarray
+    """(S, n, 3) measured key points, mm; NaN where missing."""
+    predicted: np.ndarray
+    """(S, n, 3) what the model predicts, mm."""
+    time_s: np.ndarray
+    """(S,) time in the recording, s."""
+    block: np.ndarray
+    """(S,) block of time of each row, from 0."""
+    block_of_row: np.ndarray
+    """(N,) block of each row of the table; -1 where no key point may be seen."""
+    motion: np.ndarray
+    """(B,) motion of each block, from 0: blocks that repeat a motion share it."""
+    fold: np.ndarray
+    """(B,) fold that each block is left out with; one for all blocks of a motion."""
+    discrepancy_mm: np.ndarray
+    """(n,) model discrepancy: validated RMS error of each key point without its noise, mm."""
+    reference: Reference | None = None
+    """Residuals from before the change in question; None: the discrepancy is known by its size
+    alone."""
+
+    @property
+    def history(self) -> History:
+        """All runs, every row."""
+        return self.table.history
+
+    @property
+    def noise_mm(self) -> np.ndarray:
+        """(n,) RMS noise of each key point's distance, mm."""
+        return self.table.noise_mm
+
+    @property
+    def floor_mm(self) -> float:
+        """RMS noise over all key points, mm."""
+        return float(np.sqrt(np.mean(self.noise_mm**2)))
+
+    @property
+    def residual(self) -> np.ndarray:
+        """(S, n, 3) measured less predicted, mm."""
+        return self.measured - self.predicted
+
+    @property
+    def rmse_mm(self) -> float:
+        """RMS distance between measured and predicted key points, mm."""
+        return float(np.sqrt(np.nanmean(np.square(self.residual).sum(2))))
+
+    def by_motion(self, values: np.ndarray) -> np.ndarray:
+        """(..., M) means of values (..., B) of the blocks over those that share a motion."""
+        sums = np.zeros((int(self.motion.max()) + 1, *values.shape[:-1]))
+        np.add.at(sums, self.motion, np.moveaxis(values, -1, 0))
+        return np.moveaxis(sums, 0, -1) / np.bincount(self.motion)
+
+    def rows(self, tensor: Tensor) -> Tensor:
+        """The fitted rows of a (R, T, ...) tensor."""
+        return self.history.rows(tensor)[self.index]
+
+    def with_model(self, model: ArmModel) -> "Problem":
+        """The same rows under another model of the same arm."""
+        with torch.no_grad():
+            predicted = self.rows(model.predict(self.history)).double().numpy()
+        return replace(self, model=model, predicted=predicted)
+
+    def with_reference(self, given: Sequence[Recording] | KnownError) -> "Problem":
+        """The problem with residuals from before the change in question.
+
+        The model discrepancy has to explain these rows too, by the same function of actuation and
+        direction, so it cannot be mistaken for what has changed since.
+        """
+        spec = self.model.spec
+        if not isinstance(given, KnownError):
+            check_fits(spec, list(given))
+            given = KnownError.of(self.model, [history_of(list(given), spec.actuation)], ROWS)
+        low, half = np.array(spec.low), np.array(spec.span) / 2
+        known = Reference(
+            pressure=(given.actuation.double().numpy() - low) / half - 1.0,
+            direction=given.direction.double().numpy(),
+            residual=given.residual_mm.double().numpy(),
+        )
+        return replace(self, reference=known)
+
+
+def model_discrepancy(model: ArmModel, noise_mm: np.ndarray) -> np.ndarray:
+    """(n,) validated RMS error of each key point, mm, without the noise of its validation.
+
+    noise_mm: (n,) what that noise is taken for where the model does not state it.
+    """
+    spec, stated = model.spec, model.validation
+    validated = np.array(
+        [value or 0.0 for value in stated.per_key_point_mm]
+        or [0.05 * (spec.length_mm or 50.0)] * spec.key_points
+    )
+    own = stated.noise_mm
+    noise = noise_mm if own is None else np.full(len(validated), np.sqrt(3.0) * own)
+    return np.sqrt(np.maximum(validated**2 - noise**2, (LEAST_DISCREPANCY * validated) ** 2))
+
+
+def blocks(
+    history: History, seen: np.ndarray, step: int = 1, least_blocks: int = LEAST_BLOCKS
+) -> np.ndarray:
+    """(N,) block of time of each row; -1 where it is not seen.
+
+    Whole runs where they are many and short; else stretches of runs of about BLOCK_S, at least
+    LEAST_BLOCKS of them in all. A block never crosses the border of a run. step: every how many
+    rows one is fitted.
+    """
+    run = np.where(seen, history.run_of_row.numpy(), -1)
+    time = history.rows(history.t_s).numpy()
+    lengths = {r: float(np.ptp(time[run == r])) for r in np.unique(run[seen])}
+    total = sum(lengths.values())
+    length = min(BLOCK_S, total / (2 * LEAST_BLOCKS)) if total > 0 else 1.0
+    answer, count = np.full(len(run), -1), 0
+    for r, span in lengths.items():
+        rows = np.flatnonzero(run == r)
+        parts = max(1, min(round(span / max(length, 1e-9)), len(rows) // (step * BLOCK_ROWS)))
+        edges = np.linspace(0, len(rows), parts + 1).astype(int)
+        for begin, end in itertools.pairwise(edges):
+            answer[rows[begin:end]] = count
+            count += 1
+    if count < least_blocks:
+        raise InputError(
+            f"the recordings give {count} blocks of time, expected at least {least_blocks} of "
+            f"{BLOCK_ROWS} rows: record more"
+        )
+    return answer
+
+
+def folds(motion: np.ndarray) -> np.ndarray:
+    """(B,) fold of each block: neighbouring motions together, where there are many."""
+    count = int(motion.max()) + 1
+    if count < 2:
+        return np.arange(len(motion)) // TOGETHER % FOLDS
+    return motion // (TOGETHER if count >= TOGETHER * FOLDS else 1) % FOLDS
+
+
+# Motions that repeat -------------------------------------------------------------------------
+
+MOTION_TIMES_S = (0.5, 2.0)
+"""Time constants of the low passes that say how an actuation came about, s."""
+MOTION_ALIKE = 0.1
+"""How far actuation and its past may differ, in half ranges, to count as the same motion."""
+MOTION_SHARE = 0.5
+"""Share of the rows of each of two blocks that must come again in the other, in motion."""
+STILL = 0.02
+"""How far an actuation is ahead of its past, in half ranges, up to which the arm is still."""
+MOTION_ROWS = 6000
+"""Rows among which repeated motions are looked for; more are thinned evenly."""
+
+
+def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """(B,) the motion of each block, counted from 0 in the order in which they first appear.
+
+    A sweep that is repeated shows the model discrepancy again and again, always in the same way.
+    Blocks that repeat a motion are no further evidence: they are left out of a fit together, and
+    in a test they count as one. half: (m,) half ranges of the actuation; block: (N,) block of each
+    row, -1 where it is in none.
+    """
+    rows = np.flatnonzero(block >= 0)
+    rows = rows[:: max(1, -(-len(rows) // MOTION_ROWS))]
+    state, owner = _motion_states(history, half)[rows], block[rows]
+    count = int(block.max()) + 1
+    whole = np.maximum(np.bincount(owner, minlength=count), 1)
+    moving = np.abs(state[:, history.chambers :]).max(1) > STILL
+    state, owner = state[moving], owner[moving]
+    shared = np.zeros((count, count))
+    # A row of one block and those of all blocks within reach of it, each block counted once.
+    near = cKDTree(state).query_ball_point(state, MOTION_ALIKE, p=np.inf)
+    for own, some in zip(owner, near, strict=True):
+        shared[own, np.unique(owner[some])] += 1.0
+    shared /= whole[:, None]
+    alike = np.minimum(shared, shared.T) >= MOTION_SHARE
+    answer, found = np.full(count, -1), 0
+    for first in range(count):
+        if answer[first] < 0:
+            answer[alike[first] & (answer < 0)] = found
+            answer[first] = found
+            found += 1
+    return answer
+
+
+def _motion_states(history: History, half: np.ndarray) -> np.ndarray:
+    """(N, 3 m) the actuation of every row and how far it runs ahead of its low passes."""
+    signal = history.pressure.double() / torch.from_numpy(half)
+    decay = torch.exp(-history.dt_s.double().unsqueeze(-1) / torch.tensor(MOTION_TIMES_S))
+    decay = decay.unsqueeze(2).expand(*signal.shape, len(MOTION_TIMES_S))
+    wide = signal.unsqueeze(-1)
+    start = wide[:, 0].expand(-1, -1, len(MOTION_TIMES_S))
+    past = linear_scan(decay, (1.0 - decay) * wide, start)
+    return history.rows(torch.cat([signal, (wide - past).flatten(2)], -1)).numpy()
+
+
+# Rows that repeat ----------------------------------------------------------------------------
+
+REPEAT_ALIKE = 0.02
+"""How far actuation and its past may differ, as a share of the range, in rows that repeat each
+other."""
+REPEAT_APART_S = 10.0
+"""Least time between two rows that repeat each other, s: noise may be slow."""
+REPEAT_PAIRS = 50
+"""Fewest repeats that give an estimate."""
+REPEAT_PLACES = 5
+"""Fewest blocks of time that repeats must lie in."""
+REPEAT_ROWS = 12_000
+"""Rows among which repeats are looked for; more are thinned evenly."""
+REPEAT_GROUPS = 6
+"""Groups that blocks are dealt to at random; repeats are looked for between groups."""
+
+
+def repeat_floor(table: ResidualTable, block: np.ndarray) -> Floor:
+    """The noise floor from inputs that came twice with the same recent history, far apart in time.
+
+    Two such rows differ by twice the variance of one. Their predictions are alike too, so residuals
+    are compared: the little that the inputs differ drops out. What the past of the inputs does not
+    say (temperature, wear, stick-slip) counts as noise. block: (N,) block of each row, or -1.
+    """
+    half = np.array(table.spec.span)[:, None] / 2
+    memory = table.memory
+    past = [memory.play - memory.pressure[..., None]]
+    if table.timed.any():
+        past.append(memory.low_pass[..., 1:] - memory.pressure[..., None])
+    whole = np.concatenate([memory.pressure[..., None], *past], axis=-1) / half
+    whole = whole.reshape(len(whole), -1)
+    seen = (block >= 0) & ~np.isnan(table.error_mm).all(axis=1)
+    seen[np.arange(len(seen)) % -(-len(seen) // REPEAT_ROWS) != 0] = False
+    dealt = np.random.default_rng(0).permutation(int(block.max(initial=-1)) + 1) % REPEAT_GROUPS
+    group = np.where(seen, dealt[block] if len(dealt) else -1, -1)
+    residual = table.residual_mm
+    halves, places = [], set()
+    for part in range(REPEAT_GROUPS):
+        here, there = np.flatnonzero(group == part), np.flatnonzero(seen & (group != part))
+        if not len(here) or not len(there):
+            continue
+        tree = cKDTree(whole[there])
+        _, nearest = tree.query(whole[here], p=np.inf, distance_upper_bound=2 * REPEAT_ALIKE)
+        found = nearest < len(there)
+        a, b = here[found], there[nearest[found]]
+        apart = np.abs(table.t_s[a] - table.t_s[b]) >= REPEAT_APART_S
+        apart |= table.run[a] != table.run[b]
+        a, b = a[apart], b[apart]
+        halves.append(np.square(residual[a] - residual[b]).sum(-1) / 2)
+        places |= set(block[a].tolist())
+    half_square = np.concatenate([part.ravel() for part in halves]) if halves else np.zeros(0)
+    half_square = half_square[~np.isnan(half_square)]
+    few = len(half_square) < REPEAT_PAIRS * table.spec.key_points
+    if few or len(places) < REPEAT_PLACES:
+        return UNKNOWN
+    return Floor(float(np.sqrt(half_square.mean())), "repeats")

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.effects import hypothesis_of, known_effects
 from surgisoft.surrogate.model import ArmModel
 
 SAME_DEG = 5.0
@@ -15,6 +16,11 @@ SAME_DEG = 5.0
 def angle_deg(a, b) -> float:
     """Angle between two unit vectors (3,), degrees."""
     return float(np.degrees(np.arccos(np.clip(np.dot(a, b), -1.0, 1.0))))
+
+
+def gravity_load() -> str:
+    """Name of the known effect that stands for loads along gravity."""
+    return next(name for name, kind in known_effects().items() if hypothesis_of(kind).own_weight)
 
 
 def under_weight(model: ArmModel, recordings: list[Recording]) -> tuple[ArmModel, list[str]]:
@@ -50,14 +56,15 @@ def under_weight(model: ArmModel, recordings: list[Recording]) -> tuple[ArmModel
             "differently can be taken for another effect; give those of one direction at a time"
         )
         return model, notes
-    if "payload" in model.effects:
+    loads = [name for name, effect in model.effects.items() if hypothesis_of(effect).own_weight]
+    if loads:
         notes.append(
-            "the model's payload pulls along the old direction; amend the model from before it"
+            f"the model's {loads[0]} pulls along the old direction; amend the model from before it"
         )
         return model, notes
     notes.append(
-        "payload stands for the arm's own weight as well there: a load of any direction, which "
-        "holds for this direction of weight alone"
+        f"{gravity_load()} stands for the arm's own weight as well there: a load of any direction, "
+        "which holds for this direction of weight alone"
     )
     return _without_direction(model), notes
 

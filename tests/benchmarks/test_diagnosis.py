@@ -17,11 +17,16 @@ from benchmarks.diagnosis.experiment import Settled
 from benchmarks.diagnosis.robots import bent, record, record_experiment
 from benchmarks.diagnosis.study import Outcome, read_outcomes, run, run_case, to_amend
 from benchmarks.diagnosis.table import calibration_error, markdown
-from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.next_experiment.catalogue import SETTINGS, schedule
-from surgisoft.diagnosis.next_experiment.propose import Pair, Recommendation
-from surgisoft.diagnosis.next_experiment.reading import effect_left, rivals_of
-from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Verdict
+from surgisoft.diagnosis.design.next_experiment import Pair, Recommendation
+from surgisoft.diagnosis.design.schedules import SETUPS, schedule
+from surgisoft.diagnosis.diagnose import (
+    Diagnosis,
+    ErrorLevels,
+    Verdict,
+    diagnose,
+    effect_left,
+    rivals_of,
+)
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.surrogate.checkpoint import DEFAULT_FOLDER, default_arm
 
@@ -42,7 +47,7 @@ def folder(tmp_path_factory):
         (CLEAN, "nothing_missing", ()),
         (replace(CLEAN, hidden=(("softening", 2.0),)), "identified", ("softening",)),
         (
-            replace(CLEAN, hidden=(("gain_mismatch", 1.0),), surrogate_mm=0.25),
+            replace(CLEAN, hidden=(("gain_mismatch", 1.0),), discrepancy_mm=0.25),
             "identified",
             ("gain_mismatch",),
         ),
@@ -58,7 +63,7 @@ def test_robots_of_known_truth(folder, case, kind, effects):
         assert 0.5 < worth.share < 1.2
     assert said.effects == effects
     assert (said.effect_mm > 0.2) == bool(case.hidden)
-    assert said.surrogate_mm >= case.surrogate_mm - 0.02
+    assert said.discrepancy_mm >= case.discrepancy_mm - 0.02
 
 
 def test_a_bent_surrogate_has_the_wanted_error():
@@ -108,10 +113,10 @@ def test_an_experiment_takes_away_what_it_names_and_nothing_else():
     limits = np.array([[-10.0, 50.0]] * 3)
     plan = schedule("x", [("steps", 0)], limits, "kPa")
     still, anew, heavy = (
-        record_experiment(case, SETTINGS[name], plan)
+        record_experiment(case, SETUPS[name], plan)
         for name in ("as_it_stands", "new_frame", "known_mass")
     )
-    clean = record_experiment(replace(case, hidden=()), SETTINGS["as_it_stands"], plan)
+    clean = record_experiment(replace(case, hidden=()), SETUPS["as_it_stands"], plan)
     np.testing.assert_array_equal(anew.key_points_mm, clean.key_points_mm)
     assert np.nanmax(np.abs(still.key_points_mm - anew.key_points_mm)) > 0.5
     assert heavy.payload_g[0] == 2.0
@@ -158,7 +163,7 @@ def test_an_ambiguous_robot_gets_its_experiment_and_the_outcome_is_kept(
     assert asked[:2] == [1, 2]
     assert said.settled.effect == "creep"
     assert said.settled.minutes <= 15.0
-    assert said.settled.setting in SETTINGS
+    assert said.settled.setting in SETUPS
     log = tmp_path / "x.jsonl"
     log.write_text(json.dumps(asdict(said)) + "\n{broken")
     assert read_outcomes(log) == {case: said}

@@ -9,9 +9,9 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.design.next_experiment import next_experiment
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.improve import improve
-from surgisoft.diagnosis.next_experiment.propose import next_experiment
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
@@ -114,7 +114,7 @@ def test_the_next_experiment_asks_what_diagnose_asks(lab):
 def test_the_next_experiment_sees_the_problem_of_the_diagnosis(lab, monkeypatch):
     """The rows, the residuals of the fit and the freed direction of gravity that both look at."""
     from surgisoft.diagnosis import diagnose as diagnosing
-    from surgisoft.diagnosis.next_experiment import propose as proposing
+    from surgisoft.diagnosis.design import next_experiment as proposing
 
     seen = {}
 

@@ -12,7 +12,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import Fall, amend, fall_of
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.problem import locked_rows, pose
+from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
@@ -42,7 +42,7 @@ def hashes(folder) -> dict[str, str]:
 def test_a_fall_by_hand():
     """Twelve blocks whose error is 1 mm before and 0.6 after, but for one that was 0 and is 0.6."""
     arm = bare_arm()
-    problem = pose(arm, [measured_on(arm, runs=1, rows=240)])
+    problem = problem_of(arm, [measured_on(arm, runs=1, rows=240)])
     count = int(problem.block.max()) + 1
     shift = np.zeros_like(problem.predicted)
     shift[..., 0] = np.where(problem.block == 0, 0.0, 1.0)[:, None]
@@ -79,11 +79,11 @@ def test_the_locked_rows_take_no_part():
     """Wild key points in the locked part change its error, and no parameter."""
     recording = measured_on(TRUTHS["gain_mismatch"], rows=200)
     points = recording.key_points_mm.copy()
-    points[locked_rows([recording])] += 5.0
+    points[held_out_rows([recording])] += 5.0
     wild = replace(recording, key_points_mm=points)
     one, other = (amend(bare_arm(), [each], ["gain_mismatch"]) for each in (recording, wild))
     assert one.parameters == other.parameters
-    assert other.locked.after > one.locked.after + 5
+    assert other.held_out.after > one.held_out.after + 5
 
 
 def test_an_amended_model_is_a_model(lab, capsys):
@@ -178,7 +178,7 @@ WRONG = {
 def test_a_bad_input_gets_one_line(lab, says, capsys):
     clean = load_recording(lab / "clean.parquet")
     unseen = clean.key_points_mm.copy()
-    unseen[~locked_rows([clean])] = np.nan
+    unseen[~held_out_rows([clean])] = np.nan
     for name, points in (
         ("other", clean.key_points_mm[:, :3]),
         ("blind", np.full_like(unseen, np.nan)),
@@ -209,8 +209,8 @@ def test_the_error_falls_on_a_rig_whose_creep_has_another_form():
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 2400, seed=3))
     assert isinstance(recording, Recording)
     result = amend(default_arm(), [recording], ["creep"])
-    assert result.locked.claimed
-    assert result.locked.after < 0.6 * result.locked.before
+    assert result.held_out.claimed
+    assert result.held_out.after < 0.6 * result.held_out.before
     assert list(result.model.effects) == ["hysteresis", "creep"]
 
 
@@ -224,10 +224,10 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert both.claimed
     assert both.retuned
     assert not kept.retuned
-    assert both.alone == kept.locked
-    assert both.locked.after < 0.7 * kept.locked.after
-    assert both.locked.after < 1.5 * both.locked.floor
+    assert both.alone == kept.held_out
+    assert both.held_out.after < 0.7 * kept.held_out.after
+    assert both.held_out.after < 1.5 * both.held_out.floor
     without = amend(off, [measured_on(bare_arm())], ["creep"])
     assert not without.claimed
     assert not without.retuned
-    assert without.locked == without.alone
+    assert without.held_out == without.alone

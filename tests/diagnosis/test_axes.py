@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.comparing.axes import AXES, gravity_angle, known, shares
-from surgisoft.diagnosis.residuals import residuals
+from surgisoft.diagnosis.error_axes import AXES, gravity_angle, known, shares
+from surgisoft.diagnosis.residuals import problem_of, residual_table
 from tests.diagnosis.synthetic import (
     POINTS,
     backlash,
@@ -59,7 +59,7 @@ def test_the_axis_of_the_cause_comes_first(name):
     schedule, cause, expected = CAUSES[name]
     pressure = schedule(ROWS, seed=4)
     effect = cause(pressure)
-    found = shares(residuals(still_model(), [recording(effect - effect.mean(), pressure)]))
+    found = shares(problem_of(still_model(), [recording(effect - effect.mean(), pressure)]))
     first = found[0] if "pressure" in expected else next(a for a in found if not a.static)
     assert first.axis in expected
     assert first.ci95[0] > 0.05
@@ -81,7 +81,7 @@ def test_temperature_explains_what_goes_along_with_it():
     pressure = walk(ROWS)
     warm = 24 + 3 * np.sin(np.arange(ROWS) / 170)
     made = recording(0.2 * (warm - 24), pressure, temp_C=warm)
-    first = shares(residuals(still_model(), [made]))[0]
+    first = shares(problem_of(still_model(), [made]))[0]
     assert first.axis == "temperature"
     assert first.share > 0.6
 
@@ -91,15 +91,15 @@ def test_noise_depends_on_nothing():
     result, _ = compare(still_model(), [made])
     assert all(each.share < 0.02 for each in result.axes)
     assert result.main_axes == []
-    assert "stands at the floor" in result.sentence
+    assert "is at the floor" in result.sentence
 
 
 def test_axes_without_values_are_left_out():
     """A still model has no azimuth; settled points no time; nobody measured a temperature."""
     settled = recording(np.zeros(200), walk(200), kind="settled")
-    names = set(known(residuals(still_model(), [settled])))
+    names = set(known(residual_table(still_model(), [settled])))
     assert names == {"pressure", "direction", "since reversal", "elapsed time", "largest so far"}
-    timed = set(known(residuals(still_model(), [recording(np.zeros(200), walk(200))])))
+    timed = set(known(residual_table(still_model(), [recording(np.zeros(200), walk(200))])))
     assert timed == names | {"rate", "lag", "past actuation", "dwell"}
     assert timed < set(AXES)
 
@@ -109,7 +109,7 @@ def test_angle_to_the_weight():
     pressure = walk(20)
     for bend, angle in (((3.0, 0.0), 0.0), ((0.0, 3.0), 90.0), ((-3.0, 1e-9), 180.0)):
         points = POINTS.copy()
-        rest = residuals(
+        rest = residual_table(
             still_model(), [recording(np.zeros(20), pressure, gravity=np.array([0.6, 0.0, 0.8]))]
         )
         points[-1, :2] += bend

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.candidates import candidates, with_effect
-from surgisoft.diagnosis.problem import locked_rows, pose
+from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
@@ -21,7 +21,7 @@ def recording():
 
 @pytest.fixture(scope="module")
 def problem(recording):
-    return pose(default_arm(), [recording], rows=400)
+    return problem_of(default_arm(), [recording], rows=400)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def pressurised(recording):
     rows = slice(top, last.stop)
     names = ("t_s", "measured", "key_points_mm")
     cut = Recording("cut", **{name: getattr(recording, name)[rows] for name in names})
-    return pose(default_arm(), [cut], rows=400)
+    return problem_of(default_arm(), [cut], rows=400)
 
 
 @pytest.mark.parametrize("name", ["creep", "inertia", "rate_dependence", "softening", "payload"])
@@ -92,17 +92,19 @@ def test_beside_more_of_an_effect_there_are_loops_of_other_widths(problem):
     assert [c.more for c in candidates(problem.with_model(fresh), ["creep"])] == [True]
 
 
-def test_open_and_locked_parts_share_no_row(recording, problem):
-    """The last runs are locked away, and both parts together are everything."""
-    locked = locked_rows([recording])
+def test_training_and_held_out_parts_share_no_row(recording, problem):
+    """The last runs are held out, and both parts together are everything."""
+    held_out = held_out_rows([recording])
     last = recording.runs[-1]
-    assert locked[last].all()
-    assert not locked[: last.start].any()
+    assert held_out[last].all()
+    assert not held_out[: last.start].any()
     model = problem.model
-    parts = [pose(model, [recording], rows=10**6, part=part) for part in ("open", "locked")]
+    parts = [
+        problem_of(model, [recording], rows=10**6, part=part) for part in ("training", "held_out")
+    ]
     indices = [set(part.index.tolist()) for part in parts]
     assert not indices[0] & indices[1]
-    everything = pose(model, [recording], rows=10**6)
+    everything = problem_of(model, [recording], rows=10**6)
     assert indices[0] | indices[1] == set(everything.index.tolist())
 
 

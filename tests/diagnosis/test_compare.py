@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.comparing.floor import noise_floor
 from surgisoft.diagnosis.pages.pictures import draw_all
+from surgisoft.diagnosis.residuals import noise_of, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of, outside_range
 from surgisoft.measurement.recordings import Recording
@@ -88,7 +88,9 @@ def test_another_arm_is_refused():
 
 
 def test_floor_is_what_the_lab_states_as_a_distance():
-    floor = noise_floor([recording(np.tile(POINTS, (4, 1, 1)), noise_mm=0.1)])
+    floor = residual_table(
+        still_model(), [recording(np.tile(POINTS, (4, 1, 1)), noise_mm=0.1)]
+    ).floor
     assert floor.source == "sidecar"
     assert floor.rmse_mm == pytest.approx(np.sqrt(3) * 0.1)
 
@@ -99,14 +101,14 @@ def test_floor_from_holds_finds_the_noise_under_a_drift():
     drift = 0.01 * (np.arange(rows) % 100)[:, None, None]
     points = POINTS + drift + rng.normal(0, 0.08, (rows, 3, 3))
     measured = levels + rng.normal(0, 0.01, levels.shape)
-    floor = noise_floor([recording(points, measured, commanded=levels)])
+    floor = residual_table(still_model(), [recording(points, measured, commanded=levels)]).floor
     assert floor.source == "holds"
     assert floor.rmse_mm == pytest.approx(np.sqrt(3) * 0.08, rel=0.1)
 
 
 def test_floor_is_unknown_rather_than_invented():
     points = np.tile(POINTS, (50, 1, 1))
-    assert noise_floor([recording(points)]).rmse_mm is None
+    assert noise_of([recording(points)])[1] == "unknown"
     assert compare(still_model(), [recording(points)])[0].to_json()["floor_mm"] is None
 
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.bootstrap import blocks
 from surgisoft.diagnosis.compare import compare, time_shift
-from surgisoft.diagnosis.comparing.bands import bands
-from surgisoft.diagnosis.residuals import residuals
+from surgisoft.diagnosis.error_axes import bands
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from tests.diagnosis.synthetic import NOISE_MM, POINTS, recording, still_model, walk
@@ -21,7 +20,7 @@ def test_bias_is_measured_less_predicted_in_the_bodys_frame():
     """A straight arm along z: along is z, in plane x and out of plane y by convention."""
     made = recording(np.zeros(400), walk(400))
     made.key_points_mm[:] += [0.3, -0.2, 0.5]
-    found = [band for band in bands(residuals(still_model(), [made])) if band.axis == "p1"]
+    found = [band for band in bands(problem_of(still_model(), [made])) if band.axis == "p1"]
     for band in found:
         assert band.bias_mm == pytest.approx((0.5, 0.3, -0.2), abs=0.03)
         for value, (low, high) in zip(band.bias_mm, band.bias_ci95_mm, strict=True):
@@ -33,7 +32,7 @@ def test_bias_is_measured_less_predicted_in_the_bodys_frame():
 
 
 def test_every_row_falls_into_one_band_of_each_axis():
-    found = bands(residuals(still_model(), [recording(np.zeros(500), walk(500))]))
+    found = bands(problem_of(still_model(), [recording(np.zeros(500), walk(500))]))
     totals = {}
     for band in found:
         totals[band.axis] = totals.get(band.axis, 0) + band.samples
@@ -44,7 +43,7 @@ def test_every_row_falls_into_one_band_of_each_axis():
 
 
 def test_rows_that_share_the_least_dwell_keep_the_rest_apart():
-    dwell = [b for b in bands(residuals(still_model(), [recording(np.zeros(800), walk(800))]))
+    dwell = [b for b in bands(problem_of(still_model(), [recording(np.zeros(800), walk(800))]))
              if b.axis == "dwell"]  # fmt: skip
     assert len(dwell) > 4
     assert dwell[0].low == 0
@@ -52,14 +51,15 @@ def test_rows_that_share_the_least_dwell_keep_the_rest_apart():
 
 def test_a_late_arm_is_told_its_delay():
     """The model follows a circle, the arm the same 0.25 s later."""
-    rest = residuals(still_model(), [recording(np.zeros(1000), walk(1000))])
+    problem = problem_of(still_model(), [recording(np.zeros(1000), walk(1000))])
+    rest = problem.table
 
     def circle(t):
         side = 10 * np.stack([np.cos(t), np.sin(t), 0 * t], axis=1)
         return POINTS + side[:, None]
 
     rest = replace(rest, predicted_mm=circle(rest.t_s), measured_mm=circle(rest.t_s - 0.25).copy())
-    shift = time_shift(rest, blocks(rest.run))
+    shift = time_shift(rest, problem.block_of_row)
     # Least squares on the tangent of a circle: sin(delay).
     assert shift.seconds == pytest.approx(np.sin(0.25), rel=0.01)
     assert shift.ci95_s == pytest.approx((shift.seconds, shift.seconds))

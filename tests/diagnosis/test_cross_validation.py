@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.race.cross_validation import RIDGES, CrossValidation
-from surgisoft.diagnosis.race.discrepancy import kernel
-from surgisoft.diagnosis.race.split import PERSISTENCE, ROOM, static_features
+from surgisoft.diagnosis.cross_validation import (
+    PERSISTENCE,
+    RIDGES,
+    ROOM,
+    CrossValidation,
+    Split,
+    static_features,
+)
+from surgisoft.diagnosis.discrepancy import kernel
 
 ROWS, POINTS, COLUMNS, BLOCKS = 120, 2, 3, 10
 
@@ -21,6 +27,12 @@ def data():
     residual[40:44, 0] = np.nan
     block = np.arange(ROWS) * BLOCKS // ROWS
     return features, residual, columns, block, np.arange(BLOCKS) % 5
+
+
+def cross_validated(features, residual, columns, block, fold, discrepancy, noise):
+    """The cross-validation of columns (S, n, 3, K) on a split of the rows."""
+    split = Split.of(features, residual, block, fold, discrepancy, noise)
+    return CrossValidation.on(split, columns)
 
 
 def brute(data, picked, rows, share, surrogate, noise):
@@ -64,7 +76,7 @@ def brute(data, picked, rows, share, surrogate, noise):
 @pytest.mark.parametrize("picked", [[], [1], [0, 1, 2]])
 def test_losses_are_those_of_joint_fits(data, picked):
     surrogate, noise = np.array([0.3, 0.5]), np.array([0.1, 0.1])
-    found = CrossValidation.of(*data, surrogate, noise)
+    found = cross_validated(*data, surrogate, noise)
     shares = RIDGES if len(picked) > 1 else RIDGES[:1]
     tried = [
         brute(data, picked, rows, share, surrogate, noise)
@@ -75,7 +87,7 @@ def test_losses_are_those_of_joint_fits(data, picked):
 
 
 def test_the_right_column_has_its_amplitude(data):
-    found = CrossValidation.of(*data, np.array([0.3, 0.5]), np.array([0.1, 0.1]))
+    found = cross_validated(*data, np.array([0.3, 0.5]), np.array([0.1, 0.1]))
     assert found.amplitudes([1])[0] == pytest.approx(0.8, abs=0.1)
     assert found.losses([1]).sum() < 0.3 * found.losses([]).sum()
     assert found.losses([0]).sum() > 0.95 * found.losses([]).sum()
@@ -91,8 +103,8 @@ def test_features_have_the_discrepancys_covariance():
 def test_further_columns_are_as_if_they_had_been_there(data):
     features, residual, columns, *rest = data
     size = np.array([0.3, 0.5]), np.array([0.1, 0.1])
-    whole = CrossValidation.of(*data, *size)
-    found = CrossValidation.of(features, residual, columns[..., :1], *rest, *size)
+    whole = cross_validated(*data, *size)
+    found = cross_validated(features, residual, columns[..., :1], *rest, *size)
     first = found.losses([0])
     found = found.extended(columns[..., 1:])
     assert found.columns == COLUMNS

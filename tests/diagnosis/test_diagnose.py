@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis import diagnose as diagnosing
-from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.diagnose import diagnose, within_the_discrepancy
+from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
@@ -130,16 +130,17 @@ def test_too_little_data_is_told(tmp_path, capsys):
 
 def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
     """Named second, absent from the effects alone: it stands as it does on top of the first."""
-    from surgisoft.diagnosis import diagnose as module
     from surgisoft.diagnosis.candidates import candidates
-    from surgisoft.diagnosis.problem import pose
+    from surgisoft.diagnosis.diagnose import result_of
+    from surgisoft.diagnosis.residuals import problem_of
+    from surgisoft.diagnosis.selection import find
 
-    problem = pose(default_arm(), [recorded([("creep", 1.0)], points=3000)], part="open")
-    found = module.find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
+    problem = problem_of(default_arm(), [recorded([("creep", 1.0)], points=3000)], part="training")
+    found = find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
     second = next(s for s in found.first if s.effect == "misalignment")
     first = [s for s in found.first if s.effect != "misalignment"]
-    both = module.replace(found, first=first, named=[*found.named, second])
-    assert [row.effect for row in module.answer(both).ranking] == ["creep", "misalignment"]
+    both = replace(found, first=first, named=[*found.named, second])
+    assert [row.effect for row in result_of(both).ranking] == ["creep", "misalignment"]
 
 
 def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):
@@ -156,28 +157,28 @@ def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):
 
 def test_what_is_weak_about_the_data_is_told(found):
     """Loads that the fit never saw, and an arm that shakes while it is held."""
-    from surgisoft.diagnosis.problem import pose, with_reference
-    from surgisoft.diagnosis.weaknesses import weaknesses
+    from surgisoft.diagnosis.data_quality import data_quality_warnings
+    from surgisoft.diagnosis.residuals import problem_of
 
     model, recording = default_arm(), recorded()
-    problem = with_reference(pose(model, [recording]), load_known_error("default"))
-    assert weaknesses(problem) == []
+    problem = problem_of(model, [recording]).with_reference(load_known_error("default"))
+    assert data_quality_warnings(problem) == []
     away = replace(problem, pressure=np.full_like(problem.pressure, 3.0))
-    assert "far from those" in weaknesses(away)[0]
-    shaken = replace(problem, noise_mm=problem.noise_mm + 9.0, floor_source="holds")
-    assert "shakes the arm" in weaknesses(shaken)[0]
+    assert "far from those" in data_quality_warnings(away)[0]
+    loud = replace(problem.table, noise_mm=problem.noise_mm + 9.0, floor=Floor(9.0, "holds"))
+    shaken = replace(problem, table=loud)
+    assert "shakes the arm" in data_quality_warnings(shaken)[0]
 
 
 def test_rivals_of_one_of_several_are_told():
     """Beside b a third effect does as well as a does; beside a none does as well as b."""
     from types import SimpleNamespace
 
-    from surgisoft.diagnosis.diagnose import _rivals
-    from surgisoft.diagnosis.race.ranking import Option, Standing
+    from surgisoft.diagnosis.selection import Option, Score, competing
 
     def standing(effect, number, gain):
         log_gain = gain + 0.05 * np.random.default_rng(number).normal(size=40)
-        return Standing(effect, Option(effect, (number,), 0), log_gain, log_gain, 0.001, gain)
+        return Score(effect, Option(effect, (number,), 0), log_gain, log_gain, 0.001, gain)
 
     a, b, c, d = (
         standing(n, k, g)
@@ -185,12 +186,12 @@ def test_rivals_of_one_of_several_are_told():
     )
     beside = {(1,): [a, c, d], (0,): [b, d]}
     race = SimpleNamespace(
-        standings=lambda base, without: beside[base],
+        scores=lambda base, without: beside[base],
         problem=SimpleNamespace(by_motion=lambda values: values),
     )
-    assert _rivals(race, [], [a, b]) == ["c"]
-    assert _rivals(race, [a, c, d], [a]) == ["c"]
-    assert _rivals(race, [], []) == []
+    assert competing(race, [], [a, b]) == ["c"]
+    assert competing(race, [a, c, d], [a]) == ["c"]
+    assert competing(race, [], []) == []
 
 
 @pytest.mark.parametrize(
@@ -206,9 +207,33 @@ def test_rivals_of_one_of_several_are_told():
 def test_what_would_explain_an_errorwithin_the_fit_s_own_is_told(effect, gain, chance, size, told):
     best = SimpleNamespace(effect=effect, gain=gain, p_value=chance)
     race = SimpleNamespace(whole_size=size, in_fit=lambda name: False)
-    found = SimpleNamespace(first=[best], race=race)
-    checks = diagnosing.within_the_fit(found, "nothing_missing")
+    found = SimpleNamespace(first=[best], selection=race)
+    checks = within_the_discrepancy(found, "nothing_missing")
     assert len(checks) == (told is not None)
     assert told is None or told in checks[0]
     assert told is None or ("fit --effects" in checks[0]) == (effect == "creep")
-    assert diagnosing.within_the_fit(found, "identified") == []
+    assert within_the_discrepancy(found, "identified") == []
+
+
+def test_held_out_rows_change_nothing(found):
+    """The training view holds no other key points: a diagnosis is the same whatever they are."""
+    recording = recorded([("creep", 1.0)])
+    held = held_out_rows([recording])
+    assert 0.15 < held.mean() < 0.3
+    points = recording.key_points_mm.copy()
+    points[held] = 50.0 + 10.0 * np.random.default_rng(0).normal(size=points[held].shape)
+    other = replace(recording, key_points_mm=points)
+    problem = residual_table(default_arm(), [other]).training()
+    assert np.isnan(problem.table.measured_mm[held]).all()
+    shown = problem.history.rows(problem.history.key_points).numpy()
+    assert np.isnan(shown[held]).all()
+    again, expected = diagnose(default_arm(), [other]).to_json(), found["creep"].to_json()
+    assert {**again, "seconds": 0.0} == {**expected, "seconds": 0.0}
+
+
+def test_the_final_check_sees_the_held_out_rows_alone():
+    recording = recorded(points=3000)
+    held = held_out_rows([recording])
+    check = residual_table(default_arm(), [recording]).final_check()
+    np.testing.assert_array_equal(check.index.numpy(), np.flatnonzero(held))
+    assert np.isnan(check.table.measured_mm[~held]).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from surgisoft.diagnosis.race.discrepancy import Prior, body_covariance, kernel, log_size
+from surgisoft.diagnosis.discrepancy import Prior, body_covariance, kernel, log_size
 
 ROWS, POINTS, CHAMBERS = 7, 3, 2
 

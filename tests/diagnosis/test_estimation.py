@@ -17,7 +17,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
 )
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.estimation.nuisance import kinds
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
@@ -85,7 +85,7 @@ def rms(residual: np.ndarray) -> float:
 def test_parameters_come_back_and_the_error_falls_to_the_noise(name):
     truth = TRUTHS[name]
     recording = measured_on(truth)
-    problem = pose(bare_arm(), [recording], part="open")
+    problem = problem_of(bare_arm(), [recording], part="training")
     fitted = fit_effects(problem, [name])
     floor = np.sqrt(3) * NOISE_MM
     assert rms(problem.residual) > 2 * floor
@@ -107,7 +107,7 @@ def test_intervals_shrink_with_the_data():
     """Four times the rows, half the width (within sampling error)."""
     truth, widths = TRUTHS["gain_mismatch"], []
     for rows in (150, 600):
-        problem = pose(bare_arm(), [measured_on(truth, rows=rows)], part="open")
+        problem = problem_of(bare_arm(), [measured_on(truth, rows=rows)], part="training")
         (parameter,) = fit_effects(problem, ["gain_mismatch"]).parameters
         widths.append(np.mean(np.subtract(parameter.high, parameter.low)))
     assert 0.25 < widths[1] / widths[0] < 0.9
@@ -119,7 +119,7 @@ def test_the_static_error_of_a_network_is_not_taken_for_memory():
     generator = torch.Generator().manual_seed(3)
     last = truth.network.layers[-1]
     last.weight += 0.004 * torch.randn(last.weight.shape, generator=generator)
-    problem = pose(bare_arm(), [measured_on(truth)], part="open")
+    problem = problem_of(bare_arm(), [measured_on(truth)], part="training")
     amount = fit_effects(problem, ["creep"]).parameters[0]
     assert amount.name == "amount_share"
     assert amount.value == pytest.approx(0.15, abs=0.03)
@@ -127,7 +127,7 @@ def test_the_static_error_of_a_network_is_not_taken_for_memory():
 
 def test_forward_is_the_model_and_its_slopes_are_those_of_autograd():
     arm = with_truth("creep", {"amount": [0.1]}, with_truth("misalignment", {"scale": [0.02]}))
-    problem = pose(arm, [measured_on(arm, rows=100)], part="open")
+    problem = problem_of(arm, [measured_on(arm, rows=100)], part="training")
     parameters = free_parameters(arm, ["creep", "misalignment"])
     forward = repeated_scan(arm, problem, list(arm.effects))
     predict = Prediction(forward, parameters)
@@ -152,11 +152,11 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
     for strength in weaker.effects["hysteresis"].amplitudes().values():
         strength.mul_(0.5)
     recording = measured_on(truth, rows=300)
-    problem = pose(weaker, [recording], part="open")
+    problem = problem_of(weaker, [recording], part="training")
     fitted = fit_effects(problem, ["hysteresis"])
     assert list(fitted.model.effects) == ["hysteresis"]
     assert fitted.refitted == ("hysteresis",)
-    locked = pose(weaker, [recording], part="locked")
+    locked = problem_of(weaker, [recording], part="held_out")
     before, after = rms(locked.residual), rms(locked.with_model(fitted.model).residual)
     assert before > 2 * np.sqrt(3) * NOISE_MM
     assert after < 1.1 * np.sqrt(3) * NOISE_MM
@@ -167,7 +167,7 @@ def test_hysteresis_that_the_model_has_is_fitted_anew_not_doubled():
 
 def test_two_effects_are_fitted_together():
     truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
-    problem = pose(bare_arm(), [measured_on(truth)], part="open")
+    problem = problem_of(bare_arm(), [measured_on(truth)], part="training")
     fitted = fit_effects(problem, ["creep", "gain_mismatch", "creep"])
     assert list(fitted.model.effects) == ["creep", "gain_mismatch"]
     assert rms(problem.with_model(fitted.model).residual) < 1.05 * np.sqrt(3) * NOISE_MM
@@ -180,7 +180,7 @@ def test_missing_key_points_do_no_harm():
     points = recording.key_points_mm.copy()
     points[::3, 2] = np.nan
     points[:, 1] = np.nan
-    problem = pose(bare_arm(), [replace(recording, key_points_mm=points)], part="open")
+    problem = problem_of(bare_arm(), [replace(recording, key_points_mm=points)], part="training")
     gain = fit_effects(problem, ["gain_mismatch"]).parameters[0]
     assert gain.value == pytest.approx([0.06, -0.02, -0.05], abs=0.01)
 
@@ -188,15 +188,15 @@ def test_missing_key_points_do_no_harm():
 def test_a_network_is_retuned_only_where_held_out_motion_rewards_it():
     arm = bare_arm()
     recording = measured_on(arm)
-    problem = pose(arm, [recording], part="open")
+    problem = problem_of(arm, [recording], part="training")
     untouched = retune(arm, problem)
     assert not untouched.kept
     assert untouched.model is arm
     off = copy.deepcopy(arm)
     off.network.layers[-1].bias += 0.02
-    found = retune(off, pose(off, [recording], part="open"))
+    found = retune(off, problem_of(off, [recording], part="training"))
     assert found.kept
-    locked = pose(off, [recording], part="locked")
+    locked = problem_of(off, [recording], part="held_out")
     after = locked.with_model(found.model)
     assert rms(after.residual) < 1.1 * np.sqrt(3) * NOISE_MM < 0.7 * rms(locked.residual)
 
@@ -205,7 +205,7 @@ def test_a_recurrent_baseline_takes_no_effects():
     arm = bare_arm()
     low, high = torch.tensor(arm.spec.low), torch.tensor(arm.spec.high)
     recurrent = ArmModel(arm.spec, RecurrentArm(low, high, 5, 8), {}, arm.rest_mm).eval()
-    problem = pose(recurrent, [measured_on(arm, rows=100)], part="open")
+    problem = problem_of(recurrent, [measured_on(arm, rows=100)], part="training")
     with pytest.raises(InputError, match="recurrent baseline takes none"):
         fit_effects(problem, ["creep"])
 

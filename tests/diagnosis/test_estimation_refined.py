@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis import diagnose as diagnosing
+from surgisoft.diagnosis import selection
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.estimation.effects import refined
-from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.race.ranking import Race
+from surgisoft.diagnosis.residuals import problem_of
+from surgisoft.diagnosis.selection import ModelSelection
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import default_arm
@@ -63,24 +63,21 @@ def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
 def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
     found = diagnose(default_arm(), [lagging])
     assert found.verdict.effects == ("line_lag",)
-    monkeypatch.setattr(diagnosing, "refined", lambda *_: [])
+    monkeypatch.setattr(selection, "refined", lambda *_: [])
     grid = diagnose(default_arm(), [lagging])
     fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}
     rough = {row.effect: row.heldout_rmse_mm for row in grid.ranking}
     assert fine["line_lag"] < 0.7 * rough["line_lag"]
 
 
-def standing_effects(race: Race, standings) -> list:
-    """Effects by name as a race would add each of them."""
-    return [(one.effect, race.in_place(race.single(one.option))) for one in standings]
-
-
 def test_what_is_fitted_is_plausible_small_and_new(lagging):
-    problem = pose(default_arm(), [lagging], part="open")
-    race = Race.of(problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"]))
-    first = race.standings()
+    problem = problem_of(default_arm(), [lagging], part="training")
+    race = ModelSelection.of(
+        problem, candidates(problem, ["line_lag", "hysteresis", "rate_dependence"])
+    )
+    first = race.scores()
     assert {standing.effect for standing in first} >= {"line_lag", "hysteresis"}
-    fitted = refined(problem, standing_effects(race, first))
+    fitted = refined(problem, race.starts(first))
     names = [candidate.name for candidate in fitted]
     assert "line_lag" in names
     assert "hysteresis" not in names  # the model has it already
@@ -92,12 +89,12 @@ def test_what_is_fitted_is_plausible_small_and_new(lagging):
 
 
 def test_a_fit_leaves_the_shapes_of_the_grid_as_they_are(lagging):
-    problem = pose(default_arm(), [lagging], part="open")
-    race = Race.of(problem, candidates(problem, ["line_lag"]))
-    standing = race.standings()[0]
+    problem = problem_of(default_arm(), [lagging], part="training")
+    race = ModelSelection.of(problem, candidates(problem, ["line_lag"]))
+    standing = race.scores()[0]
     effect = race.in_place(standing.option)
     before = {name: p.detach().clone() for name, p in effect.named_parameters()}
-    assert refined(problem, standing_effects(race, [standing]))
+    assert refined(problem, race.starts([standing]))
     after = dict(race.in_place(standing.option).named_parameters())
     assert all(after[name].equal(value) for name, value in before.items())
 
@@ -118,8 +115,8 @@ def test_loops_do_not_stand_for_what_the_actuation_explains():
     commands = low + ramps_from_rest(3600) * (high - low)
     behind = np.stack([backlash(column, 1.0) for column in commands.T], axis=1)
     for pressure, allowed in ((0.94 * commands, False), (behind, True)):
-        problem = pose(default_arm(), [made(commands, pressure)])
-        race = Race.of(problem, candidates(problem, ["hysteresis"]))
+        problem = problem_of(default_arm(), [made(commands, pressure)])
+        race = ModelSelection.of(problem, candidates(problem, ["hysteresis"]))
         best = min(race.options["hysteresis"], key=lambda way: race.losses(way.picked).sum())
         assert race.losses(best.picked).sum() < 0.2 * race.losses().sum()
         assert race.plausible(best) == allowed

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from surgisoft.diagnosis.comparing.features import RADII, TIMES_S, features, memory_of
+from surgisoft.diagnosis.history_features import RADII, TIMES_S, features, memory_of
 from surgisoft.surrogate.history import pack
 from tests.diagnosis.synthetic import PERIOD_S, backlash, still_model, walk
 

@@ -3,19 +3,24 @@
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.comparing.floor import noise_floor, repeat_floor
-from surgisoft.diagnosis.residuals import residuals
+from surgisoft.diagnosis.residuals import problem_of, repeat_floor, residual_table
 from tests.diagnosis.synthetic import NOISE_MM, recording, still_model, walk
 
 FLOOR = np.sqrt(3) * NOISE_MM
 CYCLE = walk(300, seed=3)
 
 
+def repeats(model, recordings):
+    """The floor from the repeats among all rows of some recordings."""
+    problem = problem_of(model, recordings)
+    return repeat_floor(problem.table, problem.block_of_row)
+
+
 def test_repeats_find_the_noise_below_a_large_error():
     """The same cycle in six runs; a model that is 2 mm off everywhere changes nothing."""
     run = np.repeat(np.arange(6), 300)
     made = recording(2.0 + np.zeros(1800), np.tile(CYCLE, (6, 1)), run=run, noise_mm=None)
-    floor = repeat_floor(residuals(still_model(), [made]))
+    floor = repeats(still_model(), [made])
     assert floor.source == "repeats"
     assert floor.rmse_mm == pytest.approx(FLOOR, rel=0.05)
 
@@ -26,7 +31,7 @@ def test_what_differs_from_one_repeat_to_the_next_is_noise():
     offset = np.random.default_rng(1).normal(0, 0.5, 6)
     made = recording(offset[run], np.tile(CYCLE, (6, 1)), run=run, noise_mm=None)
     pairs = np.square(offset[:, None] - offset[None])[~np.eye(6, dtype=bool)].mean() / 2
-    floor = repeat_floor(residuals(still_model(), [made]))
+    floor = repeats(still_model(), [made])
     assert floor.rmse_mm == pytest.approx(np.sqrt(FLOOR**2 + pairs / 3), rel=0.25)
 
 
@@ -35,10 +40,19 @@ def test_nothing_that_came_once_is_a_repeat():
     ramp = np.linspace(0, 10, 600)[:, None] * [1.0, 0.5]
     for pressure in (walk(600, 6), ramp):
         made = recording(np.zeros(600), pressure, noise_mm=None)
-        rest = residuals(still_model(pressure.shape[1]), [made])
-        assert repeat_floor(rest).rmse_mm is None
+        assert repeats(still_model(pressure.shape[1]), [made]).rmse_mm is None
 
 
 def test_a_statement_of_the_lab_comes_first():
     made = recording(np.zeros(600), walk(600), noise_mm=0.2)
-    assert noise_floor([made]).rmse_mm == pytest.approx(0.2 * np.sqrt(3))
+    floor = residual_table(still_model(), [made]).floor
+    assert (floor.source, floor.rmse_mm) == ("sidecar", pytest.approx(0.2 * np.sqrt(3)))
+
+
+def test_second_differences_find_the_noise_of_a_smooth_motion():
+    """Neither a statement nor a hold: a ramp to and fro, the arm moving along with it."""
+    ramp = 5 + 5 * np.sin(np.arange(1500) / 60)[:, None] * [1.0, 0.5]
+    made = recording(0.3 * ramp[:, 0], ramp, noise_mm=None)
+    floor = residual_table(still_model(), [made]).floor
+    assert floor.source == "second differences"
+    assert floor.rmse_mm == pytest.approx(FLOOR, rel=0.05)

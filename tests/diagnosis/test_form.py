@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.problem import pose
-from surgisoft.diagnosis.race.form import Loosened, loosened
-from surgisoft.diagnosis.race.ranking import Race
+from surgisoft.diagnosis.residuals import problem_of
+from surgisoft.diagnosis.selection import ModelSelection, RelaxedFit, relaxed_fit
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import recording, still_model, walk
 
@@ -15,23 +14,23 @@ PRESSURE = walk(ROWS)
 
 
 def shifted(size_mm: np.ndarray):
-    """A race over an arm whose tip, and the rest in proportion, is measured size_mm (S,) aside."""
+    """A selection for an arm whose whole body is measured size_mm (S,) aside."""
     model = still_model()
     model.validation = Validation(0.1, (0.1, 0.1, 0.1), ROWS)
-    problem = pose(model, [recording(size_mm, PRESSURE)])
-    race = Race.of(problem, candidates(problem, ["misalignment"]))
-    return race, race.standings()
+    problem = problem_of(model, [recording(size_mm, PRESSURE)])
+    selection = ModelSelection.of(problem, candidates(problem, ["misalignment"]))
+    return selection, selection.scores()
 
 
 def test_what_comes_at_once_is_no_steady_frame():
     """A shift in the second half alone: a steady one leaves most of it, one let loose little."""
     late = np.where(np.arange(ROWS) < ROWS // 2, 0.0, 1.0)
-    race, first = shifted(late)
-    found = loosened(race, [first[:1]])
+    selection, first = shifted(late)
+    found = relaxed_fit(selection, [first[:1]])
     assert found.wrong
     assert found.share > 0.5
     steady, first = shifted(np.ones(ROWS))
-    assert not loosened(steady, [first[:1]]).wrong
+    assert not relaxed_fit(steady, [first[:1]]).wrong
 
 
 @pytest.mark.parametrize(
@@ -45,4 +44,4 @@ def test_what_comes_at_once_is_no_steady_frame():
     ],
 )
 def test_when_a_form_is_wrong(share, log_gain, chance, wrong):
-    assert Loosened(np.zeros(1), share, log_gain, chance).wrong is wrong
+    assert RelaxedFit(np.zeros(1), share, log_gain, chance).wrong is wrong

@@ -7,8 +7,8 @@ import pytest
 
 from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
 from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
-from surgisoft.diagnosis.verdict import Diagnosis, ErrorLevels, Verdict
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -122,7 +122,7 @@ def test_rounds_are_reported_as_they_end(recited):
     )
     assert [r.step for r in heard] == [r.step for r in result.rounds] == ["gain_mismatch", None]
     assert all(r.error_mm is None for r in heard)
-    assert result.rounds[-1].error_mm == result.locked.after
+    assert result.rounds[-1].error_mm == result.held_out.after
 
 
 def test_the_second_effect_of_an_answer_does_not_repeat_its_sentence(recited):

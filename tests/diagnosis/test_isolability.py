@@ -4,25 +4,22 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from surgisoft.diagnosis.isolability.designs import history_of_protocol
-from surgisoft.diagnosis.isolability.matrix import (
-    Draws,
-    Isolability,
-    ambiguous_sets,
-    isolability,
-    judge,
-    uncertainty_of,
-)
-from surgisoft.diagnosis.isolability.moments import (
+from surgisoft.diagnosis.design.isolability import (
     FORM_S,
     FORM_SHARE,
     ROOM,
+    SURE,
+    Draws,
     Moments,
     Uncertainty,
+    history_of_protocol,
     inducing_points,
+    isolability,
+    judge,
+    uncertainty_of,
     unimitated,
 )
-from surgisoft.diagnosis.race.discrepancy import body_covariance, kernel
+from surgisoft.diagnosis.discrepancy import body_covariance, kernel
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.surrogate.checkpoint import default_arm
 
@@ -65,7 +62,7 @@ def test_moments_are_the_products_under_the_dense_covariance():
     seconds = 80.0
     gram = Moments.of(columns, x, d, uncertainty, seconds).gram()
     static = body_covariance(
-        np.sqrt((ROOM * uncertainty.surrogate_mm) ** 2 + FORM_SHARE * uncertainty.signal_mm**2)
+        np.sqrt((ROOM * uncertainty.discrepancy_mm) ** 2 + FORM_SHARE * uncertainty.signal_mm**2)
     )
     density = (uncertainty.noise_mm**2 * 0.05 + FORM_SHARE * FORM_S * 0.3**2) / 3.0
     noise = np.kron(np.eye(rows), np.diag(density)) * rows / seconds
@@ -129,10 +126,10 @@ def test_with_one_speed_play_imitates_lag_and_varied_motion_tells_them_apart(arm
     poor = isolability(arm, sweeps(6.0), NAMES)
     a, b = poor.names.index("line_lag"), poor.names.index("hysteresis")
     assert poor.separability[a, b] < 0.06
-    assert any({"line_lag", "hysteresis"} <= set(names) for names in ambiguous_sets(poor))
+    assert poor.pair("line_lag", "hysteresis") < SURE
     a, b = mixed.names.index("line_lag"), mixed.names.index("hysteresis")
     assert mixed.separability[a, b] > 0.3
-    assert not any({"line_lag", "hysteresis"} <= set(names) for names in ambiguous_sets(mixed))
+    assert mixed.pair("line_lag", "hysteresis") >= SURE
 
 
 def test_a_schedule_that_stays_at_rest_shows_nothing(arm):
@@ -172,18 +169,6 @@ def test_a_protocol_becomes_the_history_that_is_commanded(arm):
     np.testing.assert_allclose(kept, settled.commands, atol=1e-4)
 
 
-def test_ambiguous_sets_are_the_largest_in_which_all_are_near():
-    chance = np.full((4, 4), 0.99)
-    for a, b, value in ((0, 1, 0.6), (1, 2, 0.7), (0, 2, 0.94), (2, 3, 0.8)):
-        chance[a, b] = value
-    empty = np.zeros((4, 4))
-    result = Isolability(
-        ("a", "b", "c", "d"), np.ones(4), empty, empty, empty, chance, np.ones(4), 1.0
-    )
-    assert ambiguous_sets(result) == [("a", "b", "c"), ("c", "d")]
-    assert ambiguous_sets(result, sure=0.5) == []
-
-
 def test_inducing_points_fill_the_range():
     x, d = inducing_points(3)
     assert x.min() >= -1
@@ -196,4 +181,4 @@ def test_inducing_points_fill_the_range():
 def test_an_arm_without_a_stated_length_still_has_plausible_sizes(arm):
     uncertainty = uncertainty_of(arm, None, np.full(5, 0.5), 0.05)
     assert (uncertainty.density > 0).all()
-    assert uncertainty.surrogate_mm.shape == (5,)
+    assert uncertainty.discrepancy_mm.shape == (5,)

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.motions import motions
-from surgisoft.diagnosis.problem import folds, pose
-from surgisoft.diagnosis.race.gates import family_p_values
+from surgisoft.diagnosis.residuals import folds, motions, problem_of
+from surgisoft.diagnosis.statistics import sign_flip_p_values
 from surgisoft.surrogate.history import pack
 from tests.diagnosis.synthetic import PERIOD_S, recording, still_model, walk
 
@@ -66,11 +65,11 @@ def test_copies_are_left_out_of_a_fit_together():
 def test_six_motions_are_six_witnesses_however_often_they_come():
     """Gains of one sign in six motions: one in 2^6 by chance, not one in 2^96 for their copies."""
     rows = sweep(1.0, 16)
-    problem = pose(still_model(), [recording(0 * rows[:, 0], rows)], part="open")
+    problem = problem_of(still_model(), [recording(0 * rows[:, 0], rows)], part="training")
     six = replace(problem, motion=np.tile(np.arange(6), 16))
     gains = np.tile([0.5, 0.4, 0.6, 0.3, 0.5, 0.4], 16)[None]
-    assert family_p_values(gains)[0] < 0.001
-    assert family_p_values(six.by_motion(gains))[0] == pytest.approx(2.0**-6, abs=0.006)
+    assert sign_flip_p_values(gains)[0] < 0.001
+    assert sign_flip_p_values(six.by_motion(gains))[0] == pytest.approx(2.0**-6, abs=0.006)
 
 
 def bumpy(rows: np.ndarray) -> np.ndarray:
@@ -84,7 +83,7 @@ def test_an_error_of_the_surrogate_that_is_shown_again_and_again_is_no_effect():
     found = diagnose(still_model(), some)
     assert found.verdict.kind in ("nothing_missing", "surrogate_undertrained")
     assert any("repeat themselves" in check for check in found.checks)
-    problem = pose(still_model(), some, part="open")
+    problem = problem_of(still_model(), some, part="training")
     assert problem.motion.max() + 1 < len(problem.motion) / 2
     means = problem.by_motion(problem.motion * np.array([[1.0], [2.0]]))
     np.testing.assert_allclose(means, np.outer([1.0, 2.0], np.arange(means.shape[1])))

@@ -8,31 +8,30 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.isolability.matrix import isolability
-from surgisoft.diagnosis.next_experiment.catalogue import (
-    AS_IT_STANDS,
-    FIGURES,
-    ON_THE_RIG,
-    RUN_S,
-    SETTINGS,
-    bench_minutes,
-    draw_run,
-    limits_within,
-    schedule,
-    schedule_text,
-)
-from surgisoft.diagnosis.next_experiment.plans import make_plans
-from surgisoft.diagnosis.next_experiment.propose import (
+from surgisoft.diagnosis.design.isolability import isolability
+from surgisoft.diagnosis.design.next_experiment import (
     likely_rivals,
+    make_plans,
     next_experiment,
+    pose_question,
     propose,
     recommend,
 )
-from surgisoft.diagnosis.next_experiment.question import pose_question
-from surgisoft.diagnosis.next_experiment.words import words_for
-from surgisoft.diagnosis.problem import pose
+from surgisoft.diagnosis.design.schedules import (
+    AS_IT_STANDS,
+    RUN_S,
+    SETUPS,
+    bench_minutes,
+    draw_run,
+    limits_within,
+    on_the_rig,
+    schedule,
+    schedule_text,
+    words_for,
+)
+from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.errors import InputError
-from surgisoft.measurement.protocols import Protocol, load_schedule, make_protocol
+from surgisoft.measurement.protocols import SIGNALS, Protocol, load_schedule, make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
@@ -52,10 +51,10 @@ def lagging():
 
 @pytest.fixture(scope="module")
 def problem(arm, lagging):
-    return pose(arm, [lagging])
+    return problem_of(arm, [lagging])
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize(
     "limits", [[[-15.0, 54.0]] * 3, [[0.0, 1.0]], [[-90.0, 90.0]] * 6, [[2.0, 9.0], [0.0, 30.0]]]
 )
@@ -94,12 +93,12 @@ def test_a_schedule_is_read_back_as_it_was_written(tmp_path):
 def test_turned_benches_have_the_rigs_own_gravity():
     weight = np.array([0.42, 0.1, 0.9])
     weight /= np.linalg.norm(weight)
-    for name, setting in SETTINGS.items():
+    for name, setting in SETUPS.items():
         if setting.roll_deg:
             truth = VirtualRig(0, gravity=weight, roll_deg=setting.roll_deg).gravity
             np.testing.assert_allclose(setting.gravity(weight), truth, atol=1e-12)
             assert setting.options == f"--roll-deg {setting.roll_deg:g}", name
-    np.testing.assert_allclose(SETTINGS["upside_down"].gravity(weight), -weight)
+    np.testing.assert_allclose(SETUPS["upside_down"].gravity(weight), -weight)
 
 
 def test_the_recommended_schedule_runs_on_the_rig(arm):
@@ -132,7 +131,7 @@ def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(proble
     assert pair.before < 0.95 < pair.after
     assert answer.setting == "short_tube"
     assert answer.by_hand
-    assert not recommend(problem, ["line_lag", "rate_dependence"], 5.0, ON_THE_RIG).by_hand
+    assert not recommend(problem, ["line_lag", "rate_dependence"], 5.0, on_the_rig()).by_hand
     assert answer.minutes <= 15.0
     assert any("tube" in step for step in answer.steps)
     left = recommend(problem, ["line_lag", "rate_dependence"], settings=(AS_IT_STANDS,))
@@ -156,11 +155,11 @@ def test_the_recommended_schedule_settles_on_the_rig_what_one_speed_leaves_open(
     poor = Protocol("sweeps", "continuous", commands, np.zeros(9), 8.0 * np.arange(9.0))
     for true, rival in (("hysteresis", "line_lag"), ("line_lag", "hysteresis")):
         first, _ = VirtualRig(0, take=1, hidden=[(true, 1.0)]).record(poor)
-        problem = pose(arm, [first])
+        problem = problem_of(arm, [first])
         answer = recommend(problem, [true, rival], 5.0, (AS_IT_STANDS,))
         assert answer.pairs[0].before < 0.95
         second, _ = VirtualRig(0, take=2, hidden=[(true, 1.0)]).record(answer.protocol)
-        assert lead(pose(arm, [first, second]), true, rival) > 30.0 + abs(
+        assert lead(problem_of(arm, [first, second]), true, rival) > 30.0 + abs(
             lead(problem, true, rival)
         )
 
@@ -179,7 +178,7 @@ def test_where_gravity_is_not_known_no_bench_is_turned(arm):
     free = arm.replace(spec=spec)
     limits = limits_within(spec.low, spec.high)
     question = pose_question(free, None, ["payload", "gain_mismatch"])
-    plans = make_plans(question, limits, 8.0, tuple(SETTINGS))
+    plans = make_plans(question, limits, 8.0, tuple(SETUPS))
     assert {plan.setting for plan in plans} == {AS_IT_STANDS, "bare_tip"}
 
 
@@ -191,7 +190,7 @@ def test_no_chamber_leaves_what_was_recorded_of_it(arm, lagging):
     measured = lagging.measured.copy()
     measured[:, 2] = 5.0 + 2.0 * (measured[:, 2] - measured[:, 2].min()) / np.ptp(measured[:, 2])
     still = replace(lagging, measured=measured)
-    answer = recommend(pose(shy, [still]), ["creep", "line_lag"], minutes=5.0)
+    answer = recommend(problem_of(shy, [still]), ["creep", "line_lag"], minutes=5.0)
     rows = answer.protocol.commands
     assert np.ptp(rows[:, 0]) > 10.0
     np.testing.assert_allclose(rows[:, 1], 3.0)
@@ -263,10 +262,10 @@ def test_a_bench_is_spoken_of_in_its_own_words(arm, unit, said):
 def test_every_word_of_the_catalogue_is_filled_in():
     for unit in ("kPa", "deg", "V"):
         words = asdict(words_for(unit))
-        for thing in (*SETTINGS.values(), *FIGURES.values()):
+        for thing in (*SETUPS.values(), *SIGNALS.values()):
             assert "{" not in thing.about.format(**words)
         if unit != "kPa":
-            texts = " ".join(thing.about.format(**words) for thing in SETTINGS.values())
+            texts = " ".join(thing.about.format(**words) for thing in SETUPS.values())
             assert not {"valve", "valves", "vented", "chamber", "tubes"} & set(texts.split())
 
 

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from surgisoft.cli import run
+from surgisoft.diagnosis.cross_validation import FITTED
 from surgisoft.diagnosis.diagnose import diagnose
-from surgisoft.diagnosis.race.cross_validation import CrossValidation
-from surgisoft.diagnosis.race.split import FITTED
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.model import Validation
 from tests.diagnosis.synthetic import POINTS, recording, still_model, walk
+from tests.diagnosis.test_cross_validation import cross_validated
 
 ROWS = 3000
 
@@ -60,13 +60,13 @@ def test_rows_of_a_reference_are_fitted_and_not_judged():
     columns[60:] = 0.0
     block, size, noise = np.arange(90) // 6, np.ones(1), np.full(1, 0.1)
     fold = np.concatenate([np.arange(10) % 5, np.full(5, FITTED)])
-    found = CrossValidation.of(features, residual, columns[:60], block, fold, size, noise)
+    found = cross_validated(features, residual, columns[:60], block, fold, size, noise)
     assert found.losses((0,)).shape == (10,)
     np.testing.assert_array_equal(found.counts, np.full(10, 6))
     for number in range(5):
         # One split into two: the judged fold, and the rest with the reference.
         two = np.where(fold == number, 0, 1)
-        one = CrossValidation.of(features, residual, columns, block, two, size, noise)
+        one = cross_validated(features, residual, columns, block, two, size, noise)
         judged = fold == number
         np.testing.assert_allclose(found.grams[:, number], one.grams[:, 0], rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(

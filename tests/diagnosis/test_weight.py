@@ -63,7 +63,7 @@ def test_own_weight_of_a_rolled_arm_is_called_a_load(arm, turned, tmp_path):
     assert found.ranking[0].effect == "payload"
     assert "payload" in found.verdict.effects
     result = amend(model, [turned], ["payload"])
-    assert result.locked.after < 0.25 * result.locked.before
+    assert result.held_out.after < 0.25 * result.held_out.before
     save_model(result.model, tmp_path / "turned", {})
     history = history_of([turned])
     with torch.no_grad():

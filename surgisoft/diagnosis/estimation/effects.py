@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.candidates import Candidate, candidates, with_effect
+from surgisoft.diagnosis.criteria import CRITERIA
+from surgisoft.diagnosis.cross_validation import cross_validation_of
 from surgisoft.diagnosis.estimation.intervals import Parameter, intervals
 from surgisoft.diagnosis.estimation.least_squares import (
     Fit,
@@ -17,10 +19,7 @@ from surgisoft.diagnosis.estimation.least_squares import (
     free_parameters,
     repeated_scan,
 )
-from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.cross_validation import CrossValidation
-from surgisoft.diagnosis.race.ranking import PRICE, priced
-from surgisoft.diagnosis.race.split import static_features
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.errors import InputError
 from surgisoft.surrogate.effects import Effect
 from surgisoft.surrogate.model import ArmModel
@@ -147,7 +146,7 @@ def _added(problem: Problem, name: str) -> ArmModel:
         else:
             misfit = fit_all(model, problem, [name], FIRST_ITERATIONS).misfit
         values = sum(p.numel() for p in effect.amplitudes().values())
-        tried.append((misfit * (1.0 + PRICE) ** values, model))
+        tried.append((misfit * (1.0 + CRITERIA.selection.amplitude_price) ** values, model))
     return min(tried, key=lambda one: one[0])[1]
 
 
@@ -164,19 +163,13 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
             "record motion that it would show in"
         )
     ends = np.cumsum([0] + [candidate.columns.shape[-1] for candidate in tried])
-    validation = CrossValidation.of(
-        static_features(problem.pressure, problem.direction),
-        problem.residual,
-        np.concatenate([candidate.columns for candidate in tried], axis=-1),
-        problem.block,
-        problem.fold,
-        problem.surrogate_mm,
-        problem.noise_mm,
-    )
+    sensitivities = np.concatenate([candidate.columns for candidate in tried], axis=-1)
+    validation = cross_validation_of(problem, sensitivities)
     picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
     before = validation.losses().sum()
     gains = [np.log(before / validation.losses(pick).sum()) for pick in picks]
-    scores = [priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
+    selection = CRITERIA.selection
+    scores = [selection.priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
     models = []
     for best in np.argsort(scores)[::-1][:number]:
         effect = copy.deepcopy(tried[best].effect)

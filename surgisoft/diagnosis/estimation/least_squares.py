@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from surgisoft.diagnosis.estimation.nuisance import Nuisance, held_out_parts
-from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.chain import RepeatedScan
 from surgisoft.surrogate.model import ArmModel
 

@@ -19,7 +19,7 @@ from scipy import stats
 from torch import Tensor
 
 from surgisoft.diagnosis.estimation.nuisance import held_out_parts
-from surgisoft.diagnosis.problem import Problem
+from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HawNN
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy import linalg
 from scipy.sparse import csgraph
 
-from surgisoft.diagnosis.problem import Problem
-from surgisoft.diagnosis.race.split import static_features
+from surgisoft.diagnosis.cross_validation import static_features
+from surgisoft.diagnosis.residuals import Problem
 
 PERSISTENCE = 10.0
 """Rows over which what is left hangs together: so many fewer of them are independent."""
@@ -48,7 +48,7 @@ class Nuisance:
         square = np.where(seen, np.square(residual).sum(-1), 0.0).sum(0) / np.maximum(
             seen.sum(0), 1
         )
-        prior = np.maximum(problem.surrogate_mm, 0.1 * problem.noise_mm) ** 2
+        prior = np.maximum(problem.discrepancy_mm, 0.1 * problem.noise_mm) ** 2
         ridge = (problem.noise_mm**2 + PERSISTENCE * square) / prior
         features = static_features(problem.pressure, problem.direction)
         grams, factors = {}, []

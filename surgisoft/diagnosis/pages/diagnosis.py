@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from surgisoft.diagnosis.verdict import Diagnosis
+from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
 HOW = (
@@ -28,7 +28,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     facts = [
         ("error", f"{error.before:.3f} mm"),
         ("noise floor", f"{error.floor:.3f} mm"),
-        ("best on held-out blocks", f"{error.ceiling:.3f} mm"),
+        ("best achievable error", f"{error.ceiling:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
     ]
     parts = [Facts(facts)]

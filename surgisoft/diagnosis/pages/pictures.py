@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.residuals import Residuals
+from surgisoft.diagnosis.residuals import ResidualTable
 from surgisoft.surrogate.backbone import Backbone
 
 mpl.use("Agg")
@@ -23,7 +23,7 @@ POSTURES = 7
 
 
 def draw_all(
-    rest: Residuals, backbone: Backbone | None, unit: str, folder: Path, title: str = ""
+    table: ResidualTable, backbone: Backbone | None, unit: str, folder: Path, title: str = ""
 ) -> list[Path]:
     """Write loops.png, body.png and error.png into a folder; returns their paths.
 
@@ -31,9 +31,9 @@ def draw_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
-    figures = [("loops", loops(rest, unit, title)), ("error", error_over_time(rest, title))]
+    figures = [("loops", loops(table, unit, title)), ("error", error_over_time(table, title))]
     if backbone is not None:
-        figures.insert(1, ("body", body(rest, backbone, title)))
+        figures.insert(1, ("body", body(table, backbone, title)))
     for name, figure in figures:
         drawn.append(save(figure, folder / f"{name}.png"))
     return drawn
@@ -46,24 +46,24 @@ def save(figure, path: Path) -> Path:
     return path
 
 
-def ladder_loops(rests: dict[str, Residuals], unit: str):
+def ladder_loops(tables: dict[str, ResidualTable], unit: str):
     """Nested loops of one recording, measured beside several models, one column a model.
 
     Below, a cubic through the measured values is taken out of both, which leaves the loops.
     """
     figure, axes = plt.subplots(
-        2, len(rests), figsize=(4.2 * len(rests), 6.6), layout="constrained", squeeze=False
+        2, len(tables), figsize=(4.2 * len(tables), 6.6), layout="constrained", squeeze=False
     )
-    for column, (label, rest) in enumerate(rests.items()):
-        chamber = int(np.argmax(_lone_motion(rest)))
-        rows = _stretch(rest, chamber, LADDER_ROWS)
-        along = _main_direction(rest.measured_mm[rows, -1])
+    for column, (label, table) in enumerate(tables.items()):
+        chamber = int(np.argmax(_lone_motion(table)))
+        rows = _stretch(table, chamber, LADDER_ROWS)
+        along = _main_direction(table.measured_mm[rows, -1])
         measured, predicted = (
-            points[rows, -1] @ along for points in (rest.measured_mm, rest.predicted_mm)
+            points[rows, -1] @ along for points in (table.measured_mm, table.predicted_mm)
         )
-        pressure = rest.pressure[rows, chamber]
+        pressure = table.pressure[rows, chamber]
         cubic = np.polyval(np.polyfit(pressure, measured, 3), pressure)
-        error = np.sqrt(np.nanmean(np.square(rest.error_mm[:, -1])))
+        error = np.sqrt(np.nanmean(np.square(table.error_mm[:, -1])))
         for row, offset in enumerate((0, cubic)):
             axis = axes[row, column]
             axis.plot(pressure, measured - offset, c=MEASURED, lw=1.6, label="measured")
@@ -72,39 +72,39 @@ def ladder_loops(rests: dict[str, Residuals], unit: str):
         axes[0, column].set_title(f"{label}: tip RMSE {error:.2f} mm")
         axes[1, column].set_xlabel(f"chamber {chamber + 1} [{unit}]")
     axes[0, 0].set_ylabel("tip, main direction [mm]")
-    axes[1, 0].set_ylabel("the same less a cubic [mm]")
+    axes[1, 0].set_ylabel("tip less a cubic [mm]")
     axes[0, 0].legend(frameon=False)
     return figure
 
 
-def _lone_motion(rest: Residuals) -> np.ndarray:
+def _lone_motion(table: ResidualTable) -> np.ndarray:
     """(m,) share of its range that each chamber moves in its best stretch, less the others'."""
-    span = np.ptp(rest.pressure, axis=0)
+    span = np.ptp(table.pressure, axis=0)
     span = np.where(span > 0, span, 1)
     scores = []
-    for chamber in range(rest.pressure.shape[1]):
-        moves = np.ptp(rest.pressure[_stretch(rest, chamber, LADDER_ROWS)], axis=0) / span
+    for chamber in range(table.pressure.shape[1]):
+        moves = np.ptp(table.pressure[_stretch(table, chamber, LADDER_ROWS)], axis=0) / span
         scores.append(2 * moves[chamber] - moves.sum())
     return np.array(scores)
 
 
-def loops(rest: Residuals, unit: str, title: str = ""):
+def loops(table: ResidualTable, unit: str, title: str = ""):
     """Tip against the actuation of each chamber, measured and predicted.
 
     For each chamber the stretch of rows in which it moves most and the others least. Below, the
     best polynomial in all pressures is taken out of both: what is left has memory, or noise.
     """
-    chambers = rest.pressure.shape[1]
+    chambers = table.pressure.shape[1]
     figure, axes = plt.subplots(
         2, chambers, figsize=(4.2 * chambers, 6.2), layout="constrained", squeeze=False
     )
     figure.suptitle(title or "Tip against actuation")
     for chamber in range(chambers):
-        rows = _stretch(rest, chamber)
-        along = _main_direction(rest.measured_mm[rows, -1])
-        measured, predicted = rest.measured_mm[:, -1] @ along, rest.predicted_mm[:, -1] @ along
-        static = _static(rest.pressure, measured)
-        pressure = rest.pressure[rows, chamber]
+        rows = _stretch(table, chamber)
+        along = _main_direction(table.measured_mm[rows, -1])
+        measured, predicted = table.measured_mm[:, -1] @ along, table.predicted_mm[:, -1] @ along
+        static = _static(table.pressure, measured)
+        pressure = table.pressure[rows, chamber]
         for row, (offset, what) in enumerate(
             ((0 * static, "tip, main direction [mm]"), (static, "less what pressure explains [mm]"))
         ):
@@ -121,22 +121,22 @@ def loops(rest: Residuals, unit: str, title: str = ""):
     return figure
 
 
-def _stretch(rest: Residuals, chamber: int, longest: int = LOOP_ROWS) -> np.ndarray:
+def _stretch(table: ResidualTable, chamber: int, longest: int = LOOP_ROWS) -> np.ndarray:
     """Rows of one run, at most `longest`, in which one chamber moves most and others least."""
     best, score = None, -np.inf
-    span = np.ptp(rest.pressure, axis=0)
+    span = np.ptp(table.pressure, axis=0)
     span = np.where(span > 0, span, 1)
-    for run in np.unique(rest.run):
-        rows = np.flatnonzero((rest.run == run) & ~np.isnan(rest.measured_mm[:, -1, 0]))
+    for run in np.unique(table.run):
+        rows = np.flatnonzero((table.run == run) & ~np.isnan(table.measured_mm[:, -1, 0]))
         for start in range(0, max(1, len(rows) - longest // 2), longest // 2):
             part = rows[start : start + longest]
             if len(part) < 4:
                 continue
-            moves = np.ptp(rest.pressure[part], axis=0) / span
+            moves = np.ptp(table.pressure[part], axis=0) / span
             now = 2 * moves[chamber] - moves.sum()
             if now > score + 1e-9:
                 best, score = part, now
-    return best if best is not None else np.arange(min(longest, len(rest.run)))
+    return best if best is not None else np.arange(min(longest, len(table.run)))
 
 
 def _static(pressure: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -164,20 +164,20 @@ def _main_direction(points: np.ndarray) -> np.ndarray:
     return np.linalg.svd(centred, full_matrices=False)[2][0]
 
 
-def body(rest: Residuals, backbone: Backbone, title: str = ""):
+def body(table: ResidualTable, backbone: Backbone, title: str = ""):
     """A few postures in space: measured key points, predicted ones and their backbone."""
-    whole = np.flatnonzero(~np.isnan(rest.measured_mm).any(axis=(1, 2)))
+    whole = np.flatnonzero(~np.isnan(table.measured_mm).any(axis=(1, 2)))
     figure = plt.figure(figsize=(6.5, 6.2), layout="constrained")
     axis = figure.add_subplot(projection="3d")
-    for number, row in enumerate(_spread(rest.measured_mm[whole, -1])):
+    for number, row in enumerate(_spread(table.measured_mm[whole, -1])):
         row = whole[row]
-        points = torch.tensor(rest.predicted_mm[row], dtype=torch.float32)
+        points = torch.tensor(table.predicted_mm[row], dtype=torch.float32)
         line = backbone.centreline(points).numpy()
         first = number == 0
         axis.plot(*line.T, c=PREDICTED, lw=2, label="predicted backbone" if first else None)
         axis.scatter(*points.numpy().T, c=PREDICTED, s=14)
         axis.scatter(
-            *rest.measured_mm[row].T,
+            *table.measured_mm[row].T,
             facecolors="none",
             edgecolors=MEASURED,
             s=55,
@@ -207,9 +207,9 @@ def _spread(tips: np.ndarray) -> list[int]:
     return picked
 
 
-def error_over_time(rest: Residuals, title: str = ""):
+def error_over_time(table: ResidualTable, title: str = ""):
     """Tip and mean error over the rows, runs marked, and the distribution per key point."""
-    error = rest.error_mm
+    error = table.error_mm
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(11, 3.8), layout="constrained", width_ratios=(3, 1)
     )
@@ -218,7 +218,7 @@ def error_over_time(rest: Residuals, title: str = ""):
     left.plot(whole, error[whole, -1], c=PREDICTED, lw=0.6, label="tip")
     mean = error[whole].mean(axis=1)
     left.plot(whole, mean, c=MEASURED, lw=0.6, label="mean of the key points")
-    for edge in np.flatnonzero(np.diff(rest.run)):
+    for edge in np.flatnonzero(np.diff(table.run)):
         left.axvline(edge + 0.5, c="#bbbbbb", lw=0.6)
     left.set_xlabel("row (runs are divided by lines)")
     left.set_ylabel("error [mm]")

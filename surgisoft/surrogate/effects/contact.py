@@ -146,4 +146,4 @@ def _neighbours(some: list[Effect]) -> list[list[int]]:
     ]
 
 
-HYPOTHESIS = Hypothesis(Contact, _grid, combinations=_neighbours)
+HYPOTHESIS = Hypothesis(Contact, _grid, combinations=_neighbours, absent_in="no_support")

@@ -43,6 +43,17 @@ class Hypothesis:
     exact_form: bool = False
     """Whether real arms have exactly this formula, as with a turned frame or a weight. Then the
     effect must explain more before it is named, because nothing but noise may be left of it."""
+    mimic_log_odds: float = 0.0
+    """Log odds of a diagnosis that names the effect. Below 0 for an effect that causes outside the
+    known effects look like; fitted together with `diagnosis.criteria.Calibration`."""
+    absent_in: str = ""
+    """Experimental setup (`diagnosis.design.schedules.SETUPS`) in which the effect cannot act;
+    empty: there is none."""
+    own_weight: str = ""
+    """Amplitude by which the arm's own weight acts, for an effect that is a load along gravity;
+    empty: the effect is no such load."""
+    tip_mass: str = ""
+    """Amplitude by which a mass at the tip acts, for an effect that is a load along gravity."""
 
     def candidates(self, facts: ArmFacts, points: Tensor) -> list[Effect]:
         """Effects of zero amplitude to try on an arm whose model lacks the effect.

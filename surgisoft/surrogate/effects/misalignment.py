@@ -51,4 +51,4 @@ class Misalignment(Memoryless):
         ]
 
 
-HYPOTHESIS = Hypothesis(Misalignment, exact_form=True)
+HYPOTHESIS = Hypothesis(Misalignment, exact_form=True, absent_in="new_frame")

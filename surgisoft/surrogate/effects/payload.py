@@ -84,4 +84,10 @@ class Payload(Memoryless):
         ]
 
 
-HYPOTHESIS = Hypothesis(Payload, exact_form=True)
+HYPOTHESIS = Hypothesis(
+    Payload,
+    exact_form=True,
+    absent_in="bare_tip",
+    own_weight="body_sag",
+    tip_mass="tip_sag",
+)

@@ -1,1 +1,0 @@
-"""What `compare` measures: errors over axes, floors and ceilings."""

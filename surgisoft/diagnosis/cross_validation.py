@@ -1,0 +1,349 @@
+"""Held-out errors of any set of sensitivities, the model discrepancy always fitted beside them.
+
+The residual of a model is explained by a flexible function of actuation and direction (the model
+discrepancy, free in every output) and by sensitivities, each with one amplitude. Both are linear,
+so everything that a set of sensitivities can do on held-out blocks follows from a few matrices
+that are computed once: trying a set costs a small linear solve. Of rows that are left out of a
+fold's fit, products are taken once and subtracted from those of all.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import linalg
+
+from surgisoft.diagnosis.discrepancy import kernel
+from surgisoft.diagnosis.residuals import Problem
+
+RIDGES = (1e-4, 1e-2, 1e-1)
+"""Ridges on amplitudes, shares of a column's own power; the best on held-out blocks is taken."""
+INDUCING = 120
+"""Features of the model discrepancy (Nystroem: Williams & Seeger 2001)."""
+ROOM = 3.0
+"""Factor on the validated error that the discrepancy may reach without a penalty that matters."""
+PERSISTENCE = (5.0, 50.0, 500.0)
+"""Rows over which the remaining error is correlated: it holds the discrepancy back so many times
+more than white noise of its size. The one that does best on held-out blocks is taken."""
+
+REFERENCE_WEIGHT = 3.0
+"""Weight of a reference's rows: an error that changed since is not shared out over both."""
+FITTED = -1
+"""Fold of blocks that are fitted in every fold and never held out; they come last."""
+
+
+def static_features(x, d, number: int = INDUCING, seed: int = 0) -> np.ndarray:
+    """(S, F) features whose unit-normal mixture has the discrepancy's covariance."""
+    rng = np.random.default_rng(seed)
+    picked = rng.permutation(len(x))[: min(number, len(x))]
+    values, vectors = linalg.eigh(kernel(x[picked], d[picked], x[picked], d[picked]))
+    kept = values > 1e-8 * values.max()
+    return kernel(x, d, x[picked], d[picked]) @ (vectors[:, kept] / np.sqrt(values[kept]))
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """The static part's fit to the rows of a fold, of key points that were measured together."""
+
+    points: np.ndarray
+    """(p,) which key points."""
+    values: np.ndarray
+    """(F,) eigenvalues of the features' products over the fitted rows."""
+    vectors: np.ndarray
+    """(F, F) their eigenvectors, in columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Rows that are fitted and judged in turn, and what no column changes about it."""
+
+    features: np.ndarray
+    """(S, F) features of the static part."""
+    residual: np.ndarray
+    """(S, n, 3) what is to be explained, mm; 0 where missing."""
+    seen: np.ndarray
+    """(S, n) which key points were measured."""
+    block: np.ndarray
+    """(S,) block of each row; rows that are never judged come last."""
+    fold: np.ndarray
+    """(B,) fold of each judged block, from 0."""
+    held: list[np.ndarray]
+    """The rows that each fold judges."""
+    ridges: np.ndarray
+    """(L, n) ridge on the features of each key point, for each room and each of PERSISTENCE."""
+    bases: list[list[Basis]]
+    """The static fits of each fold."""
+    rotated: dict = field(default_factory=dict)
+    """Features of each fold's held-out rows in each basis, once they were needed."""
+
+    @classmethod
+    def of(
+        cls,
+        features: np.ndarray,
+        residual: np.ndarray,
+        block: np.ndarray,
+        fold: np.ndarray,
+        discrepancy_mm: np.ndarray,
+        noise_mm: np.ndarray,
+        rooms: tuple[float, ...] = (ROOM,),
+    ) -> "Split":
+        """features (S, F) and residual (S, n, 3) in mm, NaN where missing.
+
+        block: (S,) block of each row; fold: (B,) fold of each block, blocks of the fold FITTED
+        last; discrepancy_mm and noise_mm: (n,) RMS errors of each key point's distance; rooms:
+        factors on discrepancy_mm that the features' fit may reach.
+        """
+        seen = np.isfinite(residual).all(2)
+        residual = np.where(seen[..., None], residual, 0.0).astype(np.float32)
+        features = features.astype(np.float32)
+        mean = np.square(residual, dtype=float).sum((0, 2)) / np.maximum(seen.sum(0), 1)
+        prior = np.maximum(discrepancy_mm, 0.1 * noise_mm) ** 2
+        ridges = np.array(
+            [
+                (noise_mm**2 + rows * mean) / (prior * room**2)
+                for room in rooms
+                for rows in PERSISTENCE
+            ]
+        )
+        judged = np.unique(fold[fold != FITTED], return_inverse=True)[1]
+        owner = np.append(judged, FITTED)[np.minimum(block, len(judged))]
+        held = [np.flatnonzero(owner == number) for number in range(judged.max() + 1)]
+        groups, which = np.unique(seen, axis=1, return_inverse=True)
+        alike = [np.flatnonzero(which.reshape(-1) == g) for g in range(groups.shape[1])]
+        bases: list[list[Basis]] = []
+        for number in range(len(held)):
+            some = [features[(owner != number) & seen[:, points[0]]] for points in alike]
+            found = [linalg.eigh(rows.T @ rows, check_finite=False) for rows in some]
+            bases.append([Basis(p, *pair) for p, pair in zip(alike, found, strict=True)])
+        return cls(features, residual, seen, block, judged, held, ridges, bases)
+
+    @property
+    def rows(self) -> int:
+        """Rows that are judged."""
+        return int((self.block < len(self.fold)).sum())
+
+    def turned(self, field: np.ndarray, known: np.ndarray | None = None) -> list[np.ndarray]:
+        """For each fold (F, n, 3, C) products of the static part's basis and a field (rows, n, 3,
+        C), over the fitted rows; known: (S - rows, n, 3) its first column on the other ones."""
+        flat = field.reshape(self.rows, -1)
+        parts = [self.features[rows].T @ flat[rows] for rows in self.held]
+        parts = [part.reshape(-1, *field.shape[1:]) for part in parts]
+        whole = np.sum(parts, axis=0)
+        if known is not None:
+            whole[..., 0] += np.tensordot(self.features[self.rows :], known, (0, 0))
+        answer = []
+        for part, bases in zip(parts, self.bases, strict=True):
+            left = whole - part
+            for basis in bases:
+                some = left[:, basis.points]
+                turned = basis.vectors.T @ some.reshape(len(some), -1)
+                left[:, basis.points] = turned.reshape(some.shape)
+            answer.append(left)
+        return answer
+
+    def shrunk(self, turned: np.ndarray, number: int, level: int) -> np.ndarray:
+        """The same of a fold over the ridge of a level: the static part's coefficients."""
+        answer = np.empty_like(turned)
+        for basis in self.bases[number]:
+            ridge = self.ridges[level, basis.points]
+            weight = np.maximum(basis.values, 0.0)[:, None] + ridge
+            answer[:, basis.points] = turned[:, basis.points] / weight[..., None, None]
+        return answer
+
+    def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
+        """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it judges."""
+        rows = self.held[number]
+        answer = field[rows].copy()
+        for place, basis in enumerate(self.bases[number]):
+            if (number, place) not in self.rotated:
+                self.rotated[number, place] = self.features[rows] @ basis.vectors
+            own = self.rotated[number, place]
+            part = own @ shrunk[:, basis.points].reshape(len(shrunk), -1)
+            answer[:, basis.points] -= part.reshape(len(rows), len(basis.points), *field.shape[2:])
+        answer[~self.seen[rows]] = 0.0
+        return answer
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Held-out errors of sets of columns."""
+
+    split: Split
+    fields: np.ndarray
+    """(rows, n, 3, 1 + K) residual and columns, mm; 0 where missing."""
+    grams: np.ndarray
+    """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
+    judged: np.ndarray
+    """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each judged block."""
+    cache: dict = field(default_factory=dict)
+    """Held-out sums of squares and amplitudes by columns."""
+
+    @classmethod
+    def on(cls, split: Split, columns: np.ndarray) -> "CrossValidation":
+        """The same with columns (rows, n, 3, K) on a split."""
+        first = split.residual[: split.rows, ..., None]
+        both = np.concatenate([first, _masked(split, columns)], axis=3)
+        known = split.residual[split.rows :]
+        turned = split.turned(both, known)
+        grams, judged = _products(split, both, turned, both, turned)
+        grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
+        return cls(split, both, grams, judged)
+
+    def extended(self, columns: np.ndarray) -> "CrossValidation":
+        """The same with further columns (rows, n, 3, K') behind those that it has."""
+        more = _masked(self.split, columns)
+        both = np.concatenate([self.fields, more], axis=3)
+        turned = self.split.turned(more)
+        known = self.split.residual[self.split.rows :]
+        old = self.split.turned(self.fields, known)
+        whole = [np.concatenate(pair, axis=3) for pair in zip(old, turned, strict=True)]
+        beside = _products(self.split, both, whole, more, turned)
+        grams, judged = (
+            _bordered(*pair) for pair in zip((self.grams, self.judged), beside, strict=True)
+        )
+        return CrossValidation(self.split, both, grams, judged, dict(self.cache))
+
+    def level_losses(self) -> np.ndarray:
+        """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""
+        return self.judged[:, :, 0, 0].astype(float)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns, K."""
+        return self.fields.shape[3] - 1
+
+    @property
+    def counts(self) -> np.ndarray:
+        """(B,) measured key points in each block."""
+        rows = self.split.rows
+        weights = self.split.seen[:rows].sum(1)
+        return np.bincount(self.split.block[:rows], weights, minlength=len(self.split.fold))
+
+    def losses(self, picked: list[int] | tuple[int, ...] | np.ndarray = ()) -> np.ndarray:
+        """(B,) held-out sum of squared distances of each block, mm^2, with the picked columns."""
+        columns = np.unique(np.asarray(picked, int))
+        tried, _ = self._solved(columns)
+        ridges = len(RIDGES) if len(columns) > 1 else 1
+        tried = tried[:, :ridges].reshape(-1, tried.shape[2])
+        return tried[tried.sum(axis=1).argmin()]
+
+    def amplitudes(self, picked: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
+        """(k,) amplitudes of the picked columns, mean over the folds."""
+        columns, where = np.unique(np.asarray(picked, int), return_inverse=True)
+        tried, amplitudes = self._solved(columns)
+        sums = tried.sum(axis=2)
+        level, ridge = np.unravel_index(sums.argmin(), sums.shape)
+        return amplitudes[level, ridge].mean(axis=0)[where]
+
+    def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """((L, r, B) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge."""
+        key = columns.tobytes()
+        if key not in self.cache:
+            rows = np.concatenate([[0], columns + 1])
+            amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
+            mix = np.insert(-amplitudes, 0, 1.0, axis=-1)[:, :, self.split.fold]
+            part = self.judged[:, :, rows[:, None], rows].astype(float)
+            losses = (mix * (part[:, None] @ mix[..., None])[..., 0]).sum(axis=-1)
+            self.cache[key] = losses, amplitudes
+        return self.cache[key]
+
+
+def _masked(split: Split, columns: np.ndarray) -> np.ndarray:
+    """Columns (rows, n, 3, K) in single precision, 0 where nothing was measured."""
+    return np.where(split.seen[: split.rows, :, None, None], columns, 0.0).astype(np.float32)
+
+
+def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
+    """(grams, judged) of the columns of two fields (rows, n, 3, A or B), as in CrossValidation."""
+    levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
+    parts = np.array([_product(a[rows], b[rows]) for rows in split.held], float)
+    grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
+    judged = np.empty((levels, len(split.fold), *size), np.float32)
+    for number, rows in enumerate(split.held):
+        for level in range(levels):
+            mine = split.shrunk(turned_b[number], number, level)
+            grams[level, number] -= _product(turned_a[number], mine)
+            right = split.away(b, mine, number)
+            left = right
+            if a is not b:
+                left = split.away(a, split.shrunk(turned_a[number], number, level), number)
+            for one in np.unique(split.block[rows]):
+                own = split.block[rows] == one
+                judged[level, one] = _product(left[own], right[own])
+    return grams, judged
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(A, B) products of the last axes of two fields of the same rows."""
+    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+
+
+def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """(..., C, C) symmetric matrices from (..., A, A) and their last columns (..., C, C - A)."""
+    first, size = inner.shape[-1], border.shape[-2]
+    answer = np.empty((*inner.shape[:-2], size, size), inner.dtype)
+    answer[..., :first, :first] = inner
+    answer[..., first:] = border
+    answer[..., first:, :first] = np.swapaxes(border[..., :first, :], -1, -2)
+    return answer
+
+
+def _amplitudes(gram: np.ndarray) -> np.ndarray:
+    """(L, r, folds, k) least-squares amplitudes with each of r RIDGES.
+
+    gram: (L, folds, 1 + k, 1 + k) products of the residual and the columns.
+    """
+    normal, right = gram[..., 1:, 1:], gram[..., 1:, 0]
+    normal = 0.5 * (normal + np.swapaxes(normal, -1, -2))
+    power = np.diagonal(normal, axis1=-2, axis2=-1)
+    least = np.maximum(power.max(axis=-1, initial=0.0, keepdims=True), 1e-30)
+    size = np.sqrt(np.maximum(power, 1e-12 * least))
+    scaled = normal / size[..., :, None] / size[..., None, :]
+    ridge = np.array(RIDGES)[:, None, None, None] * np.eye(normal.shape[-1])
+    answer = np.linalg.solve(scaled[:, None] + ridge, (right / size)[:, None, ..., None])
+    return answer[..., 0] / size[:, None]
+
+
+def split_of(problem: Problem) -> Split:
+    """Which rows of a problem are fitted and held out in turn.
+
+    Rows of a reference are fitted and never held out: no effect acts on them.
+    """
+    pressure, direction, residual = problem.pressure, problem.direction, problem.residual
+    block, fold = problem.block, problem.fold
+    known = problem.reference
+    if known is not None:
+        pressure = np.concatenate([pressure, known.pressure])
+        direction = np.concatenate([direction, known.direction])
+        residual = np.concatenate([residual, REFERENCE_WEIGHT * known.residual])
+        block = np.concatenate([block, np.full(len(known.residual), len(fold))])
+        fold = np.append(fold, FITTED)
+    features = static_features(pressure, direction)
+    features[len(problem.block) :] *= REFERENCE_WEIGHT
+    return Split.of(features, residual, block, fold, problem.discrepancy_mm, problem.noise_mm)
+
+
+def cross_validation_of(
+    problem: Problem,
+    sensitivities: np.ndarray | None = None,
+    features: np.ndarray | None = None,
+    rooms: tuple[float, ...] = (ROOM,),
+) -> CrossValidation:
+    """The cross-validation of a problem's own rows, without its reference.
+
+    sensitivities: (S, n, 3, K) in mm; None: none. features: (S, F) functions of the row whose
+    mixtures, free in every output, are fitted beside them; None: those of the model discrepancy.
+    """
+    if features is None:
+        features = static_features(problem.pressure, problem.direction)
+    if sensitivities is None:
+        sensitivities = np.zeros((*problem.residual.shape, 0))
+    split = Split.of(
+        features,
+        problem.residual,
+        problem.block,
+        problem.fold,
+        problem.discrepancy_mm,
+        problem.noise_mm,
+        rooms,
+    )
+    return CrossValidation.on(split, sensitivities)

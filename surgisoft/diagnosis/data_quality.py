@@ -1,0 +1,64 @@
+"""Data-quality warnings of a diagnosis: what the recordings cannot support."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from surgisoft.diagnosis.residuals import Problem
+
+FAR_FROM_FIT = 2.0
+"""An actuation is far from those of the fit beyond this multiple of the distance that 97 % of
+those keep from their nearest neighbour."""
+LEAST_FAR = 0.2
+"""Least such distance, in half ranges of a chamber."""
+FAR_ROWS = 0.1
+"""Share of rows at far actuations from which there is a warning."""
+SOURCE_OF_SMOOTH = "second differences"
+"""Source of a noise floor that is neither stated nor shown by holds."""
+MOST_MISSING = 0.2
+"""Share of missing key points from which there is a warning."""
+
+
+def _far_from_fit(problem: Problem) -> float:
+    """Share of the rows whose actuation lies far from all that the model was fitted on."""
+    known = problem.reference
+    if known is None or len(known.pressure) < 2:
+        return 0.0
+    tree = cKDTree(known.pressure)
+    own = tree.query(known.pressure, k=2, p=np.inf)[0][:, 1]
+    apart = tree.query(problem.pressure, p=np.inf)[0]
+    return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, 0.97), LEAST_FAR)))
+
+
+def data_quality_warnings(problem: Problem) -> list[str]:
+    """One sentence for each warning."""
+    warnings, source = [], problem.table.floor.source
+    if source in (SOURCE_OF_SMOOTH, "unknown"):
+        warnings.append(
+            "the measurement noise is not stated and no holds show it: it was estimated from "
+            "second differences in time; state noise_mm in the sidecar for a better noise floor"
+        )
+    blocks, motions = len(problem.motion), int(problem.motion.max()) + 1
+    if 2 * motions <= blocks:
+        warnings.append(
+            f"the recordings repeat themselves: their {blocks} blocks of time show {motions} "
+            "different motions, and each counts once; record other paths and speeds"
+        )
+    far = _far_from_fit(problem)
+    if far > FAR_ROWS:
+        warnings.append(
+            f"{100 * far:.0f} % of the rows are at actuations far from those that the model was "
+            "fitted on, where its own error is larger: an effect that shows there alone may be an "
+            "error of the model"
+        )
+    validated = problem.model.validation.rmse_mm
+    noise = problem.floor_mm
+    if validated and source == "holds" and noise > validated:
+        warnings.append(
+            f"while the arm is held the key points scatter by {noise:.3g} mm, more than "
+            f"the model's whole validated error ({validated:.3g} mm): worse cameras, or something "
+            "shakes the arm; smaller effects cannot be seen"
+        )
+    missing = float(np.isnan(problem.measured).mean())
+    if missing > MOST_MISSING:
+        warnings.append(f"{100 * missing:.0f} % of the key points are missing")
+    return warnings

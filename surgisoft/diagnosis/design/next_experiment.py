@@ -1,0 +1,758 @@
+"""The experiment that best tells competing effects apart: model discrimination design.
+
+Every excitation signal of the catalogue is predicted through the model with each competing effect
+at the amplitudes that the recordings so far suggest. Excitation signals are added one by one, each
+time the one that raises most the expected log probability of naming the right competing effect,
+over all pairs, whichever is true (Hunter & Reiner 1965; Box & Hill 1967). The same is done for
+every experimental setup that touches a competing effect.
+"""
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.special import log_ndtr
+
+from surgisoft.diagnosis.candidates import facts_of
+from surgisoft.diagnosis.design.isolability import (
+    FORM_S,
+    MISFIT,
+    PERIOD_S,
+    SURE,
+    Design,
+    Draws,
+    Isolability,
+    Moments,
+    Shape,
+    Sizes,
+    Uncertainty,
+    columns_on,
+    design_of,
+    judge,
+    length_of,
+    moments_of,
+    planned_history,
+    reference_design,
+    sample_time,
+    shapes_of,
+    uncertainty_of,
+    under,
+    unimitated,
+)
+from surgisoft.diagnosis.design.schedules import (
+    AS_IT_STANDS,
+    RUN_S,
+    SETUPS,
+    Setup,
+    bench_minutes,
+    draw_run,
+    limits_within,
+    schedule,
+    words_for,
+)
+from surgisoft.diagnosis.estimation.effects import with_fitted
+from surgisoft.diagnosis.inputs import (
+    Model,
+    Recordings,
+    identification_problem,
+    open_inputs,
+)
+from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.weight import gravity_load
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.histories import STILL_SHARE
+from surgisoft.measurement.protocols import SIGNALS, Protocol
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects, make_effect
+from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.workers import torch_threads
+
+# Competing effects and what is known of them -----------------------------------------------------
+
+CLEAR = 3.0
+"""Log evidence in the recordings, nats, from which on an effect's amplitudes are taken from
+them."""
+KNOWN_ROWS = 800
+"""Rows of the recordings so far whose columns are computed."""
+MOST_SHAPES = 10
+"""Shapes of an effect that are looked at: those that fit best, or some of every kind."""
+WEAKEST = 0.2
+"""Least size of the competing effects, as a share of the plausible one, that an experiment is
+planned for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """Competing effects on a model, and what the recordings so far say about them."""
+
+    model: ArmModel
+    """The model in question."""
+    shapes: list[Shape]
+    """The competing effects' shapes."""
+    owners: list[str]
+    """The competing effect of each shape."""
+    spans: list[np.ndarray]
+    """Indices of the columns of each shape, with that of the own weight, which is open to all."""
+    draws: Draws
+    """Strengths that may be true."""
+    uncertainty: Uncertainty
+    """What signals must stand out from."""
+    known: Moments | None
+    """Moments of the recordings so far; the last column is the own weight."""
+    gains: np.ndarray | None
+    """(J,) log evidence of each shape in the recordings, nats."""
+    misfit: np.ndarray | float
+    """(E, E) misfit of the competing effects; larger where the recordings contradict the
+    prediction."""
+
+    def judged(self, moments: Moments) -> Isolability:
+        """What moments of columns and own weight say about the competing effects."""
+        return judge(moments, self.draws, self.owners, self.spans, self.misfit)
+
+
+def pose_question(
+    model: ArmModel, problem: Problem | None, rivals: list[str] | None = None
+) -> Question:
+    """The competing effects, with amplitudes from the recordings where those show them.
+
+    Default: every known effect that changes anything on this arm.
+    """
+    reference = reference_design(model)
+    facts = None if problem is None else facts_of(problem)
+    shapes = shapes_of(model, reference, rivals, facts)
+    if problem is None:
+        shapes = _some_of_each(shapes)
+    sizes = Sizes.of(reference, columns_on(reference, shapes), shapes)
+    missing = [name for name in rivals or [] if name not in {shape.name for shape in sizes.shapes}]
+    if missing:
+        raise InputError(
+            f"effect '{missing[0]}' changes nothing on this arm, so it competes with no other; "
+            "leave it out"
+        )
+    known = gains = noise = None
+    misfit, dt = MISFIT, PERIOD_S / 2
+    draws = sizes.draws()
+    if problem is None:
+        uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
+    else:
+        dt, noise = sample_time(problem.history), problem.noise_mm
+        design, residual = _thinned(problem)
+        columns = columns_on(design, sizes.shapes)
+        uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
+        gram = _with(residual, design, columns, uncertainty).gram()
+        fitted, gains = _fitted(gram, sizes)
+        sharp = _sharp(problem, sizes, fitted, gains) if rivals else []
+        if sharp:
+            sizes = Sizes.of(reference, columns_on(reference, shapes + sharp), shapes + sharp)
+            columns += columns_on(design, sizes.shapes[len(columns) :])
+            gram = _with(residual, design, columns, uncertainty).gram()
+            fitted, gains = _fitted(gram, sizes)
+        best = int(np.argmax(gains))
+        rms = float(np.sqrt(3.0 * np.mean((columns[best] @ fitted[best]) ** 2)))
+        # Once more with the size that was found, and the shapes that matter.
+        kept = _best_of_each(sizes, gains)
+        sizes, columns = sizes.select(kept), [columns[j] for j in kept]
+        scale = max(WEAKEST, rms / sizes.plausible_mm)
+        uncertainty = uncertainty_of(model, noise, scale * sizes.profile_mm, dt)
+        known = _with(residual, design, columns, uncertainty)
+        gram = known.gram()
+        fitted, gains = _fitted(gram, sizes)
+        misfit = _misfit(gram, sizes, fitted, gains)
+        draws = _likely(sizes.limited(sizes.draws(), columns), sizes, fitted, gains)
+        known = _without_last(known)
+    draws = Draws(np.pad(draws.strengths, ((0, 1), (0, 0))), draws.shape)
+    weight = np.array([sizes.columns])
+    return Question(
+        model,
+        sizes.shapes,
+        owners_of(sizes),
+        [np.concatenate([span, weight]) for span in sizes.spans],
+        draws,
+        uncertainty,
+        known,
+        gains,
+        misfit,
+    )
+
+
+def owners_of(sizes: Sizes) -> list[str]:
+    """The effect of each shape."""
+    return [shape.name for shape in sizes.shapes]
+
+
+def _some_of_each(shapes: list[Shape]) -> list[Shape]:
+    """At most MOST_SHAPES of each effect, evenly from first to last."""
+    answer = []
+    for name in dict.fromkeys(shape.name for shape in shapes):
+        mine = [shape for shape in shapes if shape.name == name]
+        places = np.linspace(0, len(mine) - 1, min(len(mine), MOST_SHAPES))
+        answer += [mine[k] for k in np.unique(places.round().astype(int))]
+    return answer
+
+
+def _best_of_each(sizes: Sizes, gains: np.ndarray) -> list[int]:
+    """Indices of the MOST_SHAPES shapes of each effect that fit best, in order."""
+    owners = owners_of(sizes)
+    kept: list[int] = []
+    for name in dict.fromkeys(owners):
+        mine = [j for j, owner in enumerate(owners) if owner == name]
+        kept += sorted(mine, key=lambda j: -gains[j])[:MOST_SHAPES]
+    return sorted(kept)
+
+
+def _with(residual, design: Design, columns, uncertainty: Uncertainty) -> Moments:
+    """Moments of the columns, with the residual (S, n, 3) as the last one."""
+    return moments_of(design, [*columns, residual[..., None]], uncertainty)
+
+
+def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
+    """A problem's rows as a design, and their residual (S, n, 3) in mm, all key points seen."""
+    residual = problem.residual
+    known = np.isfinite(residual).all(2)
+    often = known.mean(0) >= 0.5
+    residual = np.where(often[None, :, None], residual, 0.0)
+    whole = np.flatnonzero((known | ~often).all(1))
+    rows = whole[:: max(1, round(len(whole) / KNOWN_ROWS))]
+    history = problem.history
+    seconds = float(history.dt_s.sum()) + sample_time(history) * history.runs
+    design = Design(
+        problem.model,
+        history,
+        problem.index[torch.from_numpy(rows)],
+        problem.pressure[rows],
+        problem.direction[rows],
+        seconds,
+    )
+    return design, residual[rows]
+
+
+def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Shape]:
+    """Each competing effect's best shape fitted through the whole chain to the recordings, where it
+    can be."""
+    owners, answer = owners_of(sizes), []
+    for name in dict.fromkeys(owners):
+        mine = [j for j, owner in enumerate(owners) if owner == name and not sizes.shapes[j].more]
+        best = max(mine, key=lambda j: gains[j], default=None)
+        if best is None or gains[best] < CLEAR:
+            continue
+        effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
+        for parameter in effect.amplitudes().values():
+            part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
+            parameter.data.copy_(part.view_as(parameter))
+            first += parameter.numel()
+        model = with_fitted(problem, name, effect)
+        if model is not None:
+            found = model.effects[name].requires_grad_(False)
+            answer.append(Shape(name, found, fitted=True))
+    return answer
+
+
+def _spread(sizes: Sizes) -> np.ndarray:
+    """(K,) plausible spread of each amplitude."""
+    answer = np.empty(sizes.columns)
+    for span, gram in zip(sizes.spans, sizes.gram_mm2, strict=True):
+        unit = np.sqrt(np.maximum(np.diag(gram), 1e-30))
+        answer[span] = 2.0 * sizes.plausible_mm / unit
+    return answer
+
+
+def _fitted(gram: np.ndarray, sizes: Sizes) -> tuple[list[np.ndarray], np.ndarray]:
+    """Strengths of each shape that explain the last column best, and their log evidence (J,)."""
+    strengths, gains, spread = [], [], _spread(sizes)
+    for span in sizes.spans:
+        scaled = gram[np.ix_(span, span)] * spread[span][:, None] * spread[span][None]
+        pull = gram[span, -1] * spread[span]
+        inner = np.eye(len(span)) + scaled
+        amplitude = np.linalg.solve(inner, pull)
+        strengths.append(amplitude * spread[span])
+        gains.append(0.5 * pull @ amplitude - 0.5 * np.linalg.slogdet(inner)[1])
+    return strengths, np.array(gains)
+
+
+def _likely(draws: Draws, sizes: Sizes, fitted, gains) -> Draws:
+    """Each competing effect's best-fitting shape with its amplitudes where it is clear, else
+    plausible ones."""
+    strengths, shape, owners = [], [], owners_of(sizes)
+    for name in dict.fromkeys(owners):
+        mine = [j for j, owner in enumerate(owners) if owner == name]
+        best = max(mine, key=lambda j: gains[j])
+        if gains[best] >= CLEAR:
+            full = np.zeros(len(draws.strengths))
+            full[sizes.spans[best]] = fitted[best]
+            strengths.append(full[:, None])
+            shape.append([best])
+        else:
+            picked = np.isin(draws.shape, mine)
+            strengths.append(draws.strengths[:, picked])
+            shape.append(draws.shape[picked])
+    return Draws(np.concatenate(strengths, axis=1), np.concatenate(shape).astype(int))
+
+
+def _misfit(gram: np.ndarray, sizes: Sizes, fitted, gains) -> np.ndarray:
+    """(E, E) misfit that the recordings show: how far two competing effects' fits differ from the
+    prediction.
+
+    With the better fitting competing effect true, its signal s and what the other cannot imitate u
+    of it, the other should leave |u|^2 + 2 u e more, with e the misfit of the better one.
+    """
+    owner = np.array(owners_of(sizes))
+    names = list(dict.fromkeys(owner))
+    best = [max(np.flatnonzero(owner == n), key=lambda j: gains[j]) for n in names]
+    signals = np.zeros((len(gram), len(names) + 1))
+    signals[-1, -1] = 1.0
+    for k, j in enumerate(best):
+        signals[sizes.spans[j], k] = fitted[j]
+    left = unimitated(gram, signals, sizes.spans)
+    least = np.stack([left[owner == n].min(axis=0) for n in names])
+    answer = np.full((len(names), len(names)), MISFIT)
+    for a, b in itertools.permutations(range(len(names)), 2):
+        if gains[best[a]] >= max(gains[best[b]], CLEAR) and least[b, a] > 0:
+            whole = signals[:, a] @ gram @ signals[:, a]
+            gap = least[b, -1] - least[a, -1] - least[b, a]
+            error = min(gap, 0.0) ** 2 / (4.0 * least[b, a] * whole)
+            answer[a, b] = answer[b, a] = max(MISFIT, error)
+    return answer
+
+
+def _without_last(moments: Moments) -> Moments:
+    """The last column made that of the own weight, which does nothing on this bench."""
+    plain, cross = moments.plain.copy(), moments.cross.copy()
+    plain[:, -1], plain[:, :, -1], cross[..., -1] = 0.0, 0.0, 0.0
+    return replace(moments, plain=plain, cross=cross)
+
+
+# Plans --------------------------------------------------------------------------------------------
+
+LEAST_RUNS = 2
+"""Fewest runs of an experiment: one more than a single mishap spoils."""
+TARGET = 0.99
+"""Expected chance for every pair at which no further run is added."""
+RUN_ROWS = 160
+"""Rows of a planned run whose columns are computed."""
+OWN_WEIGHT_MISFIT = 0.02
+"""Mean square that is left, as a share, where the arm's own weight pulls otherwise and the beam's
+formula follows it: 0.65 of 4.5 mm on a simulated arm whose base was rolled by 90 degrees."""
+OWN_SAG_SHARE = 0.105
+"""RMS change of a key point for a unit change of the weight's unit vector, as a share of the arm's
+length: 4.5 and 6.2 of 70 mm on the same arm, rolled by 90 and 180 degrees at a tilt of 25."""
+OWN_WEIGHT_G = 10.0
+"""Mass of an arm against which a known one at its tip is set, g."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Runs on a bench in one setting."""
+
+    setting: str
+    """Its name."""
+    figures: tuple[str, ...]
+    """The runs."""
+    minutes: float
+    """Time on the bench, minutes."""
+    score: float
+    """Expected log probability of naming the right one, summed over pairs."""
+    result: Isolability
+    """With the recordings so far."""
+
+    @property
+    def worst(self) -> float:
+        """Least chance of any pair."""
+        return min(self.result.pair(a, b) for a, b in pairs_of(self.result.names))
+
+
+def pairs_of(names) -> list[tuple[str, str]]:
+    """Every pair of names, in order."""
+    return [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+
+
+def make_plans(
+    question: Question, limits: np.ndarray, minutes: float, settings: tuple[str, ...]
+) -> list[Plan]:
+    """The best runs on the bench as it stands and in every setting that touches a competing
+    effect."""
+    model = question.model
+    runs = [draw_run(name, limits, 0) for name in SIGNALS]
+    design = design_of(model, planned_history(model, runs), RUN_ROWS * len(runs))
+    run = design.history.run_of_row[design.index].numpy()
+    own = columns_on(design, question.shapes)
+    answer = []
+    for name in dict.fromkeys([AS_IT_STANDS, *settings]):
+        setting = SETUPS[name]
+        if bench_minutes(LEAST_RUNS) > minutes - setting.minutes + 1e-9:
+            continue
+        columns = own if name == AS_IT_STANDS else _changed(question, design, own, setting)
+        if columns is None:
+            continue
+        weight, worth = _own_weight(question, design, setting)
+        stacked = np.concatenate([*columns, weight], axis=3)
+        parts = {
+            figure: Moments.of(
+                stacked[run == k],
+                design.pressure[run == k],
+                design.direction[run == k],
+                question.uncertainty,
+                worth * RUN_S,
+            )
+            for k, figure in enumerate(SIGNALS)
+        }
+        answer.append(_greedy(question, name, parts, minutes - setting.minutes))
+    return answer
+
+
+def _changed(question: Question, design: Design, own, setting: Setup):
+    """The columns in another setting; None where no competing effect changes or it cannot be
+    computed."""
+    gravity = question.model.facts.gravity
+    if setting.moves_weight and gravity is None:
+        return None
+    facts = replace(question.model.facts, gravity=setting.gravity(gravity))
+    removed = setting.removes
+    absent = [j for j, shape in enumerate(question.shapes) if shape.name in removed]
+    other = [
+        j
+        for j, shape in enumerate(question.shapes)
+        if setting.moves_weight
+        and not shape.more
+        and _differs(shape.effect, under(shape.effect, facts))
+    ]
+    if not absent and not other:
+        return None
+    answer = list(own)
+    fresh = columns_on(design, [question.shapes[j] for j in other], facts) if other else []
+    for j, columns in zip(other, fresh, strict=True):
+        answer[j] = columns
+    for j in absent:
+        answer[j] = np.zeros_like(own[j])
+    return answer
+
+
+def _differs(effect: Effect, other: Effect) -> bool:
+    """Whether anything that an effect was given by its arm is another."""
+    theirs = dict(other.named_buffers())
+    return any(not torch.equal(value, theirs[name]) for name, value in effect.named_buffers())
+
+
+def _own_weight(question: Question, design: Design, setting: Setup) -> tuple[np.ndarray, float]:
+    """(S, n, 3, 1) how the arm moves, mm, because its own weight or a known mass pulls otherwise.
+
+    How far nobody knows, so every competing effect may use it. And what a row is then worth, 0 to
+    1: what the beam's formula misses of that motion hides the competing effects.
+    """
+    model = question.model
+    was = model.facts.gravity
+    if was is None or not setting.moves_weight:
+        return np.zeros((len(design.index), model.spec.key_points, 3, 1), np.float32), 1.0
+    pull = np.asarray(was) if setting.payload_g else np.subtract(setting.gravity(was), was)
+    name = gravity_load()
+    load = make_effect(name, replace(model.facts, gravity=tuple(float(v) for v in pull)))
+    known = hypothesis_of(load)
+    amplitude = known.tip_mass if setting.payload_g else known.own_weight
+    column = list(load.amplitudes()).index(amplitude)
+    motion = columns_on(design, [Shape(name, load)])[0][..., column : column + 1]
+    uncertainty = question.uncertainty
+    change = float(np.linalg.norm(pull))
+    if setting.payload_g:
+        change *= setting.payload_g / OWN_WEIGHT_G
+    profile = np.sqrt(np.mean(motion**2, axis=(0, 2, 3)) / max(np.mean(motion**2), 1e-30))
+    size = profile * change * OWN_SAG_SHARE * length_of(model)
+    hidden = OWN_WEIGHT_MISFIT * size**2 * FORM_S / 3.0
+    return motion, float(np.mean(uncertainty.density / (uncertainty.density + hidden)))
+
+
+def _greedy(question: Question, setting: str, parts: dict[str, Moments], minutes: float) -> Plan:
+    """Runs added one by one, each the one that tells most, until the pairs or the time are done."""
+    base = SETUPS[setting].minutes
+    chosen: list[str] = []
+    new: Moments | None = None
+    plan = None
+    while bench_minutes(len(chosen) + 1) <= minutes + 1e-9:
+        best = None
+        for figure, part in parts.items():
+            alone = part if new is None else new + part
+            total = alone if question.known is None else question.known + alone
+            result = question.judged(total)
+            score = _score(result)
+            if question.known is not None:
+                score += _score(question.judged(alone))
+            if best is None or score > best[0]:
+                best = (score, figure, alone, result)
+        score, figure, new, result = best
+        chosen.append(figure)
+        spent = base + bench_minutes(len(chosen))
+        plan = Plan(setting, tuple(chosen), spent, score, result)
+        if len(chosen) >= LEAST_RUNS and plan.worst >= TARGET:
+            break
+    return plan
+
+
+def _score(result: Isolability) -> float:
+    """Expected log probability of the truth, over all ordered pairs."""
+    off = ~np.eye(len(result.names), dtype=bool)
+    return float(log_ndtr(result.distance[off]).sum())
+
+
+# Recommendation ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What to record next."""
+
+    name: str
+    """Its name."""
+    minutes: float
+    """Time on the bench, minutes."""
+    separates: tuple[tuple[str, str], ...]
+    """Pairs of effects that it tells apart."""
+
+
+MINUTES = 15.0
+"""Longest time on the bench where none is asked for, minutes."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two competing effects and the expected chance to name the right one, whichever it is."""
+
+    effects: tuple[str, str]
+    """Their names."""
+    before: float
+    """With the recordings so far, 0.5 to 1."""
+    after: float
+    """With the experiment too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """What to do on the bench next, and what it is worth."""
+
+    name: str
+    """Its name: the excitation signals and the experimental setup."""
+    protocol: Protocol
+    """The schedule, ready for the rig."""
+    setting: str
+    """Name of the experimental setup."""
+    minutes: float
+    """Time on the bench, rests and changes included, minutes."""
+    pairs: tuple[Pair, ...]
+    """Every pair of competing effects."""
+    steps: tuple[str, ...]
+    """What to do, in words."""
+    options: str = ""
+    """Options of `surgisoft collect` for the experimental setup on the virtual rig."""
+    isolability: Isolability | None = field(default=None, repr=False)
+    """What the recordings and the experiment together say about the competing effects."""
+    notes: tuple[str, ...] = ()
+    """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+
+    @property
+    def separates(self) -> tuple[tuple[str, str], ...]:
+        """The pairs that it is expected to tell apart."""
+        return tuple(pair.effects for pair in self.pairs if pair.after >= SURE)
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether it takes a experimental setup that the virtual rig has no option for."""
+        return bool(self.removes)
+
+    @property
+    def removes(self) -> tuple[str, ...]:
+        """Effects that cannot be there any more once the bench is changed."""
+        return SETUPS[self.setting].removes
+
+    @property
+    def experiment(self) -> Experiment:
+        """In short, as a diagnosis names it."""
+        return Experiment(self.name, self.minutes, self.separates)
+
+    @property
+    def why(self) -> str:
+        """One sentence."""
+        worst = min(self.pairs, key=lambda pair: pair.before)
+        a, b = worst.effects
+        many = f"; {len(self.separates)} of {len(self.pairs)} pairs are told apart by it"
+        return (
+            f"the chance to tell {a} from {b} goes from {worst.before:.2f} to {worst.after:.2f}"
+            + (many if len(self.pairs) > 1 else "")
+            + ("; what is recorded should tell them apart already" if worst.before >= SURE else "")
+        )
+
+    def to_json(self) -> dict:
+        """Plain values, as `next-experiment --json` writes them."""
+        return {
+            "name": self.name,
+            "minutes": self.minutes,
+            "setting": self.setting,
+            "collect_options": self.options,
+            "by_hand": self.by_hand,
+            "steps": list(self.steps),
+            "why": self.why,
+            "separates": [list(pair) for pair in self.separates],
+            "pairs": [
+                {"effects": list(p.effects), "before": p.before, "after": p.after}
+                for p in self.pairs
+            ],
+            "notes": list(self.notes),
+        }
+
+
+@torch_threads(1)
+def next_experiment(
+    model: Model,
+    recordings: Recordings = (),
+    between: Sequence[str] | None = None,
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETUPS),
+    reference: Sequence[Recording] | KnownError | None = None,
+) -> Recommendation:
+    """The experiment that best distinguishes competing effects.
+
+    Model and recordings may be given by their paths. The recordings are looked at as `diagnose`
+    does: the training part, the direction of gravity, the residuals of the model's fit.
+
+    between: the competing effects; without them those that explain the recordings best, and
+    without recordings all known ones.
+    settings: names of the experimental setups that may be asked for.
+    reference: as for `diagnose`.
+    """
+    given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not given:
+        return propose(load_model(model), between, minutes, settings)
+    arm, measured, notes = open_inputs(model, given)
+    problem = identification_problem(arm, measured, reference)
+    found = recommend(problem, between or likely_rivals(problem), minutes, settings)
+    return replace(found, notes=notes)
+
+
+def recommend(
+    problem: Problem,
+    rivals: list[str] | tuple[str, ...],
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETUPS),
+) -> Recommendation:
+    """The experiment that best tells the competing effects apart, given a problem's recordings.
+
+    settings: names of the experimental setups that may be asked for.
+    """
+    return _recommend(problem.model, problem, list(rivals), minutes, settings)
+
+
+def propose(
+    model: ArmModel,
+    rivals: list[str] | tuple[str, ...] | None = None,
+    minutes: float = MINUTES,
+    settings: tuple[str, ...] = tuple(SETUPS),
+) -> Recommendation:
+    """The experiment that best tells the competing effects (default: all known effects) apart,
+    before anything was recorded."""
+    return _recommend(model, None, None if rivals is None else list(rivals), minutes, settings)
+
+
+def likely_rivals(problem: Problem, most: int = 4) -> list[str]:
+    """The effects that explain the residual of a problem best: those that one could confuse.
+
+    The best one, and up to `most` in all whose log evidence is at least half of its own; the two
+    best where that is one alone.
+    """
+    question = pose_question(problem.model, problem)
+    gains = question.gains
+    best: dict[str, float] = {}
+    for owner, gain in zip(question.owners, gains, strict=True):
+        best[owner] = max(best.get(owner, -np.inf), gain)
+    order = sorted(best, key=lambda name: -best[name])
+    near = [name for name in order if best[name] >= 0.5 * best[order[0]]]
+    return order[:2] if len(near) < 2 else near[:most]
+
+
+def _recommend(model, problem, rivals, minutes, settings) -> Recommendation:
+    rivals = None if rivals is None else list(dict.fromkeys(rivals))
+    _check(model, rivals, minutes)
+    question = pose_question(model, problem, rivals)
+    limits = _limits(model, problem)
+    for name in settings:
+        if name not in SETUPS:
+            raise unknown_name("experimental setup", name, SETUPS)
+    plans = make_plans(question, limits, minutes, settings)
+    good = [plan for plan in plans if plan.worst >= TARGET]
+    plan = min(good, key=lambda p: p.minutes) if good else max(plans, key=lambda p: p.worst)
+    return _worded(question, plan, limits)
+
+
+def _limits(model: ArmModel, problem: Problem | None) -> np.ndarray:
+    """(m, 2) range of commands: no chamber leaves what was recorded of the arm.
+
+    A chamber that stood still stays where it was. The range of one that hardly moved is widened
+    in the model's scale only: it keeps to what the recordings show.
+    """
+    spec = model.spec
+    limits = limits_within(spec.low, spec.high)
+    widest = max(spec.span)
+    for chamber, idle in enumerate(spec.idle):
+        if idle is not None:
+            limits[chamber] = idle
+        elif problem is not None:
+            history = problem.history
+            seen = history.rows(history.pressure)[:, chamber]
+            low, high = float(seen.min()), float(seen.max())
+            if high - low < STILL_SHARE * widest:
+                limits[chamber] = np.clip(limits[chamber], low, high)
+    return limits
+
+
+def _check(model: ArmModel, rivals: list[str] | None, minutes: float) -> None:
+    for name in rivals or []:
+        if name not in known_effects():
+            make_effect(name, model.facts)
+    if rivals is not None and len(rivals) < 2:
+        raise InputError(
+            f"effects {', '.join(rivals) or 'none'}: expected at least two different effects; "
+            "name them with --between A B"
+        )
+    if not minutes >= bench_minutes(LEAST_RUNS):
+        raise InputError(
+            f"--minutes {minutes:g}: too short for {LEAST_RUNS} runs with their rests, expected at "
+            f"least {bench_minutes(LEAST_RUNS):g}"
+        )
+
+
+def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendation:
+    """A plan as something that a person can do."""
+    setting = SETUPS[plan.setting]
+    seeds = [plan.figures[:k].count(figure) for k, figure in enumerate(plan.figures)]
+    figures = list(zip(plan.figures, seeds, strict=True))
+    names = "+".join(dict.fromkeys(plan.figures))
+    name = names if plan.setting == AS_IT_STANDS else f"{plan.setting}: {names}"
+    protocol = schedule("next_experiment", figures, limits, question.model.spec.unit)
+    before = None if question.known is None else question.judged(question.known)
+    pairs = tuple(
+        Pair((a, b), 0.5 if before is None else before.pair(a, b), plan.result.pair(a, b))
+        for a, b in pairs_of(plan.result.names)
+    )
+    options = setting.options
+    gravity = setting.gravity(question.model.facts.gravity)
+    if gravity is not None:
+        options = options.format(gravity=" ".join(f"{v:.4f}" for v in gravity))
+    words = asdict(words_for(question.model.spec.unit))
+    what = "; ".join(
+        f"{plan.figures.count(f)} x {SIGNALS[f].about.format(**words)}"
+        for f in dict.fromkeys(plan.figures)
+    )
+    about = setting.about.format(**words)
+    steps = [f"{about} (about {setting.minutes:g} min)"] if about else []
+    steps += [
+        f"if the error is gone then, the missing effect is {name}; if it stays, it is not"
+        for name in setting.removes
+    ]
+    steps.append(
+        f"run the schedule: {len(figures)} runs of {RUN_S / 60:g} min ({what}), each from a "
+        f"{words['resting']} that has rested half a minute"
+    )
+    return Recommendation(
+        name, protocol, plan.setting, plan.minutes, pairs, tuple(steps), options, plan.result
+    )

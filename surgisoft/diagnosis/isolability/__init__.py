@@ -1,1 +1,0 @@
-"""Which effects a recording's design can tell apart."""

@@ -1,1 +1,0 @@
-"""The schedule that tells rivals apart."""

@@ -1,1 +1,0 @@
-"""Effects compete to explain held-out errors."""

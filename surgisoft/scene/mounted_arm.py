@@ -1,0 +1,139 @@
+"""An arm at its mount: the laser arm around the ring, the endoscope arm turned to the lesion.
+
+The search of mounts evaluates thousands of mounts with these functions and the batched engine;
+`check` confirms the chosen ones with FCL. Everything is in the world frame.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from surgisoft.scene import frames
+from surgisoft.scene.lesion import Ring
+from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim
+from surgisoft.scene.spec import CameraSpec, LaserSpec, MountSpec
+
+LANDED_MM = 0.3
+"""A ray reaches a point of the surface if it ends this near (mm): half the laser's spot."""
+APPROACH_STEPS = 24
+"""Steps in which the way from rest to the lesion is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class MountedArm:
+    """An arm at its mount."""
+
+    reach: ArmReach
+    """What the arm can do, base frame."""
+    pose: np.ndarray
+    """(4, 4) base frame to world frame, mm."""
+    shaft_mm: float
+    """Straight shaft behind the base (mm)."""
+
+    @classmethod
+    def at(cls, mount: MountSpec, reach: ArmReach) -> "MountedArm":
+        """The arm where the scene file puts it."""
+        return cls(reach, mount.pose(), mount.shaft_mm)
+
+    def lines(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centrelines (M, K or K + 1, 3) mm from the shaft's end, tip directions (M, 3); world."""
+        line, direction = self.reach.shapes(commands)
+        return placed(line, self.pose, self.shaft_mm), frames.rotate(self.pose, direction)
+
+    def inward(self, points_mm: np.ndarray) -> np.ndarray:
+        """World points (M, 3) mm in the base frame."""
+        return frames.apply(frames.invert(self.pose), points_mm)
+
+    def way(self, commands: np.ndarray) -> np.ndarray:
+        """Commands (APPROACH_STEPS, P) in a straight line from rest to `commands` (P,)."""
+        share = np.linspace(0.0, 1.0, APPROACH_STEPS)[:, None]
+        return (1.0 - share) * self.reach.rest + share * commands
+
+
+def placed(lines_mm: np.ndarray, poses: np.ndarray, shaft_mm: float) -> np.ndarray:
+    """Centrelines (..., K, 3) of the base frame in the world, with the shaft's far end in front."""
+    if shaft_mm > 0.0:
+        end = np.zeros_like(lines_mm[..., :1, :])
+        end[..., 2] = -shaft_mm
+        lines_mm = np.concatenate((end, lines_mm), axis=-2)
+    return frames.apply(poses, lines_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class RingSolution:
+    """The laser arm around the ring, M points; commands of points it cannot reach are its best."""
+
+    centre: np.ndarray
+    """(P,) commands with the beam on the lesion's centre, the start of every other solution."""
+    commands: np.ndarray
+    """(M, P) commands with the beam on each ring point."""
+    lines_mm: np.ndarray
+    """(M, K, 3) centrelines, world frame, shaft included."""
+    directions: np.ndarray
+    """(M, 3) of the beam."""
+    in_reach: np.ndarray
+    """(M,) bool: the axis meets the point at an allowed distance."""
+    standoff_mm: np.ndarray
+    """(M,) from the tip to the point (mm)."""
+    incidence_rad: np.ndarray
+    """(M,) between beam and surface normal (rad)."""
+    steep: np.ndarray
+    """(M,) bool: incidence beyond the limit."""
+    step_mm: np.ndarray
+    """(M,) farthest that any point of the arm moves to the next ring point (mm)."""
+
+
+def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
+    """Solve the laser arm for every ring point, all from the solution at the lesion's centre."""
+    start = nearest_commands(arm.reach, arm.inward(ring.centre_mm[None]), laser.standoff_mm)
+    centre = solve_aim(arm.reach, arm.inward(ring.centre_mm[None]), start).commands[0]
+    count = len(ring.points_mm)
+    aimed = solve_aim(arm.reach, arm.inward(ring.points_mm), np.tile(centre, (count, 1)))
+    lines, directions = arm.lines(aimed.commands)
+    low, high = laser.standoff_mm
+    incidence = frames.angle_between(-directions, ring.normals)
+    return RingSolution(
+        centre=centre,
+        commands=aimed.commands,
+        lines_mm=lines,
+        directions=directions,
+        in_reach=aimed.on_target & (aimed.ahead_mm >= low) & (aimed.ahead_mm <= high),
+        standoff_mm=aimed.ahead_mm,
+        incidence_rad=incidence,
+        steep=incidence > np.radians(laser.max_incidence_deg),
+        step_mm=np.linalg.norm(np.roll(lines, -1, axis=0) - lines, axis=-1).max(axis=-1),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class EndoscopePose:
+    """The endoscope arm turned to the lesion."""
+
+    commands: np.ndarray
+    """(P,) commands with the camera's axis on the lesion's centre, or as near as it comes."""
+    line_mm: np.ndarray
+    """(K, 3) centreline, world frame, shaft included."""
+    direction: np.ndarray
+    """(3,) of the camera's axis."""
+    pose: np.ndarray
+    """(4, 4) camera frame to world frame, z along its axis, mm."""
+    distance_mm: float
+    """From the camera to the lesion's centre (mm)."""
+    axis_error_rad: float
+    """Between the camera's axis and the direction to the lesion's centre (rad)."""
+
+
+def look_at_lesion(arm: MountedArm, ring: Ring, camera: CameraSpec) -> EndoscopePose:
+    """Bend the endoscope arm until its axis runs through the lesion's centre."""
+    target = arm.inward(ring.centre_mm[None])
+    aimed = solve_aim(arm.reach, target, nearest_commands(arm.reach, target, camera.range_mm))
+    line, direction = arm.lines(aimed.commands)
+    towards = ring.centre_mm - line[0, -1]
+    return EndoscopePose(
+        aimed.commands[0],
+        line[0],
+        direction[0],
+        frames.pose_from_z(line[0, -1], direction[0]),
+        float(np.linalg.norm(towards)),
+        float(frames.angle_between(direction[0], towards)),
+    )

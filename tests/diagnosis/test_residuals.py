@@ -1,0 +1,71 @@
+"""The model's own error is the validated one without the noise of its validation."""
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis.residuals import model_discrepancy, problem_of
+from surgisoft.measurement.histories import arm_spec, history_of
+from surgisoft.measurement.noise import known_noise
+from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.model import Validation
+from tests.diagnosis.synthetic import NOISE_MM, recording, resting_together, still_model, walk
+
+VALIDATED = [0.5, 1.0, 2.0]
+
+
+def validated_model(**more):
+    model = still_model()
+    model.validation = Validation(1.3, tuple(VALIDATED), 100, **more)
+    return model
+
+
+def test_noise_of_the_validation_is_taken_out_whatever_the_noise_is_now():
+    now = np.full(3, 0.45)
+    expected = np.sqrt(np.square(VALIDATED) - 3 * 0.2**2)
+    found = model_discrepancy(validated_model(noise_mm=0.2), now)
+    assert found == pytest.approx(expected)
+    assert model_discrepancy(validated_model(), now) == pytest.approx(
+        np.sqrt(np.square(VALIDATED) - 0.45**2)
+    )
+
+
+def test_some_of_the_validated_error_is_the_models_own():
+    """Noise that is said to be all of the error or more leaves three tenths."""
+    assert model_discrepancy(validated_model(noise_mm=3.0), np.zeros(3)) == pytest.approx(
+        0.3 * np.array(VALIDATED)
+    )
+
+
+def test_a_louder_recording_does_not_make_the_model_better():
+    pressure = walk(600)
+    quiet, loud = (
+        problem_of(
+            validated_model(noise_mm=0.05),
+            [recording(np.zeros(600), pressure, seed=seed, noise_mm=noise)],
+        )
+        for seed, noise in ((1, 0.05), (2, 0.5))
+    )
+    np.testing.assert_array_equal(quiet.discrepancy_mm, loud.discrepancy_mm)
+
+
+def test_a_fit_keeps_the_noise_that_its_recordings_state_or_show_in_holds():
+    pressure = resting_together(1200)
+    stated, held = (
+        recording(0.3 * pressure[:, 0], pressure, noise_mm=noise) for noise in (0.07, None)
+    )
+    assert known_noise([stated]) == pytest.approx(0.07)
+    assert known_noise([held]) == pytest.approx(NOISE_MM, rel=0.15)
+    quick = FitConfig(hidden=(8,), epochs=10, inputs="pressure")
+    for one in (stated, held):
+        found = fit(history_of([one]), None, arm_spec([one]), quick).model
+        assert found.validation.noise_mm == pytest.approx(known_noise([one]))
+    assert known_noise([recording(np.zeros(300), walk(300, seed=1)[:, :1], noise_mm=None)]) is None
+
+
+def test_a_long_recording_is_cut_into_blocks_of_enough_fitted_rows():
+    """An hour at 10 Hz, every 18th row fitted: blocks of 14.4 s with 8 of them, not of 5 s."""
+    pressure = walk(36_000)
+    problem = problem_of(validated_model(), [recording(np.zeros(36_000), pressure)])
+    assert len(problem.block) == 2000
+    assert np.bincount(problem.block).min() >= 7
+    assert 240 <= problem.block.max() + 1 <= 250

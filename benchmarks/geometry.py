@@ -28,12 +28,12 @@ from surgisoft.scene.batched import BatchedScene, refined
 from surgisoft.scene.bvh import build_tree
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee, surface_model
+from surgisoft.scene.collision import CollisionChecker, surface_model
 from surgisoft.scene.field import build_field
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.render import Renderer
-from surgisoft.scene.torch_bvh import TorchTree
+from surgisoft.scene.torch_queries import TorchTree
 
 RADIUS_MM = 7.5
 LENGTH_MM = 70.0
@@ -123,7 +123,11 @@ def ray_rates(mesh: Mesh, cache: Path) -> dict[str, float]:
     scene = BatchedScene([body], {"laser": RADIUS_MM, "scope": RADIUS_MM}, cache=cache)
     o, d = torch.tensor(origins).float(), torch.tensor(aims).float()
     both = {n: torch.tensor(arms(4096, 0, 40, i)).float() for i, n in enumerate(scene.radii_mm)}
-    embree, referee, tree = EmbreeSurface(mesh), Referee([body]), TorchTree(build_tree(mesh), "cpu")
+    embree, checker, tree = (
+        EmbreeSurface(mesh),
+        CollisionChecker([body]),
+        TorchTree(build_tree(mesh), "cpu"),
+    )
     reach = torch.full((4096,), RANGE_MM, dtype=torch.float64)
     caster = solid.ray
     few = 64
@@ -132,10 +136,10 @@ def ray_rates(mesh: Mesh, cache: Path) -> dict[str, float]:
             lambda: caster.intersects_location(origins, aims, multiple_hits=False), 4096
         ),
         "raw FCL, sliver against mesh": rate(
-            lambda: [raw_fcl_ray(referee, origins[i], aims[i]) for i in range(few)], few
+            lambda: [raw_fcl_ray(checker, origins[i], aims[i]) for i in range(few)], few
         ),
-        "referee, one ray a call": rate(
-            lambda: [referee.cast(origins[i], aims[i], RANGE_MM) for i in range(few)], few
+        "FCL, one ray a call": rate(
+            lambda: [checker.cast(origins[i], aims[i], RANGE_MM) for i in range(few)], few
         ),
         "Embree + float64, batch": rate(lambda: embree.first_hit(origins, aims, RANGE_MM), 4096),
         "batched cast, no arms": rate(lambda: scene.cast(o, d, RANGE_MM), 4096),
@@ -158,14 +162,14 @@ def picture_rate(mesh: Mesh) -> dict[str, float]:
     return {name: rate(lambda: renderer.image(pose, shapes, beam_mm=beam), 1, 8)}
 
 
-def raw_fcl_ray(referee: Referee, origin, aim) -> int:
+def raw_fcl_ray(checker: CollisionChecker, origin, aim) -> int:
     """What FCL itself takes to name the candidate faces."""
     end = origin + RANGE_MM * aim
     side = frames.rotation_from_z(aim)[:, 0] * 1e-3
     model = surface_model(np.stack((origin, end, end + side)), np.array([[0, 1, 2]]))
     request = fcl.CollisionRequest(num_max_contacts=1000, enable_contact=True)
     return fcl.collide(
-        referee._objects[0], fcl.CollisionObject(model), request, fcl.CollisionResult()
+        checker._objects[0], fcl.CollisionObject(model), request, fcl.CollisionResult()
     )
 
 
@@ -173,7 +177,7 @@ def body_rates(mesh: Mesh, cache: Path) -> dict[str, dict[str, float]]:
     """Whole arms a second against one mesh: clearance and collision, near and far."""
     body = Body("organ", "organ", mesh)
     scene = BatchedScene([body], {"arm": RADIUS_MM}, cache=cache)
-    referee = Referee([body])
+    checker = CollisionChecker([body])
     surface = scene._surfaces[0]
     turn, shift = scene._inward(body, None)
     solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
@@ -207,9 +211,7 @@ def body_rates(mesh: Mesh, cache: Path) -> dict[str, dict[str, float]]:
             "raw FCL, capsule by capsule": rate(
                 lambda lines=lines: [raw_fcl_distance(target, line) for line in lines[:48]], 48
             ),
-            "referee": rate(
-                lambda shapes=shapes: [referee.clearance(shape) for shape in shapes], 48
-            ),
+            "FCL": rate(lambda shapes=shapes: [checker.clearance(shape) for shape in shapes], 48),
             "batched (the same call tells collisions)": rate(batched, 2048),
         }
         table[f"collision, {place}"] = {
@@ -217,9 +219,7 @@ def body_rates(mesh: Mesh, cache: Path) -> dict[str, dict[str, float]]:
             "raw FCL, capsule by capsule": rate(
                 lambda lines=lines: [raw_fcl_collide(target, line) for line in lines[:48]], 48
             ),
-            "referee": rate(
-                lambda shapes=shapes: [referee.collisions(shape) for shape in shapes], 48
-            ),
+            "FCL": rate(lambda shapes=shapes: [checker.collisions(shape) for shape in shapes], 48),
             "batched": rate(batched, 2048),
         }
     return table

@@ -131,7 +131,7 @@ def own_ways(mesh: Mesh, work: Work, cache: Path, device: str) -> dict[str, list
     from surgisoft.scene.batched import BatchedScene, refined
     from surgisoft.scene.bvh import build_tree
     from surgisoft.scene.rays import EmbreeSurface
-    from surgisoft.scene.torch_bvh import TorchTree
+    from surgisoft.scene.torch_queries import TorchTree
 
     bodies = [Body("organ", "organ", mesh)]
     scene = BatchedScene(bodies, {"arm": RADIUS_MM}, cache=cache)
@@ -200,18 +200,19 @@ def own_ways(mesh: Mesh, work: Work, cache: Path, device: str) -> dict[str, list
 
 
 def fcl_ways(mesh: Mesh, work: Work) -> dict[str, list[Way]]:
-    """The referee, one query a call: the truth that errors are taken against."""
+    """The checker, one query a call: the truth that errors are taken against."""
     from surgisoft.scene.capsules import ArmShape
-    from surgisoft.scene.collision import Referee, points_inside
+    from surgisoft.scene.collision import CollisionChecker
+    from surgisoft.scene.inside import points_inside
 
-    referee = Referee([Body("organ", "organ", mesh)])
+    checker = CollisionChecker([Body("organ", "organ", mesh)])
 
     def arms(lines):
         shapes = ({"arm": ArmShape(line, RADIUS_MM)} for line in lines)
-        return np.array([referee.clearance(s).bodies_mm["arm", "organ"] for s in shapes])
+        return np.array([checker.clearance(s).bodies_mm["arm", "organ"] for s in shapes])
 
     def rays(n):
-        return referee.cast(work.origins[:n], work.aims[:n], RANGE_MM).distance_mm
+        return checker.cast(work.origins[:n], work.aims[:n], RANGE_MM).distance_mm
 
     def points(n):
         import fcl
@@ -220,7 +221,7 @@ def fcl_ways(mesh: Mesh, work: Work) -> dict[str, list[Way]]:
         for point in work.points[:n]:
             ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
             request, result = fcl.DistanceRequest(), fcl.DistanceResult()
-            found.append(fcl.distance(ball, referee._objects[0], request, result))
+            found.append(fcl.distance(ball, checker._objects[0], request, result))
         return np.array(found)
 
     return {

@@ -19,7 +19,7 @@ FAR = wp.constant(1e6)
 
 @wp.func
 def segments_d2(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Squared distance of two segments, as `kernels.segments_d2`."""
+    """Squared distance of two segments, as `bvh.segments_d2`."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     d1 = q - p
@@ -60,7 +60,7 @@ def over_d2(p: wp.vec3d, a: wp.vec3d, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, far
 def segment_triangle_d2(
     p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, bound2: wp.float64
 ):
-    """Squared distance of a segment to a triangle, at most bound2, as in `kernels`."""
+    """Squared distance of a segment to a triangle, at most bound2, as in `bvh`."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     n = wp.cross(b - a, c - a)

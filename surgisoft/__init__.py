@@ -60,8 +60,8 @@ _PLACES = {
     "fit": "measurement.fitting",
     "improve": "diagnosis.improve",
     "load_model": "surrogate.checkpoint",
-    "load_recording": "measurement.recordings.recording",
-    "load_recordings": "measurement.recordings.recording",
+    "load_recording": "measurement.recordings",
+    "load_recordings": "measurement.recordings",
     "make": "tasks.make",
     "next_experiment": "diagnosis.design.next_experiment",
     "open_replay": "replay.show",
@@ -69,7 +69,7 @@ _PLACES = {
     "parallel_env": "tasks.parallel",
     "register_effect_file": "surrogate.effects",
     "save_model": "surrogate.checkpoint",
-    "save_recording": "measurement.recordings.recording",
+    "save_recording": "measurement.recordings",
     "train": "agents.session",
 }
 """The module of each function, inside the package."""

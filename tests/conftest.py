@@ -1,6 +1,15 @@
-"""Settings that hold for every test: one thread, seeds, and where measured data may lie."""
+"""Settings that hold for every test: one thread, seeds, slow tests, and where measured data may be.
+
+`slow.txt` lists the tests that take at least SLOW_S of processor time; `pytest -m fast` runs the
+others. The list is written by
+
+    OMP_NUM_THREADS=1 python -m pytest -n 0 -q --write-slow
+
+which measures every test, with its fixtures and the processes that it starts.
+"""
 
 import os
+from collections import defaultdict
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -12,6 +21,52 @@ settings.register_profile(
     "surgisoft", deadline=None, max_examples=30, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("surgisoft")
+
+SLOW_S = 1.0
+"""Processor time of a test, with its fixtures, from which it is slow, s."""
+SLOW = Path(__file__).with_name("slow.txt")
+"""The slow tests: `path::function` and the time of the slowest of its cases, s."""
+
+_TIMES: dict[str, float] = defaultdict(float)
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--write-slow", action="store_true", help=f"measure all tests and write {SLOW.name} anew"
+    )
+
+
+def pytest_collection_modifyitems(items):
+    """Mark each test `slow` or `fast`."""
+    slow = {line.split()[0] for line in SLOW.read_text().splitlines()}
+    for item in items:
+        item.add_marker(pytest.mark.slow if _function(item) in slow else pytest.mark.fast)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    before = _processor_s()
+    try:
+        return (yield)
+    finally:
+        name = _function(item)
+        _TIMES[name] = max(_TIMES[name], _processor_s() - before)
+
+
+def pytest_sessionfinish(session):
+    if session.config.getoption("--write-slow"):
+        slow = {name: time for name, time in _TIMES.items() if time >= SLOW_S}
+        SLOW.write_text("".join(f"{name} {slow[name]:.1f}\n" for name in sorted(slow)))
+
+
+def _function(item) -> str:
+    """The test's file and name, without its parameters."""
+    return item.nodeid.partition("[")[0]
+
+
+def _processor_s() -> float:
+    """Processor time of this process and of those that it has waited for, s."""
+    return sum(os.times()[:4])
 
 
 @pytest.fixture(scope="session", autouse=True)

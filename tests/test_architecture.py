@@ -63,6 +63,28 @@ FLOORS = {
         ("improve",),
         ("pages",),
     ),
+    "scene": (
+        ("frames",),
+        ("mesh", "capsules", "camera"),
+        ("meshio", "bvh", "rays", "plate"),
+        ("field", "distance", "torch_queries", "inside", "render"),
+        ("batched", "collision"),
+        ("reach", "spec"),
+        ("lesion", "repair", "dose_patch"),
+        ("folder", "mounted_arm", "ablation"),
+        ("mounts", "check"),
+        ("author",),
+    ),
+    "replay": (
+        ("colours", "shapes", "surfaces"),
+        ("plots",),
+        ("recording",),
+        ("arms", "endoscope"),
+        ("episode_view", "scene_view", "reach_map"),
+        ("comparison", "viewer"),
+        ("show",),
+    ),
+    "report": (("parts", "style"), ("charts", "page")),
 }
 """Floors of a part, from the ground up: its modules and folders import from floors below only."""
 

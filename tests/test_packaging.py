@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from surgisoft.scene.packaged import PHANTOM
+from surgisoft.scene.spec import PHANTOM
 
 ROOT = Path(__file__).resolve().parents[1]
 WANTED = {

@@ -15,7 +15,7 @@ import torch
 
 from surgisoft.agents.rollout import Instant
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.world.scene import LASER
 
@@ -72,7 +72,7 @@ class ExactChecks:
         """task: one whose world has obstacles, see `has_obstacles`."""
         around = task.world.scene
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
-        self.checker = Referee(around.geometry.bodies)
+        self.checker = CollisionChecker(around.geometry.bodies)
         self.beam_mm = around.beam_mm if LASER in task.world.arms else None
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
 

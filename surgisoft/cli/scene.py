@@ -119,8 +119,12 @@ def show(
 ) -> None:
     """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
     from surgisoft.replay.scene_view import save_scene_view
-    from surgisoft.replay.screenshot import take_screenshot
-    from surgisoft.replay.viewer import open_viewer, serve_viewer, temporary_recording
+    from surgisoft.replay.viewer import (
+        open_viewer,
+        serve_viewer,
+        take_screenshot,
+        temporary_recording,
+    )
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
 

@@ -19,8 +19,8 @@ from surgisoft.files import write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
-from surgisoft.scene.packaged import PHANTOM, packaged_scene
 from surgisoft.scene.spec import FILE as SCENE_FILE
+from surgisoft.scene.spec import PHANTOM, packaged_scene
 
 PACKAGED = PHANTOM / "experiments"
 """The experiments that come with the package."""

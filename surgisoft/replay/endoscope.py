@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.colours import CONE_COLOUR, LESION_TINT
 from surgisoft.replay.recording import Columns
+from surgisoft.replay.shapes import view_cone
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
@@ -22,14 +23,16 @@ from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 
 CAMERA = "/endoscope/camera"
-"""The camera's pose and its pictures."""
+"""The camera's pose and its pictures, for the 2D view."""
+CONE = "/endoscope/cone"
+"""The camera's round field of view as lines, for the 3D view: a pinhole is drawn as a pyramid."""
 PIXELS = 240
 """Width and height of a picture."""
 PICTURES_HZ = 2.5
 """Pictures a second."""
 JPEG_QUALITY = 82
-FRUSTUM_MM = 16.0
-"""Length of the drawn frustum (mm)."""
+CONE_MM = 16.0
+"""Length of the drawn cone (mm)."""
 LESION_LINEAR = np.array([0.62, 0.34, 0.16])
 BLANCHED_LINEAR = np.array([0.62, 0.50, 0.42])
 CHARRED_LINEAR = np.array([0.015, 0.012, 0.010])
@@ -50,17 +53,18 @@ def log_camera(
     pinhole = rr.Pinhole(
         resolution=[PIXELS, PIXELS],
         focal_length=0.5 * PIXELS / math.tan(half),
-        image_plane_distance=FRUSTUM_MM,
         camera_xyz=rr.ViewCoordinates.RDF,
-        color=CONE_COLOUR,
-        line_width=0.15,
     )
     columns.recording.log(CAMERA, pinhole, static=True)
+    lines = view_cone(np.zeros(3), np.array([0.0, 0.0, 1.0]), half, CONE_MM)
+    cone = rr.LineStrips3D(lines, colors=[CONE_COLOUR] * len(lines), radii=[0.15] * len(lines))
+    columns.recording.log(CONE, cone, static=True)
     poses = frames.pose_from_z(arm.line_mm[rows, -1].astype(float), arm.tip_direction[rows])
-    moving = rr.Transform3D.columns(
-        translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
-    )
-    columns.send(CAMERA, rows, moving)
+    for entity in (CAMERA, CONE):
+        moving = rr.Transform3D.columns(
+            translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
+        )
+        columns.send(entity, rows, moving)
     pictures = jpegs(log, looks, report)
     style = rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="linear")
     columns.recording.log(f"{CAMERA}/picture", style, static=True)

@@ -19,11 +19,17 @@ from surgisoft.replay.colours import (
 from surgisoft.replay.recording import new_recording
 from surgisoft.replay.shapes import creased, finer, polar_patch, tube, view_cone
 from surgisoft.scene import frames
-from surgisoft.scene.check import held_arms
+from surgisoft.scene.check import mounted_arms
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import circle_on, nearest_on_surface
+from surgisoft.scene.mounted_arm import (
+    EndoscopePose,
+    MountedArm,
+    RingSolution,
+    look_at_lesion,
+    solve_ring,
+)
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.sweep import Cut, Held, Look, cut_ring, look_at_lesion
 
 BORE_MM = 1.5
 """Radius of the arm's channel: 3 mm across in the paper's arm (mm)."""
@@ -35,8 +41,8 @@ FRAMES = 72
 
 def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> None:
     """Write the scene as an .rrd file that opens by itself with a fitting view."""
-    arms, ring = held_arms(scene, reaches), scene.ring
-    cut = cut_ring(arms["laser"], ring, scene.spec.laser)
+    arms, ring = mounted_arms(scene, reaches), scene.ring
+    cut = solve_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
     identity = scene.content_hash[:16]
     with new_recording(path, "surgisoft_scene", identity, blueprint(scene, arms)) as recording:
@@ -46,7 +52,7 @@ def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> N
         _log_laser(recording, arms["laser"], cut, ring.points_mm)
 
 
-def blueprint(scene: Scene, arms: dict[str, Held]) -> rrb.Blueprint:
+def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
     """One 3D view from the side on which the lesion lies, with lesion and both bases in it."""
     organ = scene.organ.world_mesh.bounds_mm
     points = np.array([*organ, *(arm.pose[:3, 3] for arm in arms.values())])
@@ -69,7 +75,7 @@ def blueprint(scene: Scene, arms: dict[str, Held]) -> rrb.Blueprint:
     )
 
 
-def _side_of_both_arms(scene: Scene, arms: dict[str, Held]) -> np.ndarray:
+def _side_of_both_arms(scene: Scene, arms: dict[str, MountedArm]) -> np.ndarray:
     """(3,) horizontal unit vector from which lesion and both arms lie side by side."""
     first, second = (arm.pose[:3, 3] for arm in arms.values())
     apart = (first - second) * [1.0, 1.0, 0.0]
@@ -134,7 +140,7 @@ def _log_lesion(recording, scene: Scene) -> None:
     )
 
 
-def _log_arm(recording, tool: str, arm: Held, line_mm: np.ndarray, static: bool) -> None:
+def _log_arm(recording, tool: str, arm: MountedArm, line_mm: np.ndarray, static: bool) -> None:
     """The soft body as a tube; the shaft behind it once."""
     body = line_mm[1:] if arm.shaft_mm > 0.0 else line_mm
     vertices, faces, normals = tube(finer(body, 2.0), arm.reach.radius_mm, BORE_MM)
@@ -150,7 +156,7 @@ def _log_arm(recording, tool: str, arm: Held, line_mm: np.ndarray, static: bool)
     )
 
 
-def _log_shaft(recording, tool: str, arm: Held) -> None:
+def _log_shaft(recording, tool: str, arm: MountedArm) -> None:
     if arm.shaft_mm <= 0.0:
         return
     ends = arm.pose[:3, 3] - np.array([arm.shaft_mm, 0.0])[:, None] * arm.pose[:3, 2]
@@ -167,7 +173,7 @@ def _log_shaft(recording, tool: str, arm: Held) -> None:
     )
 
 
-def _log_endoscope(recording, scene: Scene, arm: Held, look: Look) -> None:
+def _log_endoscope(recording, scene: Scene, arm: MountedArm, look: EndoscopePose) -> None:
     _log_shaft(recording, "endoscope", arm)
     _log_arm(recording, "endoscope", arm, look.line_mm, static=True)
     half = np.radians(scene.spec.camera.fov_deg / 2)
@@ -179,7 +185,7 @@ def _log_endoscope(recording, scene: Scene, arm: Held, look: Look) -> None:
     )
 
 
-def _log_laser(recording, arm: Held, cut: Cut, ring_mm: np.ndarray) -> None:
+def _log_laser(recording, arm: MountedArm, cut: RingSolution, ring_mm: np.ndarray) -> None:
     """The laser goes round the ring, one moment a point."""
     _log_shaft(recording, "laser", arm)
     for i in range(0, len(ring_mm), max(1, len(ring_mm) // FRAMES)):

@@ -11,25 +11,25 @@ import numpy as np
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.progress import Progress, silent
+from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.buried import buried_faces
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
-from surgisoft.scene.folder import Scene, rounded_mount
-from surgisoft.scene.index import used_indices
-from surgisoft.scene.mesh import ROLES, Body, Mesh
+from surgisoft.scene.folder import Scene
+from surgisoft.scene.inside import buried_faces
+from surgisoft.scene.lesion import OrganSurface, Site, directed_site, good_sites, pointed_site
+from surgisoft.scene.mesh import ROLES, Body, Mesh, used_indices
 from surgisoft.scene.meshio import (
     MM_PER_UNIT,
     Part,
     check_organ_size,
+    given_unit,
     read_parts,
     recognise_unit,
-    told_unit,
     write_ply,
 )
-from surgisoft.scene.placement import Pair, find_mounts
+from surgisoft.scene.mounts import Pair, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
-from surgisoft.scene.site import Site, directed_site, good_sites, pointed_site
 from surgisoft.scene.spec import (
     FILE,
     BodySpec,
@@ -44,7 +44,7 @@ from surgisoft.scene.spec import (
 
 FAR_OFF = 20.0
 """A mesh whose middle lies this many times its size from the origin is moved there."""
-SAID_FROM_MM = 1.0
+REPORTED_FROM_MM = 1.0
 """A lesion that is moved farther than this onto the surface is told so (mm)."""
 COARSE_RING = 36
 """Ring points while mounts are searched."""
@@ -86,6 +86,8 @@ class Prepared:
     """Role of each."""
     meshes: tuple[Mesh, ...]
     """Closed meshes, world frame, mm."""
+    holes_mm: tuple[np.ndarray, ...]
+    """For each mesh (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
     mm_per_unit: float
     """Of the first file."""
     shift_mm: np.ndarray
@@ -101,9 +103,13 @@ class Authored:
     scene: Scene
     """The scene; its folder is not yet there."""
     check: SceneCheck
-    """The referee's verdict on it."""
+    """The checker's verdict on it."""
     notes: tuple[str, ...]
     """What was recognised, repaired and chosen, one line each."""
+
+
+_NamedBody = tuple[str, Mesh, np.ndarray]
+"""Name, closed mesh, and (F,) mm: width of the hole that each face closes, else 0."""
 
 
 class NoMounts(InputError):
@@ -128,7 +134,7 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
         raise unknown_name("unit", request.unit, MM_PER_UNIT)
     notes: list[str] = []
     names: list[str] = []
-    roles, meshes, scales = [], [], []
+    roles, meshes, holes_mm, scales = [], [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         tell = partial(_tell, report, i, len(request.meshes), path.name)
         tell("reading")
@@ -141,16 +147,18 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
             unit, told = guess.unit, guess.sentence
         else:
-            unit, told = request.unit, told_unit(size, request.unit)
+            unit, told = request.unit, given_unit(size, request.unit)
         scales.append(MM_PER_UNIT[unit])
         if role == "organ":
             check_organ_size(path, size * scales[-1], told)
         notes.append(f"{path.name}: unit {told}")
         found = _closed_bodies(path, parts, scales[-1], notes, tell)
-        for i, (name, mesh) in enumerate(sorted(found, key=lambda pair: -_area(pair[1]))):
+        found = sorted(found, key=lambda body: -_area(body[1]))
+        for i, (name, mesh, hole_mm) in enumerate(found):
             names.append(_free_name(name, names))
             roles.append(role if i == 0 or role != "organ" else "keep-out")
             meshes.append(mesh)
+            holes_mm.append(hole_mm)
     bounds = meshes[0].bounds_mm
     middle, size = bounds.mean(axis=0), np.ptp(bounds, axis=0).max()
     shift = np.zeros(3)
@@ -161,10 +169,18 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     if len(meshes) > 1:
         listed = ", ".join(f"{name} ({role})" for name, role in zip(names, roles, strict=True))
         notes.append(f"{len(meshes)} bodies: {listed}")
-    return Prepared(tuple(names), tuple(roles), tuple(meshes), scales[0], shift, tuple(notes))
+    return Prepared(
+        tuple(names),
+        tuple(roles),
+        tuple(meshes),
+        tuple(holes_mm),
+        scales[0],
+        shift,
+        tuple(notes),
+    )
 
 
-def _closed_bodies(path, parts, scale, notes, tell) -> list[tuple[str, Mesh]]:
+def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
     """Every part repaired; where one is beyond repair, all parts taken as one surface.
 
     If that is beyond repair too, the broken parts are left out, unless nothing is left.
@@ -196,7 +212,7 @@ def _tell(report: Progress, number: int, count: int, name: str, what: str) -> No
     report(5.0 * number / count, 100, f"{name}: {what}")
 
 
-def _repaired(path, parts, scale, tell) -> tuple[list[tuple[str, Mesh]], list[InputError], dict]:
+def _repaired(path, parts, scale, tell) -> tuple[list[_NamedBody], list[InputError], dict]:
     """Named closed bodies of the parts, what was beyond repair, and the repairs' counts."""
     found, failures = [], []
     done: dict[str, int] = {}
@@ -213,7 +229,10 @@ def _repaired(path, parts, scale, tell) -> tuple[list[tuple[str, Mesh]], list[In
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem
-        found += [(name, mesh) for mesh in repaired.bodies]
+        found += [
+            (name, mesh, hole_mm)
+            for mesh, hole_mm in zip(repaired.bodies, repaired.holes_mm, strict=True)
+        ]
     return found, failures, done
 
 
@@ -234,8 +253,13 @@ def _free_name(name: str, taken: Sequence[str]) -> str:
 
 def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     """Places for the lesion: the one pointed at, else several good ones."""
-    meshes = list(prepared.meshes)
-    operable = [m for m, role in zip(meshes, prepared.roles, strict=True) if role != "support"]
+    surfaces = [
+        OrganSurface(mesh, hole_mm)
+        for mesh, hole_mm in zip(prepared.meshes, prepared.holes_mm, strict=True)
+    ]
+    operable = [
+        surface for surface, role in zip(surfaces, prepared.roles, strict=True) if role != "support"
+    ]
     if request.lesion is not None:
         point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
         said = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
@@ -244,7 +268,7 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
         return [pointed_site(operable, point, request.diameter_mm, said)]
     if request.lesion_direction is not None:
         return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
-    return good_sites(meshes, request.diameter_mm)
+    return good_sites(surfaces, request.diameter_mm)
 
 
 def author(
@@ -343,13 +367,29 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
     return Scene(spec, Path(), bodies)
 
 
+def rounded_mount(position_mm, rotation) -> dict:
+    """A mount's place as the file writes it: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
+
+    position_mm (3,) and rotation (3, 3) of the base frame in the world frame; answers
+    `position_mm`, `direction` and `roll_deg` for `MountSpec`.
+    """
+    direction = rotation[:, 2].round(6) + 0.0
+    plain = frames.rotation_from_z(direction)
+    roll = np.degrees(np.arctan2(rotation[:, 0] @ plain[:, 1], rotation[:, 0] @ plain[:, 0]))
+    return {
+        "position_mm": tuple((np.asarray(position_mm).round(2) + 0.0).tolist()),
+        "direction": tuple(direction.tolist()),
+        "roll_deg": float(np.round(roll, 2) + 0.0),
+    }
+
+
 def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
     assert check.work is not None, "a scene that was chosen has its arms at work"
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"
     return [
-        *([moved] if site.moved_mm > SAID_FROM_MM else []),
+        *([moved] if site.moved_mm > REPORTED_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
         f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "

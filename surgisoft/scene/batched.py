@@ -1,7 +1,7 @@
-"""Geometry of many environments at once: what training asks, in the referee's own terms.
+"""Clearance and ray queries for many environments at once, as training needs them.
 
-`BatchedScene` answers what `collision.Referee` answers, for batches of arms: on the CPU with
-Embree and compiled queries, on an accelerator with torch. Both agree with the referee to the
+`BatchedScene` gives the results of `collision.CollisionChecker` for batches of arms: on the CPU
+with Embree and compiled queries, on an accelerator with torch. Both agree with FCL to the
 tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
@@ -19,12 +18,12 @@ import torch
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import build_tree
-from surgisoft.scene.capsules import HORIZON_MM, chain_normal, self_contact_gap_mm
+from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
 from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
 from surgisoft.scene.field import MOST_NODES, load_field
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
-from surgisoft.scene.torch_distance import (
+from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
     chains_folded_torch,
@@ -39,29 +38,6 @@ MOST_PARTS = 256
 """No segment is cut into more parts than this."""
 EXACT_WITHIN_MM = 5.0
 """Nearer than this, clearances are exact; farther, off by the field's interpolation (mm)."""
-
-
-@dataclass(frozen=True, eq=False)
-class BatchClearance:
-    """Signed clearances (mm) of a batch, as `collision.Clearance` defines them, saturating."""
-
-    bodies_mm: torch.Tensor
-    """(B, A, N) arm by body, in the order of the scene's arms and bodies."""
-    arms_mm: torch.Tensor
-    """(B, A (A - 1) / 2) each pair of arms once, in the order of itertools.combinations."""
-    self_mm: torch.Tensor
-    """(B, A) each arm against itself."""
-
-    @property
-    def least_mm(self) -> torch.Tensor:
-        """(B,) the smallest against bodies and other arms, mm."""
-        return torch.cat((self.bodies_mm.flatten(1), self.arms_mm), 1).amin(1)
-
-    @property
-    def collides(self) -> torch.Tensor:
-        """(B,) bool: any arm overlaps a body, the other arm or itself."""
-        parts = (self.bodies_mm.flatten(1), self.arms_mm, self.self_mm)
-        return (torch.cat(parts, 1) < 0.0).any(1)
 
 
 class BatchedScene:

@@ -1,7 +1,7 @@
 """What the endoscope sees of the lesion: in the field of view, in focus, hidden by nothing.
 
 A camera looks along its pose's z axis, x to the right and y down in the picture (`frames.look_at`
-makes such poses). The same code serves the referee (numpy) and the batched engine (torch).
+makes such poses). The same code serves the checker (numpy) and the batched engine (torch).
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ class View:
 def view(caster, camera: Camera, pose, points_mm, normals, arms=None, own=None, **where) -> View:
     """What a camera at pose (..., 4, 4) sees of points (M, 3) or (..., M, 3) mm, world frame.
 
-    `caster` is a `collision.Referee` (numpy) or a `batched.BatchedScene` (torch, poses (B, 4, 4));
-    normals as the points; `arms` stand in the way as for its `cast`, `own` carries the camera;
+    `caster` casts the lines of sight: a `collision.CollisionChecker` (numpy) or a
+    `batched.BatchedScene` (torch, poses (B, 4, 4)). `normals` has the shape of the points. `arms`
+    can block the view, as in the caster's `cast`; `own` names the arm that carries the camera;
     further keywords go to `cast`.
     """
     points, normals = _like(pose, points_mm), _like(pose, normals)

@@ -41,6 +41,29 @@ class ArmShape:
         object.__setattr__(self, "centreline_mm", points)
 
 
+@dataclass(frozen=True, eq=False)
+class BatchClearance:
+    """Signed clearances (mm) of a batch, as `collision.Clearance` defines them, saturating."""
+
+    bodies_mm: torch.Tensor
+    """(B, A, N) arm by body, in the order of the scene's arms and bodies."""
+    arms_mm: torch.Tensor
+    """(B, A (A - 1) / 2) each pair of arms once, in the order of itertools.combinations."""
+    self_mm: torch.Tensor
+    """(B, A) each arm against itself."""
+
+    @property
+    def least_mm(self) -> torch.Tensor:
+        """(B,) the smallest against bodies and other arms, mm."""
+        return torch.cat((self.bodies_mm.flatten(1), self.arms_mm), 1).amin(1)
+
+    @property
+    def collides(self) -> torch.Tensor:
+        """(B,) bool: any arm overlaps a body, the other arm or itself."""
+        parts = (self.bodies_mm.flatten(1), self.arms_mm, self.self_mm)
+        return (torch.cat(parts, 1) < 0.0).any(1)
+
+
 def self_contact_gap_mm(radius_mm: float) -> float:
     """Arc length (mm) from which two stretches of one arm can be told to touch.
 

@@ -1,4 +1,4 @@
-"""Judge a whole scene with the referee: meshes, lesion, both arms at rest and at work, the view."""
+"""Judge a whole scene with the checker: meshes, lesion, both arms at rest and at work, the view."""
 
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.lesion import (
     ON_SURFACE_MM,
@@ -20,9 +20,16 @@ from surgisoft.scene.lesion import (
     path_off_mm,
     path_slack_mm,
 )
+from surgisoft.scene.mounted_arm import (
+    LANDED_MM,
+    EndoscopePose,
+    MountedArm,
+    RingSolution,
+    look_at_lesion,
+    solve_ring,
+)
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import TOOLS
-from surgisoft.scene.sweep import LANDED_MM, Cut, Held, Look, cut_ring, look_at_lesion
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """What a ring point's code means, in the order in which they are looked for."""
@@ -55,9 +62,9 @@ class Work:
 
     reason: np.ndarray
     """(M,) int: index into REASONS of each ring point."""
-    cut: Cut
+    cut: RingSolution
     """The laser arm's solutions around the ring."""
-    look: Look
+    look: EndoscopePose
     """The endoscope arm turned to the lesion."""
     clearance_mm: np.ndarray
     """(M,) mm: least clearance of both arms with the beam on each ring point; -1 for contact."""
@@ -72,7 +79,7 @@ class Work:
 
 @dataclass(frozen=True, eq=False)
 class SceneCheck:
-    """The referee's verdict on a scene."""
+    """The checker's verdict on a scene."""
 
     findings: tuple[Finding, ...]
     """The table."""
@@ -97,9 +104,9 @@ def sentence(check: SceneCheck) -> str:
     return f"The scene is not ready: {'; '.join(bad)}."
 
 
-def held_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, Held]:
+def mounted_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, MountedArm]:
     """Both arms at their mounts, by tool."""
-    return {tool: Held.at(scene.spec.mount(tool), reaches[tool]) for tool in TOOLS}
+    return {tool: MountedArm.at(scene.spec.mount(tool), reaches[tool]) for tool in TOOLS}
 
 
 def check_scene(
@@ -114,17 +121,19 @@ def check_scene(
     findings = (*_mesh_findings(scene), _lesion_finding(scene))
     if not findings[-1].good:
         return SceneCheck(findings, None)
-    referee, arms = Referee(scene.bodies), held_arms(scene, reaches)
-    work = _work(scene, referee, arms, report)
+    checker, arms = CollisionChecker(scene.bodies), mounted_arms(scene, reaches)
+    work = _work(scene, checker, arms, report)
     report(len(work.reason) + 1, len(work.reason) + 2, "ways")
-    ways = _way_finding(scene, referee, arms, work)
+    ways = _way_finding(scene, checker, arms, work)
     return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
 
 
-def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Progress) -> Work:
+def _work(
+    scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], report: Progress
+) -> Work:
     """The laser once around the ring beside the endoscope that looks at it."""
     limits, ring = scene.spec.limits, scene.ring
-    cut = cut_ring(arms["laser"], ring, scene.spec.laser)
+    cut = solve_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
     radius = {tool: arms[tool].reach.radius_mm for tool in TOOLS}
     scope = ArmShape(look.line_mm, radius["endoscope"])
@@ -132,9 +141,9 @@ def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Progres
     clearance, landed = np.empty(len(shapes)), np.zeros(len(shapes), dtype=bool)
     for i, shape in enumerate(shapes):
         both = {"laser": shape, "endoscope": scope}
-        clearance[i] = -1.0 if referee.collisions(both) else referee.clearance(both).least_mm
+        clearance[i] = -1.0 if checker.collisions(both) else checker.clearance(both).least_mm
         reach_mm = max(cut.standoff_mm[i], 0.0) + 50.0
-        hit = referee.cast(cut.lines_mm[i, -1], cut.directions[i], reach_mm, both, own="laser")
+        hit = checker.cast(cut.lines_mm[i, -1], cut.directions[i], reach_mm, both, own="laser")
         landed[i] = bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[i]) <= LANDED_MM
         report(i + 1, len(shapes) + 2, "ring")
     # the arm moves on to both neighbours: no point of it is farther than half a step from a shape
@@ -143,7 +152,7 @@ def _work(scene: Scene, referee: Referee, arms: dict[str, Held], report: Progres
     close = clearance < np.maximum(limits.clearance_mm, 0.5 * step)
     tests = (~cut.in_reach, cut.steep, ~landed, close, step > 0.5 * radius["laser"])
     reason = np.select(tests, range(1, len(REASONS)), 0)
-    return Work(reason, cut, look, clearance, _view(referee, look, shapes, scene))
+    return Work(reason, cut, look, clearance, _view(checker, look, shapes, scene))
 
 
 def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
@@ -218,8 +227,10 @@ def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
     )
 
 
-def _way_finding(scene: Scene, referee: Referee, arms: dict[str, Held], work: Work) -> Finding:
-    touching, least, half_step = _ways(referee, arms, work.cut, work.look)
+def _way_finding(
+    scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
+) -> Finding:
+    touching, least, half_step = _ways(checker, arms, work.cut, work.look)
     clearance = scene.spec.limits.clearance_mm
     return Finding(
         "contacts at rest and on the way",
@@ -229,17 +240,21 @@ def _way_finding(scene: Scene, referee: Referee, arms: dict[str, Held], work: Wo
     )
 
 
-def _view(referee: Referee, look: Look, shapes: list[ArmShape], scene: Scene) -> np.ndarray:
+def _view(
+    checker: CollisionChecker, look: EndoscopePose, shapes: list[ArmShape], scene: Scene
+) -> np.ndarray:
     """Fraction of ring points in view with the laser on every VIEW_EVERYth of them."""
     camera, ring = scene.spec.camera.camera(), scene.ring
     looks = (
-        view(referee, camera, look.pose, ring.points_mm, ring.normals, {"laser": shape})
+        view(checker, camera, look.pose, ring.points_mm, ring.normals, {"laser": shape})
         for shape in shapes[::VIEW_EVERY]
     )
     return np.array([one.fraction for one in looks])
 
 
-def _ways(referee: Referee, arms: dict[str, Held], cut: Cut, look: Look):
+def _ways(
+    checker: CollisionChecker, arms: dict[str, MountedArm], cut: RingSolution, look: EndoscopePose
+):
     """Contacts at rest and from rest to the lesion, the endoscope first; least clearance (mm).
 
     Also half the largest step (mm): between two of the shapes looked at, no point of an arm is
@@ -256,9 +271,9 @@ def _ways(referee: Referee, arms: dict[str, Held], cut: Cut, look: Look):
             "laser": ArmShape(laser_line, arms["laser"].reach.radius_mm),
             "endoscope": ArmShape(scope_line, arms["endoscope"].reach.radius_mm),
         }
-        for collision in referee.collisions(both):
+        for collision in checker.collisions(both):
             touching[f"{collision.arm} touches {collision.other}"] = None
-        least = min(least, referee.clearance(both).least_mm)
+        least = min(least, checker.clearance(both).least_mm)
     steps = [np.linalg.norm(np.diff(w, axis=0), axis=-1).max() for w in (scope_way, laser_way)]
     return list(touching), float(least), 0.5 * float(max(steps))
 
@@ -280,7 +295,7 @@ class Patch:
 def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> Patch:
     """Reach and incidence on circles about the lesion's centre, out to 1.6 of its diameter."""
     mesh, ring, laser = scene.organ.world_mesh, scene.ring, scene.spec.laser
-    arm = held_arms(scene, reaches)["laser"]
+    arm = mounted_arms(scene, reaches)["laser"]
     _, face = nearest_on_surface(mesh, ring.centre_mm[None])
     engine = BatchedScene(scene.bodies, {"laser": arm.reach.radius_mm}, most_nodes=PLANNING_NODES)
     plane = frames.rotation_from_z(ring.normal)
@@ -291,7 +306,7 @@ def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> 
         )
         if circle is None:
             break
-        cut = cut_ring(arm, replace(circle, centre_mm=ring.centre_mm, normal=ring.normal), laser)
+        cut = solve_ring(arm, replace(circle, centre_mm=ring.centre_mm, normal=ring.normal), laser)
         lines = torch.from_numpy(cut.lines_mm)
         hit = engine.cast(
             lines[:, -1],

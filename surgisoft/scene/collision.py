@@ -1,4 +1,4 @@
-"""FCL, the referee: whole-body collision, clearance and the first hit of rays, one moment a call.
+"""FCL, the checker: whole-body collision, clearance and the first hit of rays, one moment a call.
 
 The only file that speaks FCL. FCL works in millimetres throughout: its iterations stop at an
 absolute tolerance. It sees surfaces only, so being inside a closed body is tested apart, by the
@@ -13,20 +13,22 @@ from itertools import combinations
 
 import fcl
 import numpy as np
+import torch
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import (
     HORIZON_MM,
     ArmShape,
+    BatchClearance,
     chain_normal,
     folding_pairs,
     ray_chain,
     ray_free_segments,
 )
-from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.inside import points_inside
+from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import RayHit, Struck, struck_of
-from surgisoft.scene.winding import winding_numbers
 
 PROBE_WIDTH_MM = 1e-3
 """Width of the sliver that stands for a ray; without width FCL misses one hit in six (mm)."""
@@ -185,7 +187,7 @@ def _distance(first: fcl.CollisionObject, second: fcl.CollisionObject) -> float:
     return max(0.0, fcl.distance(first, second, fcl.DistanceRequest(), fcl.DistanceResult()))
 
 
-class Referee:
+class CollisionChecker:
     """Exact geometry of a scene, one pose of the arms a call. Build once for a set of bodies.
 
     `arms` is always a mapping from the arm's name to its `ArmShape`.
@@ -365,12 +367,86 @@ def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
     return np.where(hit, t, np.inf)
 
 
-def points_inside(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 3) mm in a closed mesh's own frame that it encloses; open: never."""
-    inside = np.zeros(len(points_mm), dtype=bool)
-    if not mesh.is_watertight:
-        return inside
-    low, high = mesh.bounds_mm
-    near = ((points_mm >= low) & (points_mm <= high)).all(axis=1)
-    inside[near] = winding_numbers(mesh, points_mm[near]) > 0.5
-    return inside
+class ExactScene:
+    """What `batched.BatchedScene` answers, asked of FCL; bodies stand where the scene puts them.
+
+    Arms map a name to centrelines (B, K, 3) mm, world frame. An environment whose arm or ray is
+    not finite gets nan clearances and misses.
+    """
+
+    def __init__(self, bodies: Sequence[Body], radii_mm: Mapping[str, float], device="cpu"):
+        self.bodies, self.radii_mm = tuple(bodies), dict(radii_mm)
+        self.device = torch.device(device)
+        self.checker = CollisionChecker(self.bodies)
+
+    def radius_mm(self, arm: str) -> float:
+        """Radius of an arm by name (mm)."""
+        if arm not in self.radii_mm:
+            raise unknown_name("arm", arm, self.radii_mm)
+        return self.radii_mm[arm]
+
+    def clearance(self, arms: Mapping[str, torch.Tensor]) -> BatchClearance:
+        """Signed clearances of every pair; arms name -> (B, K, 3) mm."""
+        names, first = list(arms), next(iter(arms.values()))
+        pairs = list(combinations(names, 2))
+        found = np.full((len(first), len(names) * (len(self.bodies) + 1) + len(pairs)), np.nan)
+        for row, shapes in zip(found, self._shapes(arms), strict=True):
+            if shapes is not None:
+                said = self.checker.clearance(shapes)
+                bodies = [said.bodies_mm[name, body.name] for name in names for body in self.bodies]
+                row[:] = [*bodies, *(said.arms_mm[p] for p in pairs), *said.self_mm.values()]
+        values = torch.as_tensor(found, dtype=first.dtype, device=self.device)
+        sizes = (len(names) * len(self.bodies), len(pairs), len(names))
+        bodies, apart, own = values.split(sizes, 1)
+        return BatchClearance(bodies.unflatten(1, (len(names), len(self.bodies))), apart, own)
+
+    def cast(self, origins_mm, directions, range_mm: float, arms=None, own: str | None = None):
+        """First hits of rays (B, ..., 3), world frame, as a `RayHit` of (B, ...) tensors."""
+        origins, aims = _numpy(origins_mm), _numpy(directions)
+        shapes = self._shapes(arms or {}) if arms else [{}] * len(origins)
+        hits = [
+            _missed(o, d, range_mm)
+            if near is None or not (np.isfinite(o).all() and np.isfinite(d).all())
+            else self.checker.cast(o, d, range_mm, near, own)
+            for o, d, near in zip(origins, aims, shapes, strict=True)
+        ]
+        parts = {name: np.stack([getattr(hit, name) for hit in hits]) for name in vars(hits[0])}
+        held = {name: torch.as_tensor(part, device=self.device) for name, part in parts.items()}
+        kind = origins_mm.dtype
+        return RayHit(
+            **{
+                name: part.to(kind) if part.is_floating_point() else part
+                for name, part in held.items()
+            }
+        )
+
+    def _shapes(self, arms: Mapping[str, torch.Tensor]) -> list[dict[str, ArmShape] | None]:
+        """Each environment's arms; None where one of them is not finite."""
+        lines = {name: _numpy(line) for name, line in arms.items()}
+        count = len(next(iter(lines.values())))
+        return [
+            {name: ArmShape(line[i], self.radius_mm(name)) for name, line in lines.items()}
+            if all(np.isfinite(line[i]).all() for line in lines.values())
+            else None
+            for i in range(count)
+        ]
+
+
+def _numpy(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()
+
+
+def _missed(origins: np.ndarray, aims: np.ndarray, range_mm: float) -> RayHit:
+    """Rays (..., 3) that meet nothing, finite even where they are not."""
+    shape, none = origins.shape[:-1], np.full(origins.shape[:-1], -1, np.int32)
+    zero = np.zeros(shape)
+    end = np.nan_to_num(origins + range_mm * aims, nan=0.0, posinf=0.0, neginf=0.0)
+    return RayHit(
+        np.full(shape, int(Struck.NOTHING), np.int8),
+        none,
+        none,
+        zero + range_mm,
+        end,
+        np.nan_to_num(-aims),
+        zero,
+    )

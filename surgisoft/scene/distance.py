@@ -12,8 +12,15 @@ import math
 import numpy as np
 
 from surgisoft.compiled import compiled
-from surgisoft.scene.bvh import STACK, point_surface, segment_surface_d2, triangle
-from surgisoft.scene.kernels import boxes_d2, line_triangle, segments_d2
+from surgisoft.scene.bvh import (
+    STACK,
+    boxes_d2,
+    line_triangle,
+    point_surface,
+    segment_surface_d2,
+    segments_d2,
+    triangle,
+)
 
 
 @compiled

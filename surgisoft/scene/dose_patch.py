@@ -16,7 +16,7 @@ import numpy as np
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.buried import buried
+from surgisoft.scene.inside import buried
 from surgisoft.scene.mesh import Mesh
 
 LESION, RING, HEALTHY = 0, 1, 2

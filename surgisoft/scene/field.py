@@ -21,8 +21,7 @@ import numpy as np
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
-from surgisoft.scene.bvh import TriangleTree, build_tree, point_surface, triangle
-from surgisoft.scene.kernels import point_triangle
+from surgisoft.scene.bvh import TriangleTree, build_tree, point_surface, point_triangle, triangle
 from surgisoft.scene.mesh import Mesh
 
 FORMAT = 1

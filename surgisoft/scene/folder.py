@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 import tomli_w
 
 from surgisoft.config import read_toml, to_table
@@ -69,21 +68,3 @@ def open_scene(path: str | Path) -> Scene:
             )
         bodies.append(Body(body.name, body.role, read_mesh(folder / body.mesh), body.pose()))
     return Scene(spec, folder, tuple(bodies))
-
-
-def rounded_mount(position_mm, rotation) -> dict:
-    """A mount's place as the file writes it: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
-
-    position_mm (3,) and rotation (3, 3) of the base frame in the world frame; answers
-    `position_mm`, `direction` and `roll_deg` for `MountSpec`.
-    """
-    from surgisoft.scene import frames
-
-    direction = rotation[:, 2].round(6) + 0.0
-    plain = frames.rotation_from_z(direction)
-    roll = np.degrees(np.arctan2(rotation[:, 0] @ plain[:, 1], rotation[:, 0] @ plain[:, 0]))
-    return {
-        "position_mm": tuple((np.asarray(position_mm).round(2) + 0.0).tolist()),
-        "direction": tuple(direction.tolist()),
-        "roll_deg": float(np.round(roll, 2) + 0.0),
-    }

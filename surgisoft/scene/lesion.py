@@ -1,12 +1,21 @@
-"""The lesion's ring: a circle laid on the organ's surface, and where a lesion can lie at all."""
+"""The lesion: its ring on the organ's surface, places for it, and random variations of it.
 
-from dataclasses import dataclass
+A ring is a circle that is laid on the surface, or the user's own path. `pointed_site`,
+`directed_site` and `good_sites` choose a place for a new scene; `lesions_like` varies the lesion of
+an existing one for training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.scene.bvh import build_tree
 from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.spec import LesionSpec
 
 RING_POINTS = 72
@@ -35,8 +44,6 @@ class Ring:
 
 def nearest_on_surface(mesh: Mesh, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Nearest surface points (N, 3) mm and their faces (N,) to points (N, 3) mm, mesh's frame."""
-    from surgisoft.scene.bvh import build_tree
-
     points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
     _, faces = build_tree(mesh).nearest(points)
     return closest_in_triangles(points, mesh.triangles_mm[faces]), faces
@@ -191,3 +198,255 @@ def _path_ring(mesh, lesion, centre, face, count) -> Ring:
         )
     normal = patch_normal(mesh, centre, face, 0.5 * lesion.diameter_mm)
     return Ring(centre, normal, points, mesh.face_normals[faces], faces)
+
+
+TRIED = 400
+"""Surface points drawn for the choice of a lesion."""
+OPEN_CONE_RAD = np.radians(60.0)
+"""Half angle of the cone above a place that should be open to the outside (rad)."""
+SITES = 6
+"""Places handed on for the search of mounts."""
+
+QUICK_RING = 12
+"""Ring points that are tried before the whole ring, when a diameter that fits is sought."""
+FAR_POINT_MM = 20.0
+"""A point farther than this from every surface is a slip, not a place on it (mm)..."""
+SMALL_HOLE = 0.1
+"""A hole up to this share of the ring's diameter is a flaw of the mesh. A wider one is an opening
+of the organ (a vessel, a bowel), and the faces that close it are no tissue."""
+FAR_POINT = 0.1
+"""... unless it is within this share of the body's largest side."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrganSurface:
+    """A closed mesh on which a lesion may lie, but for the faces that close a hole of the file."""
+
+    mesh: Mesh
+    """Closed, wound outwards, world frame, mm."""
+    hole_mm: np.ndarray
+    """(F,) mm: width of the hole that a face closes, 0 for a face of the file."""
+
+    @classmethod
+    def whole(cls, mesh: Mesh) -> OrganSurface:
+        """A mesh that had no hole."""
+        return cls(mesh, np.zeros(len(mesh.faces)))
+
+    def is_lid(self, faces: np.ndarray, diameter_mm: float) -> np.ndarray:
+        """(N,) bool: faces (N,) that close an opening too wide to lie in a ring's path."""
+        return self.hole_mm[faces] > SMALL_HOLE * diameter_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A place for a lesion."""
+
+    body: int
+    """Which of the bodies."""
+    point_mm: np.ndarray
+    """(3,) on the surface."""
+    ring: Ring
+    """The ring about it."""
+    moved_mm: float = 0.0
+    """How far it lies from the point that was pointed at (mm)."""
+
+
+def pointed_site(
+    bodies: list[OrganSurface], point_mm: np.ndarray, diameter_mm: float, said: str | None = None
+) -> Site:
+    """The surface point nearest to `point_mm` (3,), on whichever body it lies.
+
+    An InputError where none is near; `said` is the point as the user wrote it.
+    """
+    nearest = [nearest_on_surface(body.mesh, point_mm[None]) for body in bodies]
+    away = [float(np.linalg.norm(points[0] - point_mm)) for points, _ in nearest]
+    body = int(np.argmin(away))
+    points, faces = nearest[body]
+    most = max(FAR_POINT_MM, FAR_POINT * float(np.ptp(bodies[body].mesh.bounds_mm, axis=0).max()))
+    if away[body] > most:
+        said = said or f"the point {tuple(point_mm.round(3).tolist())} mm"
+        raise InputError(
+            f"{said} lies {away[body]:.4g} mm from the nearest surface; expected at most "
+            f"{most:.4g} mm: give it in the first file's own frame and unit, or check --unit"
+        )
+    site = _with_ring(bodies, body, points[0], int(faces[0]), diameter_mm)
+    return replace(site, moved_mm=away[body])
+
+
+def directed_site(bodies: list[OrganSurface], direction: np.ndarray, diameter_mm: float) -> Site:
+    """Where a ray from outside along -direction (3,) through the largest body's middle lands.
+
+    Where it passes through without touching (a ring's hole), the surface point that lies farthest
+    out in that direction.
+    """
+    away = frames.normalise(np.asarray(direction, dtype=float))
+    mesh = bodies[0].mesh
+    middle = mesh.bounds_mm.mean(axis=0)
+    far = float(np.ptp(mesh.bounds_mm, axis=0).sum())
+    origin = middle + far * away
+    distance, face = EmbreeSurface(mesh).first_hit(origin[None], -away[None], 2.0 * far)
+    if face[0] >= 0:
+        return _with_ring(bodies, 0, origin - distance[0] * away, int(face[0]), diameter_mm)
+    outermost = mesh.vertices_mm[np.argmax(mesh.vertices_mm @ away)]
+    points, faces = nearest_on_surface(mesh, outermost[None])
+    return _with_ring(bodies, 0, points[0], int(faces[0]), diameter_mm)
+
+
+def _with_ring(bodies, body, point, face, diameter_mm) -> Site:
+    surface, place = bodies[body], tuple(point.round(1).tolist())
+    ring = circle_on(surface.mesh, point, face, diameter_mm)
+    under = np.array([face]) if ring is None else np.append(ring.faces, face)
+    lids = under[surface.is_lid(under, diameter_mm)]
+    if len(lids):
+        raise InputError(
+            f"a ring of {diameter_mm:g} mm at {place} mm lies on faces that the repair added to "
+            f"close a hole {surface.hole_mm[lids].max():.3g} mm wide; the file has no surface "
+            "there: choose another place or a smaller --diameter"
+        )
+    if ring is None:
+        fits = _largest_fitting(surface.mesh, point, face, diameter_mm)
+        advice = f"a ring of {fits:.0f} mm does" if fits >= 1.0 else "no ring does"
+        raise InputError(
+            f"a ring of {diameter_mm:g} mm does not lie on the surface at "
+            f"{place} mm ({advice}); choose another place or --diameter"
+        )
+    return Site(body, point, ring)
+
+
+def _largest_fitting(mesh, point, face, diameter_mm) -> float:
+    """The largest of nineteen smaller diameters whose ring lies on the surface (mm); 0: none."""
+    most = min(diameter_mm, float(np.ptp(mesh.bounds_mm, axis=0).max()))
+    for share in np.linspace(0.95, 0.05, 19):
+        fits = share * most
+        fits = float(np.floor(fits)) if fits >= 1.0 else fits
+        if circle_on(mesh, point, face, fits, QUICK_RING) is None:
+            continue
+        if circle_on(mesh, point, face, fits) is not None:
+            return fits
+    return 0.0
+
+
+def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
+    """Places on the largest body that are open to the outside, even and on top, best first.
+
+    Points are drawn evenly over the surface (the same ones each time). Openness is the fraction of
+    a cone of rays that leave without touching any body. No place lies on faces that close an
+    opening of the file.
+    """
+    surface, mesh = bodies[0], bodies[0].mesh
+    points, faces = _drawn(mesh)
+    tissue = ~surface.is_lid(faces, diameter_mm)
+    points, faces = points[tissue], faces[tissue]
+    normals = mesh.face_normals[faces]
+    openness = _openness([body.mesh for body in bodies], points, normals)
+    evenness = _evenness(mesh, points, normals, 0.5 * diameter_mm)
+    quality = 2.0 * openness + 2.0 * evenness + 0.7 * normals[:, 2]
+    sites: list[Site] = []
+    for i in np.argsort(-quality, kind="stable")[:80]:
+        if any(np.linalg.norm(points[i] - site.point_mm) < 1.5 * diameter_mm for site in sites):
+            continue
+        ring = circle_on(mesh, points[i], int(faces[i]), diameter_mm)
+        if ring is not None and not surface.is_lid(ring.faces, diameter_mm).any():
+            sites.append(Site(0, points[i], ring))
+        if len(sites) == SITES:
+            break
+    if not sites:
+        size = np.ptp(mesh.bounds_mm, axis=0)
+        best = np.argsort(-quality, kind="stable")[:SITES]
+        fits = max(_largest_fitting(mesh, points[i], int(faces[i]), diameter_mm) for i in best)
+        advice = f"a ring of {fits:g} mm does" if fits else "no smaller one does"
+        raise InputError(
+            f"no ring of {diameter_mm:g} mm lies on a body of "
+            f"{' x '.join(f'{s:.3g}' for s in size)} mm ({advice}): it hangs over an edge or the "
+            "surface is too rough; give a smaller --diameter or the right --unit"
+        )
+    return sites
+
+
+def _drawn(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """TRIED surface points (T, 3) and their faces, evenly over the area."""
+    rng = np.random.default_rng(0)
+    share = np.cumsum(mesh.face_areas_mm2)
+    picks = (np.arange(TRIED) + rng.random(TRIED)) / TRIED * share[-1]
+    faces = np.minimum(np.searchsorted(share, picks), len(share) - 1)
+    u, v = rng.random((2, TRIED))
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    a, b, c = np.moveaxis(mesh.triangles_mm[faces], 1, 0)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), faces
+
+
+def _openness(bodies, points, normals, rays: int = 48) -> np.ndarray:
+    """(T,) fraction of a cone of rays about each normal that meet no body."""
+    k = np.arange(rays) + 0.5
+    cosine = 1.0 - (1.0 - np.cos(OPEN_CONE_RAD)) * k / rays
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    sine = np.sqrt(1.0 - cosine**2)
+    cone = np.stack((sine * np.cos(turn), sine * np.sin(turn), cosine), axis=1)
+    directions = cone @ np.swapaxes(frames.rotation_from_z(normals), 1, 2)
+    origins = np.repeat((points + 0.5 * normals)[:, None], rays, axis=1)
+    free = np.ones(directions.shape[:2], dtype=bool)
+    for mesh in bodies:
+        _, face = EmbreeSurface(mesh).first_hit(
+            origins.reshape(-1, 3), directions.reshape(-1, 3), 300.0
+        )
+        free &= (face < 0).reshape(free.shape)
+    return free.mean(axis=1)
+
+
+def _evenness(mesh, points, normals, radius) -> np.ndarray:
+    """(T,) mean cosine between a point's normal and those of the surface within `radius`."""
+    from scipy.spatial import cKDTree
+
+    middles, weights = mesh.triangles_mm.mean(axis=1), mesh.face_areas_mm2
+    around = cKDTree(middles).query_ball_point(points, radius)
+    result = np.ones(len(points))
+    for i, near in enumerate(around):
+        if near:
+            cosine = mesh.face_normals[near] @ normals[i]
+            result[i] = np.average(cosine, weights=np.maximum(weights[near], 1e-12))
+    return result
+
+
+TRIES = 20
+"""Places drawn for each lesion that is wanted before it is given up."""
+
+
+def lesions_like(
+    mesh: Mesh, lesion: LesionSpec, count: int, shift_mm: float, size: float
+) -> tuple[LesionSpec, ...]:
+    """`count` lesions on the organ's mesh (world frame), the same ones each time.
+
+    Centres lie evenly within shift_mm of the lesion's own, along the surface; diameters are even
+    within the share `size` of its own (0.1: from 90 to 110 %). With both 0 there is the own one
+    only.
+    """
+    if shift_mm == 0.0 and size == 0.0:
+        return (lesion,)
+    if lesion.path_mm:
+        raise InputError("a lesion with its own path_mm cannot be moved or scaled; leave both at 0")
+    if not 0.0 <= size < 1.0:
+        raise InputError(f"lesions differ in size by a share of {size}; expected 0 to below 1")
+    if shift_mm > lesion.diameter_mm:
+        raise InputError(
+            f"lesions move by up to {shift_mm:g} mm; expected at most the scene's own diameter of "
+            f"{lesion.diameter_mm:g} mm"
+        )
+    own, face = (part[0] for part in nearest_on_surface(mesh, np.array([lesion.centre_mm])))
+    plane = frames.rotation_from_z(patch_normal(mesh, own, int(face), 0.5 * lesion.diameter_mm))
+    rng, found = np.random.default_rng(0), []
+    for _ in range(TRIES * count):
+        turn, share, spread = rng.uniform((0.0, 0.0, -1.0), (2.0 * np.pi, 1.0, 1.0))
+        aside = shift_mm * np.sqrt(share) * np.array([np.cos(turn), np.sin(turn)])
+        diameter = lesion.diameter_mm * (1.0 + size * spread)
+        centre, face = (part[0] for part in nearest_on_surface(mesh, own + plane[:, :2] @ aside))
+        if circle_on(mesh, centre, int(face), diameter) is not None:
+            found.append(
+                replace(lesion, centre_mm=tuple(centre.tolist()), diameter_mm=float(diameter))
+            )
+        if len(found) == count:
+            return tuple(found)
+    raise InputError(
+        f"only {len(found)} of {count} lesions up to {shift_mm:g} mm aside and {100 * size:g} % "
+        f"larger lie on '{lesion.body}'; expected a smaller spread or a flatter place"
+    )

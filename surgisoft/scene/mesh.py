@@ -1,4 +1,7 @@
-"""Triangle meshes in memory: what every geometric engine works on. Files are read elsewhere."""
+"""Triangle meshes in memory, rigid bodies made of them, and index arithmetic on their faces.
+
+Every geometric engine works on these classes. `meshio` reads and writes mesh files.
+"""
 
 from __future__ import annotations
 
@@ -151,3 +154,32 @@ class Body:
     def world_mesh(self) -> Mesh:
         """The mesh in the world frame, mm."""
         return self.mesh.transformed(self.pose)
+
+
+def used_indices(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The indices that occur, rising (U,), and `index` (any shape) numbered by their place there.
+
+    For indices of vertices or labels: whole numbers from 0, not many more than there are.
+    """
+    flags = np.zeros(int(index.max(initial=-1)) + 1, dtype=bool)
+    flags[index] = True
+    used = np.flatnonzero(flags)
+    place = np.empty(len(flags), dtype=np.int64)
+    place[used] = np.arange(len(used))
+    return used, place[index]
+
+
+def equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows (N, K) that are equal, one group each: first row (G,), group (N,), size (G,).
+
+    Groups rise with their rows, first column first, as `numpy.unique(axis=0)` has them.
+    """
+    order = np.lexsort(rows.T[::-1])
+    ranked = rows[order]
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
+    start = np.flatnonzero(new)
+    group = np.empty(len(rows), dtype=np.int64)
+    group[order] = np.cumsum(new) - 1
+    # lexsort is stable: the first of a group is its first row
+    return order[start], group, np.diff(np.r_[start, len(rows)])

@@ -9,8 +9,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
-from surgisoft.scene.index import used_indices
-from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.mesh import Mesh, used_indices
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
@@ -180,7 +179,7 @@ def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
     )
 
 
-def told_unit(size: float, unit: str) -> str:
+def given_unit(size: float, unit: str) -> str:
     """What to say of a file whose largest side is `size` in the unit the user told.
 
     A warning where that is not an organ's size, with the units that would give one.

@@ -1,6 +1,6 @@
 """Rays against the scene: what a beam or a line of sight meets first.
 
-`RayHit` is the answer of both engines: the referee in `collision`, the batched one in `batched`.
+`RayHit` is the answer of both engines: the checker in `collision`, the batched one in `batched`.
 Here are the parts of the latter that run on the CPU: Embree names the face, float64 arithmetic
 says where on it, and a compiled closed form meets the arms.
 """
@@ -100,7 +100,7 @@ class EmbreeSurface:
 
         Embree works in float32; the distance is taken again in float64 in the plane of the face it
         names. Rays that are not finite miss. A ray aimed at a mesh vertex to the last bit may slip
-        through it (4 in 1,000 such rays; none of 40,000 random ones); the referee does not.
+        through it (4 in 1,000 such rays; none of 40,000 random ones); the checker does not.
         """
         finite = np.isfinite(origins_mm).all(axis=1) & np.isfinite(directions).all(axis=1)
         origins = np.where(finite[:, None], origins_mm - self._middle, 1e6)

@@ -108,7 +108,7 @@ class ArmReach:
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
+class AimSolution:
     """Commands that bring the tool's axis onto points."""
 
     commands: np.ndarray
@@ -132,7 +132,7 @@ def _miss(reach: ArmReach, commands: np.ndarray, targets_mm: np.ndarray):
     return away - ahead[:, None] * direction, ahead, direction
 
 
-def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
+def solve_aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> AimSolution:
     """Bend the arm until its axis runs through targets (M, 3) mm, base frame.
 
     Damped Gauss-Newton from commands `start` (M, P), smallest change of commands first (Nocedal &
@@ -167,7 +167,7 @@ def aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim:
         change = change * np.minimum(1.0, 0.25 / np.maximum(length, 1e-12))
         commands[todo] = np.clip(here + change * reach.span, *reach.bounds)
         miss[todo], ahead[todo], axis[todo] = _miss(reach, commands[todo], targets_mm[todo])
-    return Aim(commands, np.linalg.norm(miss, axis=1), ahead)
+    return AimSolution(commands, np.linalg.norm(miss, axis=1), ahead)
 
 
 def _smallest_change(jacobian: np.ndarray, miss: np.ndarray) -> np.ndarray:

@@ -20,10 +20,10 @@ from surgisoft.scene.rays import EmbreeSurface, rays_to_chains
 
 BODY_COLOURS = {
     "organ": (0.38, 0.095, 0.07),
-    "keep-out": (0.25, 0.33, 0.62),
+    "keep-out": (0.23, 0.37, 0.07),
     "support": (0.36, 0.42, 0.40),
 }
-"""Linear colour of a body by its role."""
+"""Linear colour of a body by its role; the hues are those of the 3D view (`replay.colours`)."""
 ARM_COLOUR = (0.72, 0.70, 0.66)
 """Linear colour of the arms: light silicone."""
 BEAM_COLOUR = (0.15, 1.0, 0.35)

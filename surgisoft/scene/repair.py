@@ -13,9 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from surgisoft.errors import InputError
-from surgisoft.scene.index import equal_rows, used_indices
-from surgisoft.scene.mesh import Mesh
-from surgisoft.scene.winding import winding_numbers
+from surgisoft.scene.inside import winding_numbers
+from surgisoft.scene.mesh import Mesh, equal_rows, used_indices
 
 JOIN = (1e-7, 1e-6, 1e-5, 1e-4, 5e-4)
 """Distances at which vertices are joined, tried in turn until the surface closes (of its size)."""
@@ -45,8 +44,20 @@ class Repaired:
 
     bodies: tuple[Mesh, ...]
     """Closed meshes, wound outwards."""
+    holes_mm: tuple[np.ndarray, ...]
+    """For each body (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
     repairs: tuple[Repair, ...]
     """What was done; empty when nothing had to be."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Shell:
+    """One closed surface, and which of its faces close a hole of the file."""
+
+    mesh: Mesh
+    """Wound outwards, mm."""
+    hole_mm: np.ndarray
+    """(F,) mm: width of the hole that a face closes, 0 for a face of the file."""
 
 
 def repair(
@@ -70,25 +81,33 @@ def repair(
     tell("winding faces alike")
     faces = _wind_alike(faces, what, log)
     tell("closing holes")
-    vertices, faces = _close_holes(vertices, faces, what, log)
-    shells = _outward(vertices, faces, log)
-    if not all(shell.is_watertight for shell in shells):
+    vertices, faces, hole_mm = _close_holes(vertices, faces, what, log)
+    shells = _outward(vertices, faces, hole_mm, log)
+    if not all(shell.mesh.is_watertight for shell in shells):
         raise InputError(
             f"{what}: the surface crosses itself along edges that three or more faces share, "
             "beyond repair; expected a closed body (remesh it in a mesh editor)"
         )
-    flat = [s for s in shells if s.volume_mm3 <= 1e-6 * size * float(s.face_areas_mm2.sum())]
-    if len(flat) == len(shells):
+    solid = [shell for shell in shells if not _is_flat(shell.mesh, size)]
+    if not solid:
         raise InputError(f"{what}: the surface is flat and encloses no volume; expected a body")
-    shells = [shell for shell in shells if all(shell is not f for f in flat)]
-    bodies = _merge_touching(_drop_inner(shells, log))
+    bodies = _merge_touching(_drop_inner(solid, log))
     if len(bodies) > MOST_BODIES:
         raise InputError(
             f"{what}: {len(bodies)} separate bodies; expected at most {MOST_BODIES} "
             "(keep the organ and what must not be touched)"
         )
-    bodies.sort(key=lambda mesh: -float(mesh.face_areas_mm2.sum()))
-    return Repaired(tuple(bodies), tuple(Repair(done, n) for done, n in log.items() if n))
+    bodies.sort(key=lambda body: -float(body.mesh.face_areas_mm2.sum()))
+    return Repaired(
+        tuple(body.mesh for body in bodies),
+        tuple(body.hole_mm for body in bodies),
+        tuple(Repair(done, n) for done, n in log.items() if n),
+    )
+
+
+def _is_flat(mesh: Mesh, size: float) -> bool:
+    """Whether the mesh of a surface `size` mm across encloses next to no volume."""
+    return mesh.volume_mm3 <= 1e-6 * size * float(mesh.face_areas_mm2.sum())
 
 
 def _join(vertices, faces, size, log):
@@ -272,9 +291,13 @@ def _wind_alike(faces, what, log):
     label = _linked(np.concatenate(([a, other], [a + count, mirror]), axis=1).T, 2 * count)
     if np.any(label[:count] == label[count:]):
         raise InputError(f"{what}: the surface has only one side (Moebius); expected a closed body")
-    # of the two ways to wind each piece, the one that turns fewer faces
+    # of the two ways to wind each piece, the one that turns fewer faces; if both turn as many, the
+    # one with the smaller label, so that all faces of the piece agree
     kept_as_is = np.bincount(label[:count], minlength=label.max() + 1)
-    turned = kept_as_is[label[:count]] < kept_as_is[label[count:]]
+    as_is, reversed_ = label[:count], label[count:]
+    fewer = kept_as_is[as_is] < kept_as_is[reversed_]
+    equal = kept_as_is[as_is] == kept_as_is[reversed_]
+    turned = fewer | (equal & (as_is > reversed_))
     log["faces wound alike"] = int(turned.sum())
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
@@ -310,9 +333,12 @@ def _boundary_loops(faces):
 
 
 def _close_holes(vertices, faces, what, log):
-    """Fan every hole shut from its middle; one as wide as a good part of the body is refused."""
+    """Close every hole by a fan of faces around its middle; a hole wider than `HOLE` is an error.
+
+    Returns vertices, faces, and (F,) mm: the width of the hole that each face closes, else 0.
+    """
     loops = _boundary_loops(faces)
-    new_vertices, new_faces = [vertices], [faces]
+    new_vertices, new_faces, hole_mm = [vertices], [faces], [np.zeros(len(faces))]
     label = _components(faces)
     part_of = np.zeros(len(vertices), dtype=np.int64)
     part_of[faces.reshape(-1)] = np.repeat(label, 3)
@@ -328,26 +354,29 @@ def _close_holes(vertices, faces, what, log):
             )
         if len(loop) == 3:
             new_faces.append(np.array([loop]))
+            hole_mm.append(np.array([width]))
             continue
         new_vertices.append(rim.mean(axis=0)[None])
         ring = np.array(loop)
         new_faces.append(np.stack((ring, np.roll(ring, -1), np.full_like(ring, following)), axis=1))
+        hole_mm.append(np.full(len(ring), width))
         following += 1
     log["holes closed"] = len(loops)
-    return np.concatenate(new_vertices), np.concatenate(new_faces)
+    return np.concatenate(new_vertices), np.concatenate(new_faces), np.concatenate(hole_mm)
 
 
-def _outward(vertices, faces, log):
-    """One mesh a closed shell, with positive volume."""
+def _outward(vertices, faces, hole_mm, log) -> list[_Shell]:
+    """Every connected surface as a shell of its own, turned so that its volume is positive."""
     label = _components(faces)
     shells, turned = [], 0
     for part in range(label.max() + 1):
-        used, dense = used_indices(faces[label == part])
+        own = label == part
+        used, dense = used_indices(faces[own])
         mesh = Mesh(vertices[used], dense)
         if mesh.volume_mm3 < 0.0:
             mesh = Mesh(mesh.vertices_mm, mesh.faces[:, ::-1])
             turned += 1
-        shells.append(mesh)
+        shells.append(_Shell(mesh, hole_mm[own]))
     log["inside-out bodies turned"] = turned
     return shells
 
@@ -364,25 +393,34 @@ def _boxes_meet(a: Mesh, b: Mesh) -> bool:
     )
 
 
-def _drop_inner(shells, log):
-    """Bodies that do not lie wholly inside a larger one."""
-    shells = sorted(shells, key=lambda mesh: -mesh.volume_mm3)
-    kept: list[Mesh] = []
+def _drop_inner(shells: list[_Shell], log) -> list[_Shell]:
+    """The shells that do not lie wholly inside a larger one, largest volume first."""
+    shells = sorted(shells, key=lambda shell: -shell.mesh.volume_mm3)
+    kept: list[_Shell] = []
     for shell in shells:
-        if not any(_boxes_meet(outer, shell) and _encloses(outer, shell).all() for outer in kept):
+        if not any(_lies_inside(shell.mesh, outer.mesh) for outer in kept):
             kept.append(shell)
     log["inner bodies removed"] = len(shells) - len(kept)
     return kept
 
 
-def _merge_touching(shells):
-    """Shells that run into each other become one body of several shells."""
+def _lies_inside(inner: Mesh, outer: Mesh) -> bool:
+    """Whether all of `inner` lies within `outer`."""
+    return _boxes_meet(outer, inner) and bool(_encloses(outer, inner).all())
+
+
+def _overlap(a: Mesh, b: Mesh) -> bool:
+    """Whether part of one mesh lies within the other."""
+    return _boxes_meet(a, b) and bool(_encloses(a, b).any() or _encloses(b, a).any())
+
+
+def _merge_touching(shells: list[_Shell]) -> list[_Shell]:
+    """Shells that overlap become one body of several shells."""
     pairs = [
         (i, j)
         for i in range(len(shells))
         for j in range(i)
-        if _boxes_meet(shells[i], shells[j])
-        and (_encloses(shells[i], shells[j]).any() or _encloses(shells[j], shells[i]).any())
+        if _overlap(shells[i].mesh, shells[j].mesh)
     ]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     graph = coo_matrix((np.ones(len(pairs)), (rows, columns)), shape=(len(shells),) * 2)
@@ -393,9 +431,11 @@ def _merge_touching(shells):
     ]
 
 
-def _together(shells) -> Mesh:
-    starts = np.cumsum([0, *(len(shell.vertices_mm) for shell in shells[:-1])])
-    return Mesh(
-        np.concatenate([shell.vertices_mm for shell in shells]),
-        np.concatenate([s.faces + i for s, i in zip(shells, starts, strict=True)]),
+def _together(shells: list[_Shell]) -> _Shell:
+    meshes = [shell.mesh for shell in shells]
+    starts = np.cumsum([0, *(len(mesh.vertices_mm) for mesh in meshes[:-1])])
+    mesh = Mesh(
+        np.concatenate([mesh.vertices_mm for mesh in meshes]),
+        np.concatenate([mesh.faces + i for mesh, i in zip(meshes, starts, strict=True)]),
     )
+    return _Shell(mesh, np.concatenate([shell.hole_mm for shell in shells]))

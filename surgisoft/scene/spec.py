@@ -1,7 +1,7 @@
-"""The scene file `scene.toml` as frozen dataclasses: what stands where, in which units.
+"""The scene file `scene.toml` as frozen dataclasses: bodies, lesion, mounts, laser, camera.
 
-Lengths in mm, times in s; angles are in degrees in the file (the field says so) and in radians
-everywhere else. World frame: z up. An arm's base frame: z along the arm at rest.
+Lengths are in mm, times in s. Angles are in degrees in the file (the field's name says so) and in
+radians everywhere else. World frame: z up. An arm's base frame: z along the arm at rest.
 """
 
 import re
@@ -17,7 +17,23 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.mesh import ROLES
-from surgisoft.scene.packaged import packaged_scene
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+SCENES = (_PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent) / "scenes"
+"""Their folder: in the installed package, or beside it in a checkout."""
+PHANTOM = SCENES / "phantom_liver"
+"""The liver phantom."""
+
+
+def packaged_scene(path: str | Path) -> Path:
+    """The folder of a packaged scene for its name, where nothing of that name exists here.
+
+    Any other path is returned as it is.
+    """
+    path = Path(path)
+    named = len(path.parts) == 1 and not path.exists()
+    return SCENES / path if named and (SCENES / path / "scene.toml").is_file() else path
+
 
 FORMAT = 1
 FILE = "scene.toml"

@@ -11,7 +11,7 @@ import torch
 
 from surgisoft.agents.run_folder import LAST, RunFolder
 from surgisoft.cli import run as surgisoft
-from surgisoft.replay.find import find_replay
+from surgisoft.replay.show import find_replay
 from surgisoft.tasks.episodes.file import load_episode
 
 SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]

@@ -9,7 +9,7 @@ from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.plan import settings
 from surgisoft.experiments.spec import load_experiment, save_experiment
-from surgisoft.scene.packaged import PHANTOM
+from surgisoft.scene.spec import PHANTOM
 from tests.experiments.tiny import FAULT, TINY, write
 
 SHIPPED = sorted((PHANTOM / "experiments").glob("*.toml"))

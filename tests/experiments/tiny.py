@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from surgisoft.scene.packaged import PHANTOM
+from surgisoft.scene.spec import PHANTOM
 
 TINY = """
 name = "tiny"

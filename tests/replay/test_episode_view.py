@@ -1,5 +1,6 @@
 """A real cut as a replay: what is in the file is what is in the log, and it can be seen."""
 
+import colorsys
 import io
 import time
 from dataclasses import replace
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.replay.bodies import TIP_MM, joined, turns_from_z
+from surgisoft.replay.arms import TIP_MM, joined, turns_from_z
 from surgisoft.replay.colours import (
     BLANCHED,
     CHARRED,
@@ -21,13 +22,14 @@ from surgisoft.replay.colours import (
     ROLE_COLOURS,
     tissue_colours,
 )
-from surgisoft.replay.dosed_surface import dosed_surface
-from surgisoft.replay.endoscope import CAMERA, PIXELS
+from surgisoft.replay.endoscope import CAMERA, CONE, PIXELS
 from surgisoft.replay.episode_view import legend, write_replay
 from surgisoft.replay.plots import plots_of
-from surgisoft.replay.screenshot import take_screenshot
+from surgisoft.replay.surfaces import dosed_surface
+from surgisoft.replay.viewer import take_screenshot
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
+from surgisoft.scene.render import BODY_COLOURS
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeRecorder
@@ -102,9 +104,14 @@ def test_bodies_beam_and_camera_stand_where_the_log_says(log, replay):
         np.testing.assert_allclose(beam[row][0][0], log.arms["laser"].line_mm[row, -1], atol=1e-4)
         np.testing.assert_allclose(beam[row][0][1], log.beam.end_mm[row], atol=1e-4)
         assert (radii[row][0] > 0.2) == log.beam.on[row]
-    eyes = column(replay.path, CAMERA, "Transform3D:translation")
     tips = log.arms["endoscope"].line_mm[:, -1]
-    np.testing.assert_allclose(np.array([eyes[row][0] for row in range(log.rows)]), tips, atol=1e-4)
+    for entity in (CAMERA, CONE):
+        eyes = column(replay.path, entity, "Transform3D:translation")
+        found = np.array([eyes[row][0] for row in range(log.rows)])
+        np.testing.assert_allclose(found, tips, atol=1e-4)
+    rim = np.array(column(replay.path, CONE, "LineStrips3D:strips")[-1][0])
+    slope = np.hypot(rim[:, 0], rim[:, 1]) / rim[:, 2]
+    np.testing.assert_allclose(slope, np.tan(0.5 * log.camera.fov_rad), rtol=1e-5)
     events = column(replay.path, "/events", "TextLog:text", "time")
     assert len(events) == len({event.time_s for event in log.events})
     assert "lesion in sight" in str(events)
@@ -266,6 +273,27 @@ def test_the_command_finds_the_newest_and_says_what_is_wrong(log, replay, tmp_pa
     assert "expected 0 to 4.6 s" in told(replay.path, "--screenshot", picture, "--time", "99")
     assert "replay already" in told(replay.path, "--save", tmp_path / "b.rrd")
     assert not list(tmp_path.glob("a.png"))
+
+
+def test_an_unknown_view_is_refused_before_the_replay_is_made(log, replay, tmp_path, capsys):
+    save_episode(log, tmp_path / "log.npz")
+    for path in (replay.path, tmp_path / "log.npz"):
+        began = time.perf_counter()
+        wish = ["--screenshot", str(tmp_path / "a.png"), "--view", "Nope"]
+        assert run(["replay", str(path), *wish]) == 2
+        assert time.perf_counter() - began < 5.0
+        error = capsys.readouterr().err
+        assert "unknown view 'Nope'" in error
+        assert all(name in error for name in ("Scene", "Endoscope", "Clearance (mm)", "Events"))
+
+
+@pytest.mark.parametrize("role", ["organ", "keep-out"])
+def test_a_role_has_one_hue_in_the_3d_view_and_in_the_endoscope(role):
+    """The picture's colours are linear and lit by a lamp, so only the hues can agree."""
+    linear = np.array(ROLE_COLOURS[role]) / 255.0
+    hue_3d = colorsys.rgb_to_hsv(*linear**2.2)[0]
+    hue_endoscope = colorsys.rgb_to_hsv(*BODY_COLOURS[role])[0]
+    assert hue_endoscope == pytest.approx(hue_3d, abs=0.03)
 
 
 def test_a_log_becomes_a_replay_by_command(tmp_path, capsys):

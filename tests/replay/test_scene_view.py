@@ -11,9 +11,8 @@ from rerun.chunk import RrdReader
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.replay.screenshot import take_screenshot
 from surgisoft.replay.shapes import carried_frames, finer, polar_patch, tube, view_cone
-from surgisoft.replay.viewer import web_address
+from surgisoft.replay.viewer import take_screenshot, web_address
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 

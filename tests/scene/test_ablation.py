@@ -11,13 +11,18 @@ from scipy.integrate import quad
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.ablation import AblationMap, longest_run, sweep_fluence
+from surgisoft.scene.ablation import (
+    AblationMap,
+    Tissue,
+    longest_run,
+    sweep_fluence,
+    vaporisation_j_per_mm3,
+)
 from surgisoft.scene.camera import Camera
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, cut_patch, samples_at
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.render import Renderer
-from surgisoft.scene.tissue import Tissue, vaporisation_j_per_mm3
 from tests.scene.shapes import ball, box
 
 WAIST = 0.4
@@ -89,12 +94,12 @@ def test_energy_is_kept_on_a_curved_organ_with_coarse_faces():
     ring[:, 2] = np.sqrt(40.0**2 - 64)
     normals = frames.normalise(ring)
     patch = cut_patch(mesh, ring, normals, np.array([0, 0, 40.0]), spacing_mm=0.2)
-    referee = Referee([Body("organ", "organ", mesh)])
+    checker = CollisionChecker([Body("organ", "organ", mesh)])
     eye = np.array([5.0, -12.0, 80.0])
     for waist in (0.3, 0.5):
         ablation = AblationMap(patch, waist)
         aims = frames.normalise(ring[::8] - eye)
-        hits = referee.cast(np.tile(eye, (len(aims), 1)), aims, 200.0)
+        hits = checker.cast(np.tile(eye, (len(aims), 1)), aims, 200.0)
         state = swept(
             ablation, torch.tensor(hits.point_mm).float(), 0.1, 1.0, torch.tensor(aims).float()
         )

@@ -1,4 +1,4 @@
-"""From mesh files to scenes: what comes out holds before the referee, what cannot be is said."""
+"""From mesh files to scenes: what comes out holds before the checker, what cannot be is said."""
 
 import dataclasses
 import os
@@ -11,11 +11,17 @@ import trimesh
 
 from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.scene.author import check_target
+from surgisoft.scene.author import (
+    Request,
+    check_target,
+    choose_sites,
+    prepare,
+    rounded_mount,
+)
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.check import REASONS, check_scene, held_arms, reach_patch, sentence
-from surgisoft.scene.collision import Referee
-from surgisoft.scene.folder import open_scene, rounded_mount
+from surgisoft.scene.check import REASONS, check_scene, mounted_arms, reach_patch, sentence
+from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
@@ -98,15 +104,49 @@ def test_the_same_meshes_give_the_same_scene(made, tmp_path):
 
 def test_both_arms_and_their_shafts_clear_each_other(made):
     scene = open_scene(made[1])
-    arms = held_arms(scene, reaches_of(scene))
+    arms = mounted_arms(scene, reaches_of(scene))
     rest = {
         tool: ArmShape(arm.lines(arm.reach.rest[None])[0][0], 7.5) for tool, arm in arms.items()
     }
     for tool, arm in arms.items():
         far = rest[tool].centreline_mm[0]
         np.testing.assert_allclose(np.linalg.norm(far - arm.pose[:3, 3]), 100.0)
-    clearance = Referee(scene.bodies).clearance(rest)
+    clearance = CollisionChecker(scene.bodies).clearance(rest)
     assert clearance.least_mm >= scene.spec.limits.clearance_mm
+
+
+def open_tube(folder, radius=15.0, length=120.0):
+    """A tube along z that is open at both ends, as a bowel or a vessel comes, as an STL."""
+    tube = trimesh.creation.cylinder(radius, length, sections=96)
+    tube = tube.subdivide_to_size(8.0)
+    tube.update_faces(abs(tube.face_normals[:, 2]) < 0.5)
+    tube.export(folder / "tube.stl")
+    return Request((folder / "tube.stl",), ("organ",), diameter_mm=12.0)
+
+
+def test_the_lesion_of_an_open_tube_lies_on_its_wall(tmp_path):
+    """The two lids that close the tube for the simulation are no tissue."""
+    request = open_tube(tmp_path)
+    prepared = prepare(request)
+    assert any("holes closed: 2" in note for note in prepared.notes)
+    (mesh,), (hole_mm,) = prepared.meshes, prepared.holes_mm
+    lids = abs(mesh.face_normals[:, 2]) > 0.5
+    np.testing.assert_array_equal(hole_mm > 0.0, lids)
+    np.testing.assert_allclose(hole_mm[lids], 30.0, rtol=0.01)
+    for site in choose_sites(request, prepared):
+        points = np.vstack((site.ring.points_mm, site.point_mm))
+        # between the circle and the 96 chords' middles
+        radius = np.hypot(points[:, 0], points[:, 1])
+        assert np.all((radius > 15.0 * np.cos(np.pi / 96) - 1e-6) & (radius < 15.0 + 1e-6))
+
+
+@pytest.mark.parametrize(
+    "place", [{"lesion": (0.0, 0.0, 61.0)}, {"lesion_direction": (0.0, 0.0, 1.0)}]
+)
+def test_a_lesion_on_a_closed_opening_is_refused(tmp_path, place):
+    request = dataclasses.replace(open_tube(tmp_path), **place)
+    with pytest.raises(InputError, match=r"close a hole 30 mm wide; the file has no surface there"):
+        choose_sites(request, prepare(request))
 
 
 def scene_with(made, folder, **changes):
@@ -197,7 +237,7 @@ def test_the_tables_shapes_are_those_that_the_tasks_bend(made):
 
 
 def test_the_patch_agrees_with_the_ring(made):
-    """The map's circle of the lesion's own diameter says what the referee says of the ring."""
+    """The map's circle of the lesion's own diameter says what the checker says of the ring."""
     scene = open_scene(made[1])
     patch = reach_patch(scene, reaches_of(scene), 48)
     far = np.linalg.norm(patch.flat_mm, axis=1)
@@ -323,9 +363,10 @@ def test_a_public_liver_becomes_a_scene(shared, tmp_path, capsys):
 
 
 def test_a_target_that_cannot_be_written_is_found_before_the_work(tmp_path, capsys):
-    """The mesh is missing as well: only the target is spoken of, so nothing was read."""
+    """The mesh is no mesh either: the error names the target only, so no mesh was read."""
     (tmp_path / "file").write_text("x")
-    assert new(tmp_path / "file" / "deep" / "scene", tmp_path / "nowhere.stl") == 2
+    (tmp_path / "text.stl").write_text("no mesh")
+    assert new(tmp_path / "file" / "deep" / "scene", tmp_path / "text.stl") == 2
     error = capsys.readouterr().err
     assert f"cannot be written, {tmp_path / 'file'} is no writable folder" in error
     assert (tmp_path / "file").read_text() == "x"

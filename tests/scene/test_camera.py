@@ -11,7 +11,7 @@ from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import Camera, view
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.render import Renderer, pixel_rays
@@ -27,10 +27,10 @@ def flat_ring(radius, height, count=360):
 
 def on_box(referee_arms=None, eye=(0.0, 0, 60), target=(0.0, 0, 10), ring=None, camera=CAMERA):
     ring = flat_ring(10.0, 10.0) if ring is None else ring
-    referee = Referee([Body("slab", "organ", box((80, 80, 20)))])
+    checker = CollisionChecker([Body("slab", "organ", box((80, 80, 20)))])
     up = np.tile([0, 0, 1.0], (len(ring), 1))
     pose = frames.look_at(np.array(eye), np.array(target))
-    return view(referee, camera, pose, ring, up, referee_arms)
+    return view(checker, camera, pose, ring, up, referee_arms)
 
 
 def test_a_ring_straight_ahead_is_wholly_seen():
@@ -77,18 +77,18 @@ def test_the_far_side_of_a_ball_is_hidden_by_the_ball():
     """From distance D the cap within acos(R / D) of its centre is seen (tangent rays)."""
     radius, eye = 30.0, np.array([0, 0, 80.0])
     limit = math.acos(radius / 80.0)
-    referee = Referee([Body("ball", "organ", ball(radius, 5))])
+    checker = CollisionChecker([Body("ball", "organ", ball(radius, 5))])
     camera = Camera(math.radians(100), (1.0, 200.0))
     for angle in (0.2, limit - 0.1, limit + 0.1, 2.5):
         ring = radius * flat_ring(math.sin(angle), math.cos(angle), 40)
-        seen = view(referee, camera, frames.look_at(eye, np.zeros(3)), ring, ring / radius)
+        seen = view(checker, camera, frames.look_at(eye, np.zeros(3)), ring, ring / radius)
         assert seen.fraction == float(angle < limit)
 
 
 def test_batched_view_agrees_with_the_referee(tmp_path):
     bodies = [Body("organ", "organ", lumpy(4))]
     engine = BatchedScene(bodies, {"laser": 5.0, "scope": 5.0}, most_nodes=20_000, cache=tmp_path)
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     rng = np.random.default_rng(0)
     count, vertices = 60, bodies[0].mesh.vertices_mm
     start = bodies[0].mesh.vertices_mm[:, 2].argmax()
@@ -103,7 +103,7 @@ def test_batched_view_agrees_with_the_referee(tmp_path):
     arms = {"laser": torch.tensor(lasers)}
     found = view(engine, CAMERA, torch.tensor(poses), ring, normals, arms)
     for i in range(count):
-        truth = view(referee, CAMERA, poses[i], ring, normals, {"laser": ArmShape(lasers[i], 5.0)})
+        truth = view(checker, CAMERA, poses[i], ring, normals, {"laser": ArmShape(lasers[i], 5.0)})
         assert np.mean(found.visible[i].numpy() != truth.visible) <= 1 / 30
         assert found.axis_error_mm[i].item() == pytest.approx(truth.axis_error_mm, abs=1e-6)
     assert 0.1 < found.fraction.mean() < 0.95

@@ -1,4 +1,4 @@
-"""The referee against closed forms and against engines that share none of its code."""
+"""The checker against closed forms and against engines that share none of its code."""
 
 import math
 
@@ -12,7 +12,8 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import ArmShape, segment_distance
-from surgisoft.scene.collision import Referee, points_inside
+from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.inside import points_inside
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.rays import Struck
 from tests.scene.shapes import arc_points, ball, box, lumpy
@@ -22,7 +23,7 @@ POSE = frames.pose_from_z([12.0, -7.0, 30.0], [0.3, -0.5, 0.8], 0.7)
 
 
 def box_referee(**options):
-    return Referee([Body("box", "organ", box(BOX), POSE)], **options)
+    return CollisionChecker([Body("box", "organ", box(BOX), POSE)], **options)
 
 
 def box_distance(points, half=BOX / 2):
@@ -65,9 +66,9 @@ def test_touching_a_face_is_decided_to_a_nanometre(gap, axis):
     start[axis] = BOX[axis] / 2 + 2.0 + gap
     along = np.roll([1.0, 0, 0], axis + 1)
     arm = straight(start - 5 * along, start + 5 * along)
-    referee = box_referee()
-    assert referee.clearance({"a": arm}).bodies_mm["a", "box"] == pytest.approx(gap, abs=1e-9)
-    assert bool(referee.collisions({"a": arm})) == (gap < 0)
+    checker = box_referee()
+    assert checker.clearance({"a": arm}).bodies_mm["a", "box"] == pytest.approx(gap, abs=1e-9)
+    assert bool(checker.collisions({"a": arm})) == (gap < 0)
 
 
 def test_an_arm_wholly_inside_is_found_though_it_touches_no_surface():
@@ -79,10 +80,10 @@ def test_an_arm_wholly_inside_is_found_though_it_touches_no_surface():
 
 def test_a_body_wholly_inside_the_arm_is_found():
     grain = Mesh(box((0.1, 0.1, 0.1)).vertices_mm, box().faces)
-    referee = Referee([Body("grain", "keep-out", grain)])
+    checker = CollisionChecker([Body("grain", "keep-out", grain)])
     arm = ArmShape([[-30.0, 1.0, 0], [30, 1, 0]], 5.0)
-    assert referee.collisions({"a": arm})[0].other == "grain"
-    assert referee.clearance({"a": arm}).least_mm == pytest.approx(0.95 - 5.0)
+    assert checker.collisions({"a": arm})[0].other == "grain"
+    assert checker.clearance({"a": arm}).least_mm == pytest.approx(0.95 - 5.0)
 
 
 def test_every_overlapping_pair_is_found():
@@ -93,7 +94,7 @@ def test_every_overlapping_pair_is_found():
         "a": ArmShape(arc_points(110.0, 0.0, 30), 3.0),
         "b": ArmShape(np.add(arc_points(110.0, 0.0, 30), [1, 0, 0]), 3.0),
     }
-    found = {(c.arm, c.other) for c in Referee(bodies).collisions(arms)}
+    found = {(c.arm, c.other) for c in CollisionChecker(bodies).collisions(arms)}
     assert found == {(arm, f"b{i}") for arm in "ab" for i in range(6)} | {("a", "b")}
 
 
@@ -109,27 +110,27 @@ def test_arms_keep_the_distance_of_their_centrelines(a, b, c, d):
     rounding = 1e-9  # coordinates of tens of millimetres in double precision
     assert brute - slack - rounding <= exact <= brute + parallel + rounding
     arms = {"one": ArmShape([a, b], 1.5), "two": ArmShape([c, d], 2.5)}
-    referee = Referee([], horizon_mm=1000.0)
-    assert referee.clearance(arms).arms_mm["one", "two"] == pytest.approx(exact - 4, abs=1e-5)
+    checker = CollisionChecker([], horizon_mm=1000.0)
+    assert checker.clearance(arms).arms_mm["one", "two"] == pytest.approx(exact - 4, abs=1e-5)
     if abs(exact - 4) > 1e-4:
-        assert bool(referee.collisions(arms)) == (exact < 4)
+        assert bool(checker.collisions(arms)) == (exact < 4)
 
 
 def test_an_arm_meets_itself_only_where_it_folds():
-    referee = Referee([])
+    checker = CollisionChecker([])
     radius, length = 5.0, 120.0
     for bend, folds in ((0.0, False), (3.0, False), (2 * math.pi, True)):
         arm = ArmShape(arc_points(length, bend, 60), radius)
-        assert bool(referee.collisions({"a": arm})) is folds
-        assert (referee.clearance({"a": arm}).self_mm["a"] < 0) is folds
+        assert bool(checker.collisions({"a": arm})) is folds
+        assert (checker.clearance({"a": arm}).self_mm["a"] < 0) is folds
     tightest = ArmShape(arc_points(math.pi * 6.0, math.pi, 60), 5.9)
-    assert not referee.collisions({"a": tightest})
+    assert not checker.collisions({"a": tightest})
 
 
 def test_self_clearance_of_a_hairpin_is_the_gap_between_its_legs():
     leg = arc_points(50, 0, 26)
     arm = ArmShape(np.concatenate((leg, np.add(leg[::-1], [14, 0, 0]))), 4.0)
-    assert Referee([]).clearance({"a": arm}).self_mm["a"] == pytest.approx(6.0, abs=1e-9)
+    assert CollisionChecker([]).clearance({"a": arm}).self_mm["a"] == pytest.approx(6.0, abs=1e-9)
 
 
 def test_far_clearances_saturate_at_the_horizon():
@@ -157,7 +158,7 @@ def test_rays_hit_a_ball_where_the_sphere_says():
     origins = frames.normalise(rng.normal(size=(300, 3))) * 90.0
     aims = frames.normalise(rng.normal(size=(300, 3))) * radius * rng.uniform(0, 0.9, (300, 1))
     directions = frames.normalise(aims - origins)
-    hit = Referee([Body("ball", "organ", mesh)]).cast(origins, directions, 300.0)
+    hit = CollisionChecker([Body("ball", "organ", mesh)]).cast(origins, directions, 300.0)
     half = frames.dot(origins, directions)
     truth = -half - np.sqrt(half**2 - 90.0**2 + radius**2)
     assert hit.on_organ.all()
@@ -169,11 +170,11 @@ def test_rays_hit_a_ball_where_the_sphere_says():
 
 def test_rays_agree_with_embree_to_floating_point():
     mesh = lumpy()
-    referee = Referee([Body("organ", "organ", mesh, POSE)])
+    checker = CollisionChecker([Body("organ", "organ", mesh, POSE)])
     rng = np.random.default_rng(5)
     origins = rng.normal(size=(1500, 3)) * 60
     directions = frames.normalise(rng.normal(size=(1500, 3)))
-    hit = referee.cast(frames.apply(POSE, origins), frames.rotate(POSE, directions), 400.0)
+    hit = checker.cast(frames.apply(POSE, origins), frames.rotate(POSE, directions), 400.0)
     solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
     points, ray, face = RayMeshIntersector(solid).intersects_location(
         origins, directions, multiple_hits=False
@@ -186,21 +187,21 @@ def test_rays_agree_with_embree_to_floating_point():
 
 
 def test_incidence_and_normal_of_a_plane_are_exact():
-    referee = Referee([Body("box", "organ", box(BOX))])
+    checker = CollisionChecker([Body("box", "organ", box(BOX))])
     for degrees in (0, 30, 60, 89):
         tilt = math.radians(degrees)
         direction = np.array([math.sin(tilt), 0, -math.cos(tilt)])
-        hit = referee.cast([1.0, 2.0, 10.0] - 15 * direction, direction, 100.0)
+        hit = checker.cast([1.0, 2.0, 10.0] - 15 * direction, direction, 100.0)
         np.testing.assert_allclose(hit.incidence_rad, tilt, atol=1e-12)
         np.testing.assert_allclose(hit.normal, [0, 0, 1], atol=1e-12)
         np.testing.assert_allclose(hit.point_mm, [1, 2, 10], atol=1e-12)
 
 
 def test_a_ray_along_an_edge_of_the_mesh_is_not_lost():
-    referee = Referee([Body("box", "organ", box(BOX))])
+    checker = CollisionChecker([Body("box", "organ", box(BOX))])
     on_diagonals = np.linspace(-0.99, 0.99, 41)[:, None] * [20, 15, 0] + [0, 0, 50]
     for flip in ([1, 1, 1], [1, -1, 1]):
-        hit = referee.cast(on_diagonals * flip, np.tile([0, 0, -1.0], (41, 1)), 100.0)
+        hit = checker.cast(on_diagonals * flip, np.tile([0, 0, -1.0], (41, 1)), 100.0)
         np.testing.assert_allclose(hit.distance_mm, 40.0, atol=1e-9)
 
 
@@ -210,14 +211,14 @@ def test_what_stands_in_the_beam_is_named():
         Body("vessel", "keep-out", box((4, 4, 4)), frames.pose_from_z([10, 0, 12], [0, 0, 1])),
         Body("table", "support", box((90, 90, 2)), frames.pose_from_z([0, 0, -20], [0, 0, 1])),
     ]
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     arms = {
         "laser": ArmShape([[0.0, 0, 90], [0, 0, 50]], 3.0),
         "scope": ArmShape([[-10.0, -30, 30], [-10, 30, 30]], 2.0),
     }
     origins = np.array([[0, 0, 50], [10, 0, 50], [-10, 0, 50], [40, 0, 50], [90, 0, 50.0]])
     down = np.tile([0, 0, -1.0], (5, 1))
-    hit = referee.cast(origins, down, 80.0, arms, own="laser")
+    hit = checker.cast(origins, down, 80.0, arms, own="laser")
     kinds = [Struck.ORGAN, Struck.KEEP_OUT, Struck.OTHER_ARM, Struck.SUPPORT, Struck.NOTHING]
     assert hit.struck.tolist() == kinds
     np.testing.assert_allclose(hit.distance_mm, [45, 36, 18, 69, 80])
@@ -231,13 +232,17 @@ def test_a_folded_arm_blocks_its_own_beam():
     hook = np.stack((12 + 12 * np.cos(turn), 0 * turn, 60 + 12 * np.sin(turn)), axis=1)
     line = np.concatenate((arc_points(60.0, 0.0, 40), hook[1:]))
     arms = {"laser": ArmShape(line, 2.0)}
-    hit = Referee([]).cast(line[-1], [-1.0, 0, 0], 100.0, arms, own="laser")
+    hit = CollisionChecker([]).cast(line[-1], [-1.0, 0, 0], 100.0, arms, own="laser")
     assert hit.struck == Struck.OWN_ARM
     assert hit.distance_mm == pytest.approx(10.0, abs=1e-9)
     np.testing.assert_allclose(hit.normal, [1, 0, 0], atol=1e-9)
     straight_arm = {"laser": ArmShape(arc_points(70, 0.5, 20), 5.0)}
     line = straight_arm["laser"].centreline_mm
-    assert Referee([]).cast(line[-1], line[-1] - line[-2], 100.0, straight_arm, "laser").missed
+    assert (
+        CollisionChecker([])
+        .cast(line[-1], line[-1] - line[-2], 100.0, straight_arm, "laser")
+        .missed
+    )
 
 
 def test_bad_shapes_are_named():
@@ -247,4 +252,4 @@ def test_bad_shapes_are_named():
         ArmShape([[0.0, 0, 0], [0, 0, 1]], 0.0)
     body = Body("x", "organ", box())
     with pytest.raises(InputError, match="repeat"):
-        Referee([body, body])
+        CollisionChecker([body, body])

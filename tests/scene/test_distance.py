@@ -1,4 +1,4 @@
-"""Batched clearance against the referee and against closed forms."""
+"""Batched clearance against the checker and against closed forms."""
 
 import math
 import os
@@ -13,18 +13,17 @@ from hypothesis import strategies as st
 from surgisoft.errors import InputError
 from surgisoft.scene import batched, field, frames
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.bvh import build_tree, segment_triangle_d2
 from surgisoft.scene.capsules import ArmShape, segment_distance, self_contact_gap_mm
-from surgisoft.scene.collision import Referee
-from surgisoft.scene.kernels import segment_triangle_d2
+from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
-from surgisoft.scene.torch_bvh import segment_triangle_d2 as segment_triangle_d2_torch
-from surgisoft.scene.torch_distance import (
+from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
     chains_folded_torch,
 )
-from surgisoft.scene.winding import winding_numbers
+from surgisoft.scene.torch_queries import segment_triangle_d2 as segment_triangle_d2_torch
 from tests.scene.shapes import ball, box, lumpy
 
 RADIUS = 5.0
@@ -70,13 +69,13 @@ def on_torch(bodies):
 def test_ten_thousand_poses_agree_with_the_referee(organ_scene):
     """Within 0.1 mm near contact, and not one collision missed or made up."""
     bodies, scene = organ_scene
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     arms = random_arms(10_000, seed=1, points=13)
     found = scene.clearance({"a": arms}).bodies_mm[:, 0, 0].double().numpy()
     shapes = [{"a": ArmShape(line, RADIUS)} for line in arms.double().numpy()]
-    hits = np.array([any(c.kind == "body" for c in referee.collisions(s)) for s in shapes])
+    hits = np.array([any(c.kind == "body" for c in checker.collisions(s)) for s in shapes])
     asked = np.flatnonzero((np.abs(found) < 4.0) | (np.arange(len(arms)) % 10 == 0))
-    truth = {i: referee.clearance(shapes[i]).bodies_mm["a", "organ"] for i in asked}
+    truth = {i: checker.clearance(shapes[i]).bodies_mm["a", "organ"] for i in asked}
     error = {i: abs(found[i] - value) for i, value in truth.items()}
     near = [e for i, e in error.items() if truth[i] < batched.EXACT_WITHIN_MM - 0.1]
     far = [e for i, e in error.items() if truth[i] >= batched.EXACT_WITHIN_MM - 0.1]
@@ -175,13 +174,13 @@ def test_arms_against_each_other_and_themselves():
     ends = (a[:, :-1, None], a[:, 1:, None], b[:, None, :-1], b[:, None, 1:])
     truth = segment_distance(*(x.double() for x in ends)).flatten(1).amin(1) - 7.0
     torch.testing.assert_close(found.arms_mm[:, 0].double(), truth.clamp(max=60), atol=1e-4, rtol=0)
-    referee = Referee([])
+    checker = CollisionChecker([])
     for i in range(60):
         shapes = {"a": ArmShape(a[i].numpy(), 3.0), "b": ArmShape(b[i].numpy(), 4.0)}
-        exact = referee.clearance(shapes)
+        exact = checker.clearance(shapes)
         assert found.arms_mm[i, 0].item() == pytest.approx(exact.arms_mm["a", "b"], abs=1e-4)
         assert found.self_mm[i, 0].item() == pytest.approx(exact.self_mm["a"], abs=1e-4)
-        named = {(c.arm, c.other) for c in referee.collisions(shapes)}
+        named = {(c.arm, c.other) for c in checker.collisions(shapes)}
         assert (("a", "b") in named) == (found.arms_mm[i, 0].item() < 0)
     torch.testing.assert_close(
         chains_apart_torch(a, b, 7.0, 60.0), found.arms_mm[:, 0], atol=1e-3, rtol=0
@@ -295,7 +294,7 @@ def test_bad_requests_are_named():
 def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
     """A first segment of 100 mm behind the arm; sideways passes of long segments too."""
     bodies, scene = organ_scene
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     arms = random_arms(150, seed=11, near=60.0, far=110.0)
     back = frames.normalise(arms[:, 0] - arms[:, 1])
     arms = torch.cat((arms[:, :1] + 100.0 * back[:, None], arms), 1)
@@ -304,7 +303,7 @@ def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
         found = engine.clearance({"a": arms}).bodies_mm[:, 0, 0]
         for i, line in enumerate(arms.double().numpy()):
             shapes = {"a": ArmShape(line, RADIUS)}
-            truth = referee.clearance(shapes).bodies_mm["a", "organ"]
+            truth = checker.clearance(shapes).bodies_mm["a", "organ"]
             if truth < batched.EXACT_WITHIN_MM - 0.1:
                 assert found[i].item() == pytest.approx(truth, abs=1e-4)
             else:

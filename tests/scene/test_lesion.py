@@ -10,16 +10,20 @@ from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
 from surgisoft.scene.lesion import (
+    OrganSurface,
     circle_on,
     closest_in_triangles,
+    directed_site,
+    good_sites,
     lesion_ring,
     nearest_on_surface,
+    pointed_site,
 )
-from surgisoft.scene.site import directed_site, good_sites, pointed_site
 from surgisoft.scene.spec import LesionSpec
 from tests.scene.shapes import ball, box, lumpy, mesh_of
 
 FINE = ball(50.0, 5)
+whole = OrganSurface.whole
 
 
 @given(seed=st.integers(0, 1000))
@@ -96,7 +100,7 @@ def test_a_path_of_ones_own_is_followed_evenly():
 def test_pointing_finds_the_nearest_body():
     near, far = ball(30.0), ball(30.0)
     far = type(far)(far.vertices_mm + np.array([100.0, 0.0, 0.0]), far.faces)
-    site = pointed_site([near, far], np.array([100.0, 0.0, 35.0]), 15.0)
+    site = pointed_site([whole(near), whole(far)], np.array([100.0, 0.0, 35.0]), 15.0)
     assert site.body == 1
     np.testing.assert_allclose(site.point_mm, [100.0, 0.0, 30.0], atol=0.1)
 
@@ -105,20 +109,20 @@ def test_pointing_finds_the_nearest_body():
 def test_a_direction_finds_the_side_that_faces_it(seed):
     direction = np.random.default_rng(seed).normal(size=3)
     direction /= np.linalg.norm(direction)
-    site = directed_site([FINE], direction, 20.0)
+    site = directed_site([whole(FINE)], direction, 20.0)
     np.testing.assert_allclose(site.point_mm, 50.0 * direction, atol=0.05)
 
 
 def test_a_direction_through_a_hole_takes_the_outermost_point():
     torus = mesh_of(trimesh.creation.torus(60.0, 25.0))
-    site = directed_site([torus], np.array([0.0, 0.0, 1.0]), 20.0)
+    site = directed_site([whole(torus)], np.array([0.0, 0.0, 1.0]), 20.0)
     assert site.point_mm[2] == pytest.approx(25.0)
 
 
 def test_a_ring_that_does_not_fit_where_pointed_tells_what_fits():
     side = box((80.0, 80.0, 80.0))
     with pytest.raises(InputError, match=r"20 mm does not lie .*a ring of 9 mm does"):
-        pointed_site([side], np.array([35.2, 0.0, 40.0]), 20.0)
+        pointed_site([whole(side)], np.array([35.2, 0.0, 40.0]), 20.0)
 
 
 def test_good_sites_are_open_and_the_same_each_time():
@@ -126,8 +130,8 @@ def test_good_sites_are_open_and_the_same_each_time():
     lid = type(organ)(
         box((300.0, 300.0, 10.0)).vertices_mm + np.array([0.0, 0.0, 70.0]), box().faces
     )
-    sites = good_sites([organ, lid], 20.0)
-    again = good_sites([organ, lid], 20.0)
+    sites = good_sites([whole(organ), whole(lid)], 20.0)
+    again = good_sites([whole(organ), whole(lid)], 20.0)
     assert [tuple(site.point_mm) for site in sites] == [tuple(site.point_mm) for site in again]
     # under the lid nothing above the organ is open
     assert sites[0].ring.normal[2] < 0.9
@@ -138,7 +142,7 @@ def test_a_ring_too_large_for_the_organ_tells_one_that_fits(diameter):
     """On a ball of 15 mm radius a ring is at most 30 mm sin(75.5 degrees) = 29 mm wide."""
     small = ball(15.0, 3)
     with pytest.raises(InputError, match=f"no ring of {diameter:g} mm") as caught:
-        good_sites([small], diameter)
+        good_sites([whole(small)], diameter)
     fits = float(re.search(r"a ring of (\S+) mm does", str(caught.value))[1])
     assert 20.0 <= fits <= 29.1
-    assert good_sites([small], fits)
+    assert good_sites([whole(small)], fits)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
 from surgisoft.scene.mesh import Mesh
-from surgisoft.scene.meshio import read_mesh, read_parts, recognise_unit, told_unit, write_ply
+from surgisoft.scene.meshio import given_unit, read_mesh, read_parts, recognise_unit, write_ply
 from tests.scene.shapes import lumpy
 
 
@@ -63,11 +63,11 @@ def test_the_unit_is_told_from_an_organs_size(size):
 
 
 def test_a_told_unit_that_makes_no_organ_is_warned_of():
-    assert told_unit(180.0, "mm") == "mm, as told"
-    said = told_unit(180.0, "cm")
+    assert given_unit(180.0, "mm") == "mm, as told"
+    said = given_unit(180.0, "cm")
     assert "in doubt: 1800 mm across is not an organ's size" in said
     assert said.endswith("in mm it is 180 mm (--unit mm)")
-    assert "in doubt: 15 mm" in told_unit(15.0, "mm")
+    assert "in doubt: 15 mm" in given_unit(15.0, "mm")
 
 
 def test_doubt_about_the_unit_is_said():

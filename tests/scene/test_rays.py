@@ -1,4 +1,4 @@
-"""Batched rays against the referee, closed forms, and each engine against the other."""
+"""Batched rays against the checker, closed forms, and each engine against the other."""
 
 import math
 
@@ -12,11 +12,10 @@ from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.bvh import build_tree
 from surgisoft.scene.capsules import ArmShape, ray_capsule
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, Struck, rays_to_chains
-from surgisoft.scene.torch_bvh import TorchTree
-from surgisoft.scene.torch_distance import rays_to_chains_torch
+from surgisoft.scene.torch_queries import TorchTree, rays_to_chains_torch
 from tests.scene.shapes import arc_points, ball, box, lumpy
 
 RANGE = 250.0
@@ -42,13 +41,13 @@ def random_rays(count, seed):
     return torch.tensor(origins, dtype=torch.float32), torch.tensor(aims, dtype=torch.float32)
 
 
-def near_silhouette(referee, origins, aims, truth):
+def near_silhouette(checker, origins, aims, truth):
     """Rays whose neighbours 0.02 mm beside them end on something else or far away."""
     unsure = truth.incidence_rad > math.radians(85)
     for axis in range(2):
         side = frames.rotation_from_z(aims)[..., axis] * 0.02
         for shift in (side, -side):
-            beside = referee.cast(origins + shift, aims, RANGE)
+            beside = checker.cast(origins + shift, aims, RANGE)
             unsure |= np.abs(beside.distance_mm - truth.distance_mm) > 0.5
             unsure |= beside.struck != truth.struck
     return unsure
@@ -58,14 +57,14 @@ def test_ten_thousand_rays_agree_with_the_referee(scene):
     bodies, engine = scene
     origins, aims = random_rays(10_000, seed=1)
     found = engine.cast(origins, aims, RANGE)
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     o, d = origins.double().numpy(), aims.double().numpy()
-    truth = referee.cast(o, d, RANGE)
+    truth = checker.cast(o, d, RANGE)
     gap = np.linalg.norm(found.point_mm.double().numpy() - truth.point_mm, axis=1)
     apart = np.flatnonzero((gap > 0.001) | (found.struck.numpy() != truth.struck))
     assert len(apart) < 20
     subset = type(truth)(*(getattr(truth, f)[apart] for f in truth.__dataclass_fields__))
-    silhouette = near_silhouette(referee, o[apart], d[apart], subset)
+    silhouette = near_silhouette(checker, o[apart], d[apart], subset)
     assert (gap[apart][~silhouette] < 0.02).all()
     assert (found.struck.numpy()[apart] == truth.struck[apart])[~silhouette].all()
     agree = np.setdiff1d(np.arange(len(o)), apart)
@@ -111,10 +110,10 @@ def test_arms_in_the_way_agree_with_the_referee(scene, name, tmp_path):
     origins = torch.where(half, tip, origins.double())
     aims = torch.where(half, tangent, aims.double())
     found = engine.cast(origins, aims, RANGE, lines, own="laser")
-    referee = Referee(bodies)
+    checker = CollisionChecker(bodies)
     for i in range(count):
         arms = {n: ArmShape(v[i].numpy(), engine.radii_mm[n]) for n, v in lines.items()}
-        truth = referee.cast(origins[i].numpy(), aims[i].numpy(), RANGE, arms, "laser")
+        truth = checker.cast(origins[i].numpy(), aims[i].numpy(), RANGE, arms, "laser")
         assert found.struck[i].item() == truth.struck
         assert found.distance_mm[i].item() == pytest.approx(float(truth.distance_mm), abs=1e-3)
         np.testing.assert_allclose(found.normal[i], truth.normal, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Reach tables against closed forms of the arc; aiming against arms that are known to aim."""
+"""Reach tables against closed forms of the arc; aiming against arms that are known to solve_aim."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
-from surgisoft.scene.reach import ArmReach, aim, nearest_commands
+from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
@@ -62,7 +62,7 @@ def test_bends_reach_ninety_degrees_to_every_side():
 def test_aim_hits_every_target_that_some_arm_hits(seed, distance):
     tips, directions = REACH.tips(random_commands(seed, 40))
     targets = tips + distance * directions
-    found = aim(REACH, targets, nearest_commands(REACH, targets, (15.0, 65.0)))
+    found = solve_aim(REACH, targets, nearest_commands(REACH, targets, (15.0, 65.0)))
     tips, directions = REACH.tips(found.commands)
     away = targets - tips
     across = np.linalg.norm(np.cross(away, directions), axis=1)
@@ -75,7 +75,7 @@ def test_aim_hits_every_target_that_some_arm_hits(seed, distance):
 def test_neighbouring_targets_have_neighbouring_solutions():
     around = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     ring = np.stack((10 * np.cos(around), 10 * np.sin(around), 0 * around + 110.0), axis=1)
-    found = aim(REACH, ring, np.tile(REACH.rest, (72, 1)))
+    found = solve_aim(REACH, ring, np.tile(REACH.rest, (72, 1)))
     lines, _ = REACH.shapes(found.commands)
     assert found.on_target.all()
     assert np.linalg.norm(np.roll(lines, -1, axis=0) - lines, axis=2).max() < 0.5
@@ -84,7 +84,7 @@ def test_neighbouring_targets_have_neighbouring_solutions():
 
 def test_what_lies_behind_is_not_on_target():
     target = np.array([[0.0, 0.0, -40.0]])
-    assert not aim(REACH, target, REACH.rest[None]).on_target.any()
+    assert not solve_aim(REACH, target, REACH.rest[None]).on_target.any()
 
 
 def test_a_fitted_model_makes_the_same_table_as_its_arcs():

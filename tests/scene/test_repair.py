@@ -5,7 +5,7 @@ import contextlib
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
@@ -35,6 +35,7 @@ def test_a_sound_mesh_stays_as_it_is():
     assert repaired.bodies[0].content_hash == BALL.content_hash
 
 
+@example(seed=400, share=0.43493323626521513)  # turns 160 of the 320 faces: a tie
 @given(seed=st.integers(0, 1000), share=st.floats(0.05, 0.45))
 def test_random_damage_that_loses_nothing_is_undone(seed, share):
     """Turned faces, corners apart by rounding, faces in any order: the same surface comes back."""

@@ -15,9 +15,8 @@ from surgisoft.environments import ONE_AGENT
 from surgisoft.errors import InputError
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
-from surgisoft.scene.packaged import PHANTOM
-from surgisoft.scene.refereed import RefereedScene
+from surgisoft.scene.collision import CollisionChecker, ExactScene
+from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.parallel import parallel_env
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS
@@ -68,8 +67,8 @@ def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     """Every clearance and hit of an episode is an answer of that engine, and of no other."""
     env = surgisoft.parallel_env("circle_ablation", geometry=geometry)
     around, asked = env.task.scene, []
-    referee = Referee(around.geometry.bodies)
-    assert isinstance(around.collision, RefereedScene if geometry == "fcl" else BatchedScene)
+    referee = CollisionChecker(around.geometry.bodies)
+    assert isinstance(around.collision, ExactScene if geometry == "fcl" else BatchedScene)
     for name in ("clearance", "cast"):
         ask = getattr(around.collision, name)
         monkeypatch.setattr(
@@ -221,7 +220,7 @@ def test_gymnasium_takes_the_arm_and_refuses_what_it_does_not_know(tmp_path):
     plain = gymnasium.make("surgisoft/track_circle-v0")
     np.testing.assert_array_equal(env.reset(seed=4)[0], plain.reset(seed=4)[0])
     many = gymnasium.make_vec("surgisoft/keyhole-v0", num_envs=2, geometry="fcl")
-    assert isinstance(many.unwrapped._adapter.task.world.scene.collision, RefereedScene)
+    assert isinstance(many.unwrapped._adapter.task.world.scene.collision, ExactScene)
     for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(InputError, match="no arm model there"):
             make("surgisoft/track_circle-v0", arm=tmp_path / "none")

@@ -9,7 +9,7 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.keyhole import Keyhole, KeyholeConfig
@@ -50,7 +50,7 @@ def test_the_script_visits_every_slot_without_contact(done):
 
 def test_fcl_says_so_too(task, done):
     """The referee on every fifth body of the episodes: no contact, the same clearances."""
-    referee = Referee(task.world.scene.geometry.bodies)
+    referee = CollisionChecker(task.world.scene.geometry.bodies)
     for state in done[0][::5]:
         for i, line in enumerate(state.world.arms["arm"].line_mm.numpy()):
             shape = {"arm": ArmShape(line, 7.5)}

@@ -11,7 +11,7 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm
@@ -147,7 +147,7 @@ def test_geometry_is_the_referees(theatre, phantom):
     state = theatre.start(streams(7, 6))
     for action in actions_of(theatre, 6, 10, seed=2):
         state = theatre.step(state, action)
-    referee, scene = Referee(phantom.bodies), state.scene
+    referee, scene = CollisionChecker(phantom.bodies), state.scene
     for i in range(6):
         shapes = {name: ArmShape(part.line_mm[i].numpy(), 7.5) for name, part in state.arms.items()}
         least = referee.clearance(shapes).least_mm

@@ -11,17 +11,17 @@ from torch import Tensor
 
 from surgisoft.errors import unknown_name
 from surgisoft.scene import frames
-from surgisoft.scene.ablation import AblationMap, AblationState
-from surgisoft.scene.batched import BatchClearance, BatchedScene
+from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
+from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import View, view
+from surgisoft.scene.capsules import BatchClearance
+from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.lesions import lesions_like
+from surgisoft.scene.lesion import lesions_like
 from surgisoft.scene.mesh import Body
-from surgisoft.scene.packaged import PHANTOM as PHANTOM
 from surgisoft.scene.rays import RayHit
-from surgisoft.scene.refereed import RefereedScene
-from surgisoft.scene.tissue import Tissue
+from surgisoft.scene.spec import PHANTOM as PHANTOM
 from surgisoft.tasks.world.arm import ArmPart, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
@@ -204,8 +204,8 @@ class ObstacleEngine:
         return SceneState(self.collision.clearance(lines), donated=donated)
 
 
-def collision_engine(geometry: str, engine: BatchedScene) -> BatchedScene | RefereedScene:
+def collision_engine(geometry: str, engine: BatchedScene) -> BatchedScene | ExactScene:
     """The batched engine itself, or FCL with the same bodies and arms, by `GEOMETRIES` name."""
     if geometry == "batched":
         return engine
-    return RefereedScene(engine.bodies, engine.radii_mm, engine.device)
+    return ExactScene(engine.bodies, engine.radii_mm, engine.device)

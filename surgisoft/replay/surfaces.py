@@ -1,4 +1,7 @@
-"""The organ's surface around the cut, finely parted so that it can be coloured by its dose."""
+"""Surfaces to draw: meshes with sharp edges, a disc on a surface, the organ around the cut.
+
+`dosed_surface` divides the organ's faces around the cut finely enough to colour them by dose.
+"""
 
 from __future__ import annotations
 

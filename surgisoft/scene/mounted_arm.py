@@ -1,7 +1,7 @@
-"""An arm at work from its mount: the beam around the ring, the camera upon it.
+"""An arm at its mount: the laser arm around the ring, the endoscope arm turned to the lesion.
 
-What is judged here for thousands of mounts at once (batched engine) is confirmed for the chosen one
-by the referee (`check`). Everything is in the world frame.
+The search of mounts evaluates thousands of mounts with these functions and the batched engine;
+`check` confirms the chosen ones with FCL. Everything is in the world frame.
 """
 
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ import numpy as np
 
 from surgisoft.scene import frames
 from surgisoft.scene.lesion import Ring
-from surgisoft.scene.reach import ArmReach, aim, nearest_commands
+from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim
 from surgisoft.scene.spec import CameraSpec, LaserSpec, MountSpec
 
 LANDED_MM = 0.3
 """A ray reaches a point of the surface if it ends this near (mm): half the laser's spot."""
-WAY_STEPS = 24
+APPROACH_STEPS = 24
 """Steps in which the way from rest to the lesion is looked at."""
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class MountedArm:
     """An arm at its mount."""
 
     reach: ArmReach
@@ -31,7 +31,7 @@ class Held:
     """Straight shaft behind the base (mm)."""
 
     @classmethod
-    def at(cls, mount: MountSpec, reach: ArmReach) -> "Held":
+    def at(cls, mount: MountSpec, reach: ArmReach) -> "MountedArm":
         """The arm where the scene file puts it."""
         return cls(reach, mount.pose(), mount.shaft_mm)
 
@@ -45,8 +45,8 @@ class Held:
         return frames.apply(frames.invert(self.pose), points_mm)
 
     def way(self, commands: np.ndarray) -> np.ndarray:
-        """Commands (WAY_STEPS, P) in a straight line from rest to `commands` (P,)."""
-        share = np.linspace(0.0, 1.0, WAY_STEPS)[:, None]
+        """Commands (APPROACH_STEPS, P) in a straight line from rest to `commands` (P,)."""
+        share = np.linspace(0.0, 1.0, APPROACH_STEPS)[:, None]
         return (1.0 - share) * self.reach.rest + share * commands
 
 
@@ -60,7 +60,7 @@ def placed(lines_mm: np.ndarray, poses: np.ndarray, shaft_mm: float) -> np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class RingSolution:
     """The laser arm around the ring, M points; commands of points it cannot reach are its best."""
 
     centre: np.ndarray
@@ -83,16 +83,16 @@ class Cut:
     """(M,) farthest that any point of the arm moves to the next ring point (mm)."""
 
 
-def cut_ring(arm: Held, ring: Ring, laser: LaserSpec) -> Cut:
+def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
     """Solve the laser arm for every ring point, all from the solution at the lesion's centre."""
     start = nearest_commands(arm.reach, arm.inward(ring.centre_mm[None]), laser.standoff_mm)
-    centre = aim(arm.reach, arm.inward(ring.centre_mm[None]), start).commands[0]
+    centre = solve_aim(arm.reach, arm.inward(ring.centre_mm[None]), start).commands[0]
     count = len(ring.points_mm)
-    aimed = aim(arm.reach, arm.inward(ring.points_mm), np.tile(centre, (count, 1)))
+    aimed = solve_aim(arm.reach, arm.inward(ring.points_mm), np.tile(centre, (count, 1)))
     lines, directions = arm.lines(aimed.commands)
     low, high = laser.standoff_mm
     incidence = frames.angle_between(-directions, ring.normals)
-    return Cut(
+    return RingSolution(
         centre=centre,
         commands=aimed.commands,
         lines_mm=lines,
@@ -106,7 +106,7 @@ def cut_ring(arm: Held, ring: Ring, laser: LaserSpec) -> Cut:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class EndoscopePose:
     """The endoscope arm turned to the lesion."""
 
     commands: np.ndarray
@@ -123,13 +123,13 @@ class Look:
     """Between the camera's axis and the direction to the lesion's centre (rad)."""
 
 
-def look_at_lesion(arm: Held, ring: Ring, camera: CameraSpec) -> Look:
+def look_at_lesion(arm: MountedArm, ring: Ring, camera: CameraSpec) -> EndoscopePose:
     """Bend the endoscope arm until its axis runs through the lesion's centre."""
     target = arm.inward(ring.centre_mm[None])
-    aimed = aim(arm.reach, target, nearest_commands(arm.reach, target, camera.range_mm))
+    aimed = solve_aim(arm.reach, target, nearest_commands(arm.reach, target, camera.range_mm))
     line, direction = arm.lines(aimed.commands)
     towards = ring.centre_mm - line[0, -1]
-    return Look(
+    return EndoscopePose(
         aimed.commands[0],
         line[0],
         direction[0],

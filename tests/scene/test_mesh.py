@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surgisoft.scene.index import equal_rows, used_indices
+from surgisoft.scene.mesh import equal_rows, used_indices
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (1, 3), (400, 3)])

@@ -2,7 +2,7 @@
 
 import os
 
-from surgisoft.replay.find import MAGIC, find_replay
+from surgisoft.replay.show import MAGIC, find_replay
 
 
 def test_the_newest_replay_of_a_run_is_found(tmp_path):

@@ -1,38 +1,40 @@
-"""Mounts of one arm, judged alone: what the laser covers from there, what the endoscope sees.
+"""Search for the mounts of both arms: the laser covers the ring, the endoscope sees it, no contact.
 
-Mounts are drawn from how the arm stands at work: from where the beam comes, how far off, how much
-the arm is bent then and to which side. Each is judged by the batched engine.
+Candidates are drawn from how the arm stands at work: the beam's direction and length, how much the
+arm is bent, and to which side. The batched engine evaluates the candidates of each arm alone; then
+the best of both arms are paired.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from surgisoft.progress import Progress
+from surgisoft.progress import Progress, silent
 from surgisoft.scene import frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import view
+from surgisoft.scene.distance import chains_apart
 from surgisoft.scene.lesion import Ring
-from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec
-from surgisoft.scene.sweep import (
+from surgisoft.scene.mounted_arm import (
     LANDED_MM,
-    Cut,
-    Held,
-    Look,
-    cut_ring,
+    EndoscopePose,
+    MountedArm,
+    RingSolution,
     look_at_lesion,
     placed,
+    solve_ring,
 )
+from surgisoft.scene.reach import ArmReach
+from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec
 
 BENDS_RAD = np.radians([0.0, 25.0, 50.0])
 """How far the arm is bent when it looks at the lesion's centre (rad)."""
 ROLLS = 8
 """Sides to which a bent arm's base may lie, seen along the beam."""
-MOST_JUDGED = 240
+MOST_EVALUATED = 240
 """How many mounts of each kind are judged on the whole ring."""
 ROUNDS, TRIES = 3, 60
 """How often, and at how many mounts each, the search goes on around the best when none will do."""
@@ -46,9 +48,9 @@ COMFORT_MM = 10.0
 class LaserSite:
     """A laser mount judged on the ring."""
 
-    arm: Held
+    arm: MountedArm
     """Reach, pose and shaft."""
-    cut: Cut
+    cut: RingSolution
     """The arm's solutions around the ring."""
     landed: np.ndarray
     """(M,) bool: nothing stands between the tip and the point."""
@@ -63,12 +65,12 @@ class LaserSite:
 
 
 @dataclass(frozen=True, eq=False)
-class LookSite:
+class EndoscopeSite:
     """An endoscope mount judged alone."""
 
-    arm: Held
+    arm: MountedArm
     """Reach, pose and shaft."""
-    look: Look
+    look: EndoscopePose
     """The arm turned to the lesion."""
     visible: np.ndarray
     """(M,) bool: ring points in the picture and not hidden by a body."""
@@ -119,7 +121,7 @@ def mount_poses(reach: ArmReach, centre_mm, outward: np.ndarray, distances_mm) -
     return np.concatenate(poses)
 
 
-def judge_lasers(
+def laser_sites(
     engine: BatchedScene,
     reach: ArmReach,
     ring: Ring,
@@ -137,7 +139,7 @@ def judge_lasers(
     poses = _standing(engine, "laser", reach, poses, shaft_mm, limits, ring)
 
     def judge(pose: np.ndarray) -> LaserSite:
-        return _judge_laser(engine, Held(reach, pose, shaft_mm), ring, laser, limits)
+        return _evaluate_laser(engine, MountedArm(reach, pose, shaft_mm), ring, laser, limits)
 
     return _best_first(judge, poses, ring, lambda site: site.good.all(), report, "laser mounts")
 
@@ -173,7 +175,7 @@ def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -
 
 
 def _standing(engine, tool, reach, poses, shaft_mm, limits, ring) -> np.ndarray:
-    """Poses whose arm is clear at rest, those nearest to the middle first, at most MOST_JUDGED.
+    """Poses whose arm is clear at rest, those nearest to the middle first, at most MOST_EVALUATED.
 
     When none is clear the ones that come nearest to it are kept, to tell how close they come.
     """
@@ -184,13 +186,13 @@ def _standing(engine, tool, reach, poses, shaft_mm, limits, ring) -> np.ndarray:
     clear = clearance >= limits.clearance_mm
     order = np.argsort(-(np.where(clear, 1e3, clearance) + upright), kind="stable")
     kept = order[: max(int(clear.sum()), 20)]
-    if len(kept) > MOST_JUDGED:
-        kept = kept[np.linspace(0, len(kept) - 1, MOST_JUDGED).astype(int)]
+    if len(kept) > MOST_EVALUATED:
+        kept = kept[np.linspace(0, len(kept) - 1, MOST_EVALUATED).astype(int)]
     return poses[kept]
 
 
-def _judge_laser(engine, arm: Held, ring: Ring, laser: LaserSpec, limits: LimitsSpec):
-    cut = cut_ring(arm, ring, laser)
+def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limits: LimitsSpec):
+    cut = solve_ring(arm, ring, laser)
     way, _ = arm.lines(arm.way(cut.centre))
     lines = torch.from_numpy(np.concatenate((cut.lines_mm, way)))
     answer = engine.clearance({"laser": lines})
@@ -224,7 +226,7 @@ def _judge_laser(engine, arm: Held, ring: Ring, laser: LaserSpec, limits: Limits
     return LaserSite(arm, cut, landed, clearance[:count], good, least, float(score))
 
 
-def judge_looks(
+def endoscope_sites(
     engine: BatchedScene,
     reach: ArmReach,
     ring: Ring,
@@ -232,7 +234,7 @@ def judge_looks(
     limits: LimitsSpec,
     shaft_mm: float,
     report: Progress,
-) -> list[LookSite]:
+) -> list[EndoscopeSite]:
     """Endoscope mounts, best first."""
     radius = np.linalg.norm(ring.points_mm - ring.centre_mm, axis=1).max()
     nearest = max(camera.range_mm[0], 1.25 * radius / np.tan(np.radians(camera.fov_deg / 2)))
@@ -242,21 +244,23 @@ def judge_looks(
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
     poses = _standing(engine, "endoscope", reach, poses, shaft_mm, limits, ring)
 
-    def judge(pose: np.ndarray) -> LookSite:
-        return _judge_look(engine, Held(reach, pose, shaft_mm), ring, camera, limits)
+    def judge(pose: np.ndarray) -> EndoscopeSite:
+        return _evaluate_endoscope(engine, MountedArm(reach, pose, shaft_mm), ring, camera, limits)
 
-    def enough(site: LookSite) -> bool:
+    def enough(site: EndoscopeSite) -> bool:
         return sees(site, limits)
 
     return _best_first(judge, poses, ring, enough, report, "endoscope mounts")
 
 
-def sees(site: LookSite, limits: LimitsSpec) -> bool:
+def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
     """Whether the endoscope sees enough of the ring without touching anything."""
     return bool(site.visible.mean() >= limits.view_fraction and site.score > 50.0)
 
 
-def _judge_look(engine, arm: Held, ring: Ring, camera: CameraSpec, limits: LimitsSpec):
+def _evaluate_endoscope(
+    engine, arm: MountedArm, ring: Ring, camera: CameraSpec, limits: LimitsSpec
+):
     look = look_at_lesion(arm, ring, camera)
     way, _ = arm.lines(arm.way(look.commands))
     answer = engine.clearance({"endoscope": torch.from_numpy(way)})
@@ -274,4 +278,163 @@ def _judge_look(engine, arm: Held, ring: Ring, camera: CameraSpec, limits: Limit
         + 0.7 * base[2]
         - 0.5 * frames.angle_between(-look.direction, ring.normal)
     )
-    return LookSite(arm, look, visible, least, float(score))
+    return EndoscopeSite(arm, look, visible, least, float(score))
+
+
+LASERS, LOOKS = 12, 40
+"""How many of the best mounts of each kind are tried together."""
+PORTS_MM = 100.0
+"""Shafts farther apart than two ports in an abdominal wall gain nothing more (mm)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shortfall:
+    """Why no pair of mounts was found, and how close the best came."""
+
+    sentence: str
+    """For the user."""
+    covered: float
+    """Fraction of the ring that the best laser mount can cut."""
+    viewed: float
+    """Fraction of the ring that the best endoscope mount sees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Mounts for both arms."""
+
+    laser: LaserSite
+    """The laser's."""
+    look: EndoscopeSite
+    """The endoscope's."""
+    view: float
+    """Least fraction of the ring in view while the laser goes round."""
+    score: float
+    """Higher is better."""
+
+
+def arms_apart_mm(first: np.ndarray, second: np.ndarray, radii_mm: float) -> np.ndarray:
+    """(B,) skin distances of centrelines (B, K, 3) and (B, L, 3) mm with summed radii."""
+    out = np.empty(len(first))
+    chains_apart(np.ascontiguousarray(first), np.ascontiguousarray(second), radii_mm, 200.0, out)
+    return out
+
+
+def find_mounts(
+    engine: BatchedScene,
+    reaches: dict[str, ArmReach],
+    ring: Ring,
+    laser: LaserSpec,
+    camera: CameraSpec,
+    limits: LimitsSpec,
+    shafts_mm: dict[str, float],
+    report: Progress = silent,
+) -> tuple[list[Pair], Shortfall | None]:
+    """Pairs of mounts, best first; or none and what was lacking.
+
+    The ring may be coarse here; `check` confirms the chosen pair on the whole of it.
+    """
+    lasers = laser_sites(engine, reaches["laser"], ring, laser, limits, shafts_mm["laser"], report)
+    looks = endoscope_sites(
+        engine, reaches["endoscope"], ring, camera, limits, shafts_mm["endoscope"], report
+    )
+    whole = [site for site in lasers if site.good.all()]
+    wide = [site for site in looks if sees(site, limits)]
+    covered, viewed = float(lasers[0].good.mean()), float(looks[0].visible.mean())
+    if not whole:
+        return [], Shortfall(_laser_shortfall(lasers[0], laser, limits), covered, viewed)
+    if not wide:
+        return [], Shortfall(_endoscope_shortfall(looks[0], limits), covered, viewed)
+    pairs = _together(engine, _spread(whole, LASERS), _spread(wide, LOOKS), ring, camera, limits)
+    if not pairs:
+        sentence = (
+            "each arm finds a mount, but no two of them leave room for both arms "
+            f"({limits.clearance_mm:g} mm apart) with {100 * limits.view_fraction:.0f} % of the "
+            "ring in view"
+        )
+        return [], Shortfall(sentence, covered, viewed)
+    return pairs, None
+
+
+def _spread(sites: list, count: int) -> list:
+    """The best sites, at most `count`, each with its base at least 25 mm from the others'."""
+    chosen: list = []
+    for site in sites:
+        place = site.arm.pose[:3, 3]
+        if all(np.linalg.norm(place - other.arm.pose[:3, 3]) >= 25.0 for other in chosen):
+            chosen.append(site)
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
+    """Pairs that leave each other room and the ring in view, best first."""
+    pairs = []
+    for laser in lasers:
+        work = np.concatenate(
+            (laser.arm.lines(laser.arm.way(laser.cut.centre))[0], laser.cut.lines_mm)
+        )
+        for look in looks:
+            radii = laser.arm.reach.radius_mm + look.arm.reach.radius_mm
+            way = look.arm.lines(look.arm.way(look.look.commands))[0]
+            turned = arms_apart_mm(work, np.tile(look.look.line_mm, (len(work), 1, 1)), radii)
+            resting = arms_apart_mm(np.tile(work[:1], (len(way), 1, 1)), way, radii)
+            apart = float(min(turned.min(), resting.min()))
+            steps = [np.linalg.norm(np.diff(a, axis=0), axis=-1).max() for a in (work, way)]
+            if apart < max(limits.clearance_mm, 0.5 * max(steps)):
+                continue
+            score = laser.score + look.score + min(apart, COMFORT_MM) / COMFORT_MM
+            score += 3.0 * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
+            pairs.append(Pair(laser, look, float(look.visible.mean()), score))
+    pairs.sort(key=lambda pair: -pair.score)
+    seen_pairs = []
+    for pair in pairs:
+        fraction = least_view(engine, pair.look.look, pair.laser.cut.lines_mm, ring, camera)
+        if fraction >= limits.view_fraction:
+            seen_pairs.append(replace(pair, view=fraction))
+        if len(seen_pairs) == 5:
+            break
+    return seen_pairs
+
+
+def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
+    """Distance of the two shafts where they are nearest: at their bases or at their far ends."""
+    ends = [
+        np.array([arm.pose[:3, 3] - s * arm.pose[:3, 2] for s in (0.0, arm.shaft_mm)])
+        for arm in (first, second)
+    ]
+    return float(np.linalg.norm(ends[0] - ends[1], axis=1).min())
+
+
+def least_view(
+    engine, look: EndoscopePose, laser_lines_mm, ring: Ring, camera: CameraSpec
+) -> float:
+    """Least fraction of the ring in view while the laser arm stands at each of its lines."""
+    poses = torch.from_numpy(np.tile(look.pose, (len(laser_lines_mm), 1, 1)))
+    arms = {"laser": torch.from_numpy(laser_lines_mm)}
+    views = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, arms)
+    return float(views.fraction.min())
+
+
+def _laser_shortfall(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> str:
+    cut = best.cut
+    reasons = {
+        f"out of reach at {laser.standoff_mm[0]:g} to {laser.standoff_mm[1]:g} mm": ~cut.in_reach,
+        f"hit at more than {laser.max_incidence_deg:g} degrees": cut.in_reach & cut.steep,
+        "hidden from the beam": cut.in_reach & ~best.landed,
+    }
+    said = [f"{100 * bad.mean():.0f} % {why}" for why, bad in reasons.items() if bad.any()]
+    if best.least_mm < limits.clearance_mm:
+        said.append(f"least clearance {best.least_mm:.1f} mm of {limits.clearance_mm:g} mm")
+    return (
+        f"no mount lets the laser cut the whole ring: the best covers "
+        f"{100 * best.good.mean():.0f} % ({', '.join(said) or 'the arm would have to jump'})"
+    )
+
+
+def _endoscope_shortfall(best: EndoscopeSite, limits: LimitsSpec) -> str:
+    return (
+        f"no mount lets the endoscope see {100 * limits.view_fraction:.0f} % of the ring: the best "
+        f"sees {100 * best.visible.mean():.0f} % with {best.least_mm:.1f} mm of clearance"
+    )

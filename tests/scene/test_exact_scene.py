@@ -6,8 +6,8 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.mesh import Body
-from surgisoft.scene.refereed import RefereedScene
 from tests.scene.shapes import ball, box
 
 RADII = {"laser": 6.0, "endoscope": 5.0}
@@ -18,7 +18,7 @@ def engines():
     pose = np.eye(4)
     pose[:3, 3] = [60.0, 0.0, 0.0]
     bodies = (Body("organ", "organ", ball(30.0, 3)), Body("block", "keep-out", box(), pose))
-    return RefereedScene(bodies, RADII), BatchedScene(bodies, RADII)
+    return ExactScene(bodies, RADII), BatchedScene(bodies, RADII)
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap
 from surgisoft.scene.author import CROSSING, Request, prepare
-from surgisoft.scene.buried import buried, buried_faces
-from surgisoft.scene.collision import Referee
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.dose_patch import cut_patch
+from surgisoft.scene.inside import buried, buried_faces, winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.meshio import write_ply
-from surgisoft.scene.winding import winding_numbers
 from tests.scene.shapes import lumpy
 
 AXES = np.array([40.0, 30.0, 30.0])
@@ -90,11 +89,11 @@ def test_the_seam_makes_no_energy(aside):
     normals = frames.normalise((ring - np.sign(x)[:, None] * AWAY) / AXES**2)
     patch = cut_patch(mesh, ring, normals, np.array([0.0, 0.0, top]), 0.3)
     assert not buried(mesh, patch.points_mm, patch.normals).any()
-    referee = Referee([Body("organ", "organ", mesh)])
+    checker = CollisionChecker([Body("organ", "organ", mesh)])
     for start, stop in (([aside, -5.0], [aside, 5.0]), ([aside - 3.0, 1.0], [aside + 3.0, 1.0])):
         eyes = np.c_[np.linspace(start, stop, 41), np.full(41, 80.0)]
         aims = np.tile([0.0, 0.0, -1.0], (41, 1))
-        hits = torch.tensor(referee.cast(eyes, aims, 200.0).point_mm).float()
+        hits = torch.tensor(checker.cast(eyes, aims, 200.0).point_mm).float()
         down, on = torch.tensor([[0.0, 0.0, -1.0]]), torch.ones(1, dtype=torch.bool)
         ablation = AblationMap(patch, 0.4)
         state = ablation.start(hits[:1], down, on)

@@ -3,7 +3,7 @@
 `compare`, `diagnose`, `amend`, `improve` and `next_experiment` all start from one `ResidualTable`,
 which is built once from a model and recordings. `ResidualTable.view` hands out the training rows,
 the held-out rows or all rows as a `Problem`: the rows of that part alone, thinned, in blocks of
-time and folds, with the measurement noise and the model discrepancy that errors are judged
+time and folds, with the measurement noise and the model discrepancy that errors are compared
 against. Key points of rows outside the part are NaN in a view, so that nothing that works on a
 view can see them.
 """

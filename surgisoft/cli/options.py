@@ -46,6 +46,19 @@ EffectFiles = Annotated[
     ),
 ]
 """Of every command that opens a model. The effects are registered when the command line is read."""
+
+
+def with_effect_files(command: str) -> str:
+    """A command to run next, with the files of user-defined effects that this one was given.
+
+    Without them it would refuse to open the model.
+    """
+    from surgisoft.surrogate.effects import registered_files
+
+    files = registered_files()
+    return f"{command} --effect-file {' '.join(files)}" if files else command
+
+
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
 ExperimentFile = Annotated[
     Path,

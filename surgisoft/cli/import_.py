@@ -30,7 +30,7 @@ def import_(
     ],
     force: Force = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be written, write nothing.")
+        bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
     ] = False,
 ) -> None:
     """Import somebody else's files: columns, units and frames as a map says."""

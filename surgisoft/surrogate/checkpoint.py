@@ -144,7 +144,8 @@ def load_model(
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: no arm model there (config.json is missing); make one with 'surgisoft fit'"
+            f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
+            "folder that 'surgisoft fit' made"
         )
     try:
         config = json.loads((folder / "config.json").read_text())

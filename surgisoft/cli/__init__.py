@@ -11,7 +11,7 @@ from surgisoft.errors import InputError
 
 app = typer.Typer(
     name="surgisoft",
-    help="Soft robots in surgical scenes, with arm models judged by measurements.",
+    help="Soft robot arms in surgical scenes: system identification, diagnosis, control.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -64,7 +64,7 @@ def _version(value: bool) -> None:
 @app.callback()
 def _root(
     version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version and leave."
+        False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
 ) -> None:
     pass

@@ -48,7 +48,7 @@ def fit(
     actuation: Annotated[
         Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
     ] = "measured",
-    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage.")] = 200,
+    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage; at least 10.")] = 200,
     seed: Annotated[
         int, typer.Option(min=0, max=SEED_MAX, help="Seed of weights and order of rows.")
     ] = 0,

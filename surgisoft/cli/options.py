@@ -113,9 +113,9 @@ Threads = Annotated[
 Web = Annotated[bool, Option("--web", help="Serve it to a browser on this machine only.")]
 Screenshot = Annotated[
     Path | None,
-    Option("--screenshot", metavar="FILE.png", help="Write a picture without a display and leave."),
+    Option("--screenshot", metavar="FILE.png", help="Write a picture without a display and exit."),
 ]
 SaveReplay = Annotated[
     Path | None,
-    Option("--save", metavar="FILE.rrd", help="Write what the viewer would show and leave."),
+    Option("--save", metavar="FILE.rrd", help="Write what the viewer would show and exit."),
 ]

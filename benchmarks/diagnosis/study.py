@@ -23,7 +23,6 @@ from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.workers import workers
 
 
@@ -65,7 +64,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     model = base_model(case.robot, folder, case.undertrained)
     if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, case.robot, case.discrepancy_mm, case.take)
-    known = KnownError.of(model, [validation_of(case.robot)])
+    known = model.residuals_on([validation_of(case.robot)])
     recorded = record(case)
     ready = time.process_time()
     found = diagnose(model, [recorded.recording], reference=known)

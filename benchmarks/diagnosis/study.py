@@ -22,6 +22,7 @@ from benchmarks.diagnosis.experiment import Settled, settle_both
 from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe
 from surgisoft.progress import Progress
 from surgisoft.workers import workers
 
@@ -84,7 +85,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
         effect_mm=recorded.effect_mm,
         discrepancy_mm=model.validation.rmse_mm,
         seconds=seconds,
-        statistics=found.statistics,
+        statistics=json_safe(asdict(found.statistics)),
         settled=settled,
         settled_untouched=untouched,
         amended=worth,

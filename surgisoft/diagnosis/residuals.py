@@ -27,9 +27,9 @@ from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.scan import linear_scan
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
@@ -444,16 +444,16 @@ class Problem:
             predicted = self.rows(model.predict(self.history)).double().numpy()
         return replace(self, model=model, predicted=predicted)
 
-    def with_reference(self, given: Sequence[Recording] | KnownError) -> "Problem":
+    def with_reference(self, given: Sequence[Recording] | TrainingResiduals) -> "Problem":
         """The problem with residuals from before the change in question.
 
         The model discrepancy has to explain these rows too, by the same function of actuation and
         direction, so it cannot be mistaken for what has changed since.
         """
         spec = self.model.spec
-        if not isinstance(given, KnownError):
+        if not isinstance(given, TrainingResiduals):
             check_fits(spec, list(given))
-            given = KnownError.of(self.model, [history_of(list(given), spec.actuation)], ROWS)
+            given = self.model.residuals_on([history_of(list(given), spec.actuation)], ROWS)
         low, half = np.array(spec.low), np.array(spec.span) / 2
         known = Reference(
             pressure=(given.actuation.double().numpy() - low) / half - 1.0,

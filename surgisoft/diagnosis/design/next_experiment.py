@@ -69,8 +69,8 @@ from surgisoft.measurement.protocols import SIGNALS, Protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects, make_effect
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
 # Competing effects and what is known of them -----------------------------------------------------
@@ -609,7 +609,7 @@ def next_experiment(
     between: Sequence[str] | None = None,
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
-    reference: Sequence[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | TrainingResiduals | None = None,
 ) -> Recommendation:
     """The experiment that best distinguishes competing effects.
 

@@ -76,7 +76,7 @@ def _device() -> torch.device:
 
 @contextlib.contextmanager
 def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
-    """This process among those that torchrun started, and its device."""
+    """Rank and device of this process among those that torchrun started."""
     if device.split(":")[0] not in ("cpu", "cuda"):
         raise InputError(f"--device '{device}': expected cpu or cuda")
     kind = torch.device(device)

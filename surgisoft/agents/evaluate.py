@@ -31,7 +31,7 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "collided": Rollout.largest,
     "clearance_mm": Rollout.smallest,
 }
-"""Measure -> number that stands for an episode; errors have four numbers, others the mean."""
+"""Measure -> how an episode is summarised; errors have four summaries, others the mean."""
 RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
 
@@ -45,7 +45,7 @@ class Summary:
     low: float
     """Lower end of the 95 % interval of the mean."""
     high: float
-    """Upper end."""
+    """Upper end of the 95 % interval of the mean."""
     least: float
     """Smallest of all episodes."""
     most: float
@@ -63,7 +63,7 @@ class Evaluation:
     per_episode: dict[str, np.ndarray]
     """name with unit -> (N,); nan where it does not apply."""
     overall: dict[str, Summary]
-    """The same names."""
+    """name with unit -> summary over the N episodes."""
     checks: list[EpisodeCheck] | None
     """Exact collision checks of each episode; None where there were none."""
 

@@ -1,4 +1,4 @@
-"""Trained policies: from a run's folder alone, or while they are being trained."""
+"""Trained policies, opened from a run's folder or taken from a running training."""
 
 from __future__ import annotations
 

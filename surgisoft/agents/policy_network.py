@@ -45,4 +45,5 @@ class ScaledActor(nn.Module):
         self.network, self.scale, self.limit = actor.as_jit(), action_kPa, step_kPa
 
     def forward(self, observation: Tensor) -> Tensor:
+        """Actions (B, m) kPa, within the limits of the pumps, from observations (B, D)."""
         return (self.scale * self.network(observation)).clamp(-self.limit, self.limit)

@@ -62,7 +62,7 @@ def groups_of(agent: str, agents: Collection[str]) -> tuple[str, ...]:
 
 
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
-    """Agent -> its PPO: an actor of its own, a critic that sees the joint state."""
+    """One PPO for each agent: an actor on its observation, a critic on the joint state."""
     seen, answer, device = env.get_observations().clone(), {}, env.task.world.device
     for agent in env.task.agents:
         view = SimpleNamespace(

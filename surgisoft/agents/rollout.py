@@ -1,4 +1,4 @@
-"""Rollouts: whole episodes of a policy, many at once, with the task's measures and their logs."""
+"""Rollouts: whole episodes of a policy, in batches, with the task's measures and logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Instant:
     episodes: Tensor
     """(R,) int64: number of each episode."""
     state: TaskState
-    """The state reached. The next step overwrites its dose map: copy what is kept."""
+    """The state reached. The next step overwrites its dose map, so copy what you store."""
     actions: dict[str, Tensor] | None
     """agent -> (R, m) kPa that led here; None at the start."""
     outcome: Outcome | None
@@ -44,7 +44,7 @@ class Rollout:
     dt_s: float
     """Time of a step, s."""
     steps: Tensor
-    """(N,) int64: steps until each episode's end."""
+    """(N,) int64: number of steps until the end of each episode."""
     returns: dict[str, Tensor]
     """agent -> (N,): sum of its rewards."""
     terminated: Tensor
@@ -56,7 +56,7 @@ class Rollout:
 
     @property
     def episodes(self) -> int:
-        """N."""
+        """Number N of episodes."""
         return len(self.steps)
 
     @property
@@ -85,7 +85,7 @@ class Rollout:
         return _extreme(self.measures[name], torch.amin, torch.inf)
 
     def end(self, name: str) -> Tensor:
-        """(N,): the value at the episode's last step."""
+        """(N,) value of a measure at the last step of each episode."""
         last = (self.steps - 1).clamp(min=0)[:, None]
         return self.measures[name].gather(1, last)[:, 0]
 

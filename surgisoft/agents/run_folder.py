@@ -90,7 +90,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
 
 
 def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
-    """Copy the scene into the run's folder; its mounts name the run's own arm models."""
+    """Copy the scene into the run's folder; its mounts name the arm models of the run."""
     source = getattr(plan.task_config, "scene", None)
     if source is None:
         return None

@@ -60,7 +60,7 @@ class TrainingRequest:
     preset: str = "fast"
     """`fast`, or `paper`: the hyper-parameters of Chen et al. 2025."""
     steps: int | None = None
-    """Steps over all episodes; None: the task's own, unless minutes are given."""
+    """Steps over all episodes; None: the number that the task names, unless minutes are given."""
     minutes: float | None = None
     """Time to train in place of steps, minutes."""
     envs: int | None = None
@@ -77,7 +77,7 @@ class TrainingRequest:
     """Configuration of the task, or a TOML file with fields of it."""
 
     def plan(self) -> Plan:
-        """The training run that this asks for."""
+        """Resolve the request to a `Plan`; raises InputError for contradicting options."""
         if self.steps is not None and self.minutes is not None:
             raise InputError(
                 f"--steps {self.steps} and --minutes {self.minutes:g}: give one of them, the "
@@ -172,7 +172,7 @@ class EvaluationRequest:
     episodes: int = 20
     """Episodes of each policy."""
     seed: int = 0
-    """Seed of the episodes, the same for each policy."""
+    """Seed of the episodes, equal for each policy."""
     rig: RigConfig | None = None
     """The arms are on this virtual rig; None: in simulation."""
     referee: bool = True
@@ -188,11 +188,11 @@ class EvaluationRequest:
 
     @property
     def place(self) -> str:
-        """Where the episodes take place: `simulation` or `rig`."""
+        """Plant of the episodes: `simulation` or `rig`."""
         return "simulation" if self.rig is None else "rig"
 
     def resolved(self, on_warning: Callable[[str], None]) -> tuple[Task, Any]:
-        """The task and its configuration; a run brings its own."""
+        """The task and its configuration; a training run determines both."""
         if not self.policies:
             raise InputError("no policy is given; expected scripted, random or a run's folder")
         for name in self.policies:

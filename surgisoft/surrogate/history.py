@@ -71,7 +71,7 @@ class History:
             self.noise_mm,
         )
 
-    def to(self, device) -> "History":
+    def to(self, device: str | torch.device) -> "History":
         """Copy of the history on another device."""
         return History(
             self.t_s.to(device),

@@ -72,7 +72,7 @@ def test_results_are_not_overwritten(whole, tmp_path, capsys):
     file, folder = whole
     before = _rows(folder)
     assert run(["experiment", "run", str(file), "-o", str(folder)]) == 2
-    assert "--resume goes on, --force begins anew" in capsys.readouterr().err
+    assert "--resume continues results, --force replaces them" in capsys.readouterr().err
     other = write(tmp_path, TINY.replace("seed = 3", "seed = 4"))
     with pytest.raises(InputError, match="holds another experiment"):
         open_results(load_experiment(other), folder, resume=True)

@@ -126,7 +126,7 @@ def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
     return effect_class(name)(facts, **config)
 
 
-def free_name(kind: str, taken) -> str:
+def free_name(kind: str, taken: Iterable[str]) -> str:
     """Name of one more effect of a kind in a model that has the effects `taken`: `creep#2`."""
     number, name = 1, kind
     while name in taken:

@@ -20,7 +20,7 @@ from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, BodyLog, CameraLog, 
 SUFFIX = ".npz"
 """Suffix of the file of an episode."""
 FORMAT = "surgisoft episode 1"
-"""What the file says it is."""
+"""Name and version of the file format."""
 
 
 def save_episode(log: EpisodeLog, path: str | Path) -> None:

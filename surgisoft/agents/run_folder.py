@@ -50,7 +50,8 @@ def check_free(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
     if (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: a run is already there; go on with --resume {folder} or choose another name"
+            f"{folder}: a run is already there; continue it with --resume {folder} or choose "
+            "another name"
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already there; choose another name")
@@ -188,7 +189,7 @@ class RunFolder:
         file = self.checkpoint(which)
         if not file.is_file():
             raise InputError(
-                f"{file}: there is no such checkpoint yet; go on with 'surgisoft train --resume "
+                f"{file}: there is no such checkpoint yet; continue with 'surgisoft train --resume "
                 f"{self.path}'"
             )
         try:

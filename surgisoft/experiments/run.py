@@ -185,7 +185,7 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
                 yield waiting[future]
     except BrokenProcessPool:
         raise InputError(
-            f"a process of {processes} was ended from outside, memory may be short; go on with "
+            f"one of {processes} processes was killed, perhaps for lack of memory; continue with "
             "--resume and fewer --processes"
         ) from None
 

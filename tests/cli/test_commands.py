@@ -75,11 +75,11 @@ def test_a_folder_holds_config_weights_and_report(lab):
         (["compare", "{lab}/arm", "{lab}/arm/config.json"], "config.json"),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/test.parquet"],
-            "no older result",
+            "not an older result",
         ),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/arm/config.json"],
-            "no older result",
+            "not an older result",
         ),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--report", "{lab}/test.parquet/x"],

@@ -41,7 +41,7 @@ class Truth:
 
 
 class Rig(Protocol):
-    """A bench with one arm of m chambers whose cameras track n key planes."""
+    """Interface of a test bench with one arm of m chambers whose cameras track n key planes."""
 
     chambers: int
     """Number m of chambers, or of other actuators."""

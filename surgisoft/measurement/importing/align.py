@@ -14,7 +14,7 @@ from surgisoft.measurement.importing.units import SECONDS_PER
 SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""
 LARGEST_GAP_S = 1.0
-"""A late log is not read inside a longer gap of its own [s]."""
+"""Longest gap of a late log within which it is still read [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ def without_holds(t_s: np.ndarray, values: np.ndarray, period_s: float) -> np.nd
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """The raw columns of one set of files, one row a sample."""
+    """Raw columns of one set of files, joined to one row per sample."""
 
     main: RawTable
     """The main file, whose rows are the samples."""

@@ -1,4 +1,4 @@
-"""Turns a laboratory's own files into recordings, as a map says.
+"""Conversion of a laboratory's files to recordings, as a map describes it.
 
 The steps: every file gets its role, files that belong together form a set, a set's files are joined
 to one row a sample, positions are brought into the arm's base frame, rows are tidied, and the sets
@@ -138,7 +138,7 @@ def _patterns(spec: ImportMap) -> str:
 
 
 def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
-    """One set of files as a recording on the main file's own clock."""
+    """One set of files as a recording on the clock of the main file."""
     tables = {name: open_raw(path, spec.file[name]) for name, path in files.items()}
     measured = _with_columns(spec.measured, tables, "p")
     commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
@@ -242,7 +242,7 @@ def _actuation(joined: Joined, spec: ActuationMap) -> np.ndarray:
 
 
 def _context(joined: Joined, spec: ImportMap, main: str) -> np.ndarray:
-    """(T, 2) temperature and payload, NaN where the map says nothing."""
+    """(T, 2) temperature and payload, NaN where the map states nothing."""
     values = np.full((len(joined.t_s), 2), np.nan)
     for i, name in enumerate(("temp_C", "payload_g")):
         source = getattr(spec.context, name)

@@ -208,7 +208,7 @@ class Lead:
     """By how much time the body leads its measured actuation."""
 
     seconds: float
-    """Best estimate; the arm's own lag comes on top [s]."""
+    """Best estimate, which includes the lag of the arm [s]."""
     ci95_s: tuple[float, float]
     """95 % interval, by a jackknife over blocks of time [s]."""
 

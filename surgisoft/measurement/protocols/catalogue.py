@@ -21,9 +21,9 @@ class Entry:
     """One protocol of the catalogue."""
 
     about: str
-    """One line."""
+    """Description in one line."""
     points: int
-    """Samples where none are asked for: steady-state points, or frames at 20 Hz."""
+    """Default number of samples: steady-state points, or frames at 20 Hz."""
     steady_state: Callable | None = None
     """Builder of the pressures of steady-state points."""
     signals: tuple[str, ...] = ()

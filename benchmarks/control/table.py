@@ -1,4 +1,4 @@
-"""The control study as Markdown."""
+"""Tables of the benchmark `control` as Markdown."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ NUMBERS = (
     "time_s",
     "failed",
 )
-"""Numbers of an evaluation that are shown where they apply, in this order."""
+"""Measures in the tables, where they apply, in this order."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One figure that is asked for."""
+    """One goal of the project for a measure."""
 
     task: str
     place: str
     number: str
-    """A number of an evaluation."""
+    """Name of the measure."""
     limit: float
     """Largest value, or least where the number is a share of success."""
     at_least: bool = False
     """Whether the limit is the least value."""
     paper: str = ""
-    """The paper's figure (Chen et al. 2025, sec. V)."""
+    """Value in the paper (Chen et al. 2025, sec. V)."""
 
 
 GOALS = (
@@ -59,11 +59,11 @@ GOALS = (
     Goal("circle_ablation", "simulation", "in_view", 0.95, at_least=True),
     Goal("circle_ablation", "simulation", "beam_error_mean_mm", 0.1),
 )
-"""What the project set out to reach, beside what the paper has."""
+"""Goals of the project, with the values of the paper."""
 
 
 def markdown(results: Results, config: ControlConfig) -> str:
-    """All tables."""
+    """All tables of the benchmark."""
     parts = [_setting(config), "## Goals", _goals(results), "## Training", _training(results)]
     if results.paper:
         parts += [f"### {PAPER_STEPS:,} steps", _paper(results, config)]

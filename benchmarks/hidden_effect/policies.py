@@ -1,4 +1,4 @@
-"""Policies trained on a model, and all policies evaluated on the rig that hides an effect."""
+"""Policies trained on a model and evaluated on the rig with a hidden effect."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from surgisoft.progress import Stages
 from surgisoft.tasks.registry import with_fields
 
 TASK = "track_circle"
-"""What the policies learn."""
+"""Task of the policies."""
 SIGHTS = ("blind", "cameras")
-"""Without the cameras' key points, where the model alone says where the body is, and with them."""
+"""Without the cameras' key points, where the model alone estimates the body, and with them."""
 TRAIN, PLAY = 100, 8
 """Lengths of a training and of a driver's episodes, by the meter."""
 
@@ -25,11 +25,11 @@ class PolicyEvaluation:
     """How policies are trained, and the rig on which they are evaluated."""
 
     kept: Cache
-    """Where policies and results are kept."""
+    """Folder of policies and results."""
     specimen: int
     """Seed of the virtual robot."""
     hidden: tuple[tuple[str, float], ...]
-    """Hidden effects of the rig and their strengths."""
+    """Hidden effects of the rig and their amplitudes."""
     steps: int
     """Training steps of each policy."""
     seed: int

@@ -1,4 +1,4 @@
-"""Models judged by how fast the actuation changes: does the arm trail them, or run ahead?"""
+"""Errors of models by the rate of actuation: whether the arm trails them or runs ahead."""
 
 from __future__ import annotations
 

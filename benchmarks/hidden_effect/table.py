@@ -1,4 +1,4 @@
-"""The loop closed, as tables and pictures."""
+"""Tables and pictures of the benchmark `hidden-effect`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ FORMS = {
 }
 """What is known of the two forms of an effect, the rig's and the model's."""
 COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}
-"""Of the three models, in every picture."""
+"""Colours of the three models, in every picture."""
 WORDS = {
     "blind": "without the cameras (`--no-cameras`): the model alone says where the body is",
     "cameras": "with the cameras: key points are measured and filtered",
 }
-"""What each sight means."""
+"""Meaning of each kind of sight."""
 
 
 def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
@@ -207,7 +207,7 @@ def _costs(outcomes: list[Outcome]) -> str:
 
 
 def draw(outcomes: list[Outcome], folder: Path) -> list[Path]:
-    """Error bars of the models and of the policies as pictures; returns their paths."""
+    """Draw error bars of models and policies; returns the paths of the pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     tracking = {
         sight: {key: [o.driven[f"{key}/learned/{sight}"] for o in outcomes] for key in MODELS}

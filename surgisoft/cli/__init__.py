@@ -103,7 +103,7 @@ def _usage(error: TyperException, many: list[str]) -> int:
     message = error.format_message().rstrip(".")
     if message.startswith("Missing argument") and many:
         message += (
-            f" (every value after {', '.join(many)} belongs to it: put arguments before options)"
+            f" (values after {', '.join(many)} belong to that option: put arguments before options)"
         )
     return _fail(f"{message}; see '{where} --help'")
 

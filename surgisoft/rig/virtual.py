@@ -113,7 +113,7 @@ class VirtualRig:
     unit = "kPa"
 
     def __init__(self, config: VirtualRigConfig | int = 0, **fields) -> None:
-        """Build a rig from a configuration, or from the robot's seed and fields of `VirtualRigConfig`."""
+        """Build a rig from a configuration or a robot's seed; fields: of `VirtualRigConfig`."""
         plain = config if isinstance(config, VirtualRigConfig) else VirtualRigConfig(config)
         config = self.config = replace(plain, **fields)
         design, seed, noise = config.design, config.seed, config.noise

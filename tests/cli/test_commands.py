@@ -86,7 +86,10 @@ def test_a_folder_holds_config_weights_and_report(lab):
             "no writable folder",
         ),
         (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "no writable folder"),
-        (["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"], "took every"),
+        (
+            ["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"],
+            "belong to that option",
+        ),
         (["collect", "dance", "-o", "{lab}/x.parquet"], "dance"),
         (["collect", "walk", "-o", "{lab}/x.parquet", "--hidden", "ghost"], "ghost"),
         (["fti"], "No such command"),

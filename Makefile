@@ -34,7 +34,7 @@ test: $(STAMP)  ## the whole suite
 	$(BIN)/python -m pytest -n 2 -q
 
 fast: $(STAMP)  ## the tests that are not marked slow
-	$(BIN)/python -m pytest -n 2 -q -m fast
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m fast
 
 lint: $(STAMP)  ## style, format, types
 	$(BIN)/ruff check .

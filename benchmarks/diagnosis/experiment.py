@@ -14,8 +14,8 @@ from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS
 from surgisoft.diagnosis.diagnose import MOST_RIVALS, diagnose, effect_left
 from surgisoft.diagnosis.residuals import problem_of
 from surgisoft.measurement.recordings import Recording
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Settled:
 def settle(
     case: Case,
     model: ArmModel,
-    known: KnownError,
+    known: TrainingResiduals,
     recording: Recording,
     rivals: tuple[str, ...],
     settings: tuple[str, ...] = tuple(SETUPS),
@@ -62,7 +62,11 @@ def settle(
 
 
 def settle_both(
-    case: Case, model: ArmModel, known: KnownError, recording: Recording, rivals: tuple[str, ...]
+    case: Case,
+    model: ArmModel,
+    known: TrainingResiduals,
+    recording: Recording,
+    rivals: tuple[str, ...],
 ) -> tuple[Settled, Settled]:
     """Results of the recommended experiment, and of one without a change of the setup."""
     free = settle(case, model, known, recording, rivals)

@@ -22,8 +22,8 @@ from benchmarks.diagnosis.experiment import Settled, settle_both
 from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe
 from surgisoft.progress import Progress
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.workers import workers
 
 
@@ -65,7 +65,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
     model = base_model(case.robot, folder, case.undertrained)
     if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, case.robot, case.discrepancy_mm, case.take)
-    known = KnownError.of(model, [validation_of(case.robot)])
+    known = model.residuals_on([validation_of(case.robot)])
     recorded = record(case)
     ready = time.process_time()
     found = diagnose(model, [recorded.recording], reference=known)
@@ -85,7 +85,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
         effect_mm=recorded.effect_mm,
         discrepancy_mm=model.validation.rmse_mm,
         seconds=seconds,
-        statistics=found.statistics,
+        statistics=json_safe(asdict(found.statistics)),
         settled=settled,
         settled_untouched=untouched,
         amended=worth,

@@ -11,7 +11,7 @@ from surgisoft.errors import InputError
 
 app = typer.Typer(
     name="surgisoft",
-    help="Soft robots in surgical scenes, with arm models validated by measurements.",
+    help="Soft robot arms in surgical scenes: system identification, diagnosis, control.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

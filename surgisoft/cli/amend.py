@@ -9,7 +9,15 @@ from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
-from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model, NewModel, Report
+from surgisoft.cli.options import (
+    EffectFiles,
+    Force,
+    JsonFile,
+    Model,
+    NewModel,
+    Report,
+    with_effect_files,
+)
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_json
 
@@ -97,7 +105,8 @@ def amend(
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
-        print(f"next, find further effects: surgisoft diagnose {output} {' '.join(map(str, data))}")
+        following = f"surgisoft diagnose {output} {' '.join(map(str, data))}"
+        print(f"next, find further effects: {with_effect_files(following)}")
     else:
         print(f"{output} was not written; --anyway writes it nevertheless", flush=True)
     if not result.claimed:

@@ -5,7 +5,15 @@ import math
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
-from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Replay, Report
+from surgisoft.cli.options import (
+    EffectFiles,
+    JsonFile,
+    Model,
+    Recordings,
+    Replay,
+    Report,
+    with_effect_files,
+)
 from surgisoft.files import write_json
 
 AXES_SHOWN = 5
@@ -64,7 +72,8 @@ def compare(
         print(f"wrote {path}")
     if result.explainable:
         names = " ".join(map(str, recordings))
-        print(f"next, which effect is missing: surgisoft diagnose {model} {names}")
+        following = with_effect_files(f"surgisoft diagnose {model} {names}")
+        print(f"next, which effect is missing: {following}")
 
 
 def _show(result) -> None:

@@ -8,7 +8,14 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
-from surgisoft.cli.options import EffectFiles, JsonFile, Model, Recordings, Report
+from surgisoft.cli.options import (
+    EffectFiles,
+    JsonFile,
+    Model,
+    Recordings,
+    Report,
+    with_effect_files,
+)
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_json
 
@@ -72,10 +79,12 @@ def diagnose(
     data = " ".join(map(str, recordings))
     if found.verdict.kind == "ambiguous":
         between = " ".join(found.verdict.effects)
-        print(f"next: surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv")
+        command = f"surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv"
+        print(f"next: {with_effect_files(command)}")
     elif found.verdict.kind in ("identified", "several"):
         effects = " ".join(found.verdict.effects)
-        print(f"next: surgisoft amend {model} --effect {effects} --data {data} -o NEW")
+        command = f"surgisoft amend {model} --effect {effects} --data {data} -o NEW"
+        print(f"next: {with_effect_files(command)}")
 
 
 def _show(found) -> None:

@@ -49,7 +49,9 @@ def fit(
         Literal["measured", "commanded"],
         typer.Option(help="Which actuation is the model's input."),
     ] = "measured",
-    epochs: Annotated[int, typer.Option(min=1, help="Largest number of epochs of a stage.")] = 200,
+    epochs: Annotated[
+        int, typer.Option(min=1, help="Largest number of epochs of a stage; at least 10.")
+    ] = 200,
     seed: Annotated[
         int,
         typer.Option(

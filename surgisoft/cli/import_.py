@@ -30,7 +30,7 @@ def import_(
     ],
     force: Force = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be written, but write nothing.")
+        bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
     ] = False,
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames."""

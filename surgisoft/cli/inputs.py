@@ -17,7 +17,8 @@ def check_model(folder: Path) -> None:
     """Raise InputError where there is no model, before anything is loaded that takes seconds."""
     if str(folder) != "default" and not (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+            f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
+            "folder that 'surgisoft fit' made"
         )
 
 

@@ -46,6 +46,19 @@ EffectFiles = Annotated[
     ),
 ]
 """Option of every command that opens a model. Reading the command line registers the effects."""
+
+
+def with_effect_files(command: str) -> str:
+    """A command to run next, with `--effect-file` and the files that this call was given.
+
+    Without them the command would refuse to open the model.
+    """
+    from surgisoft.surrogate.effects import registered_files
+
+    files = registered_files()
+    return f"{command} --effect-file {' '.join(files)}" if files else command
+
+
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
 ExperimentFile = Annotated[
     Path,

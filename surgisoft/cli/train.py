@@ -6,7 +6,16 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import INTERRUPTED, app
-from surgisoft.cli.options import SEED_MAX, Arm, EffectFiles, Run, SceneFolder, TaskConfig, Threads
+from surgisoft.cli.options import (
+    SEED_MAX,
+    Arm,
+    EffectFiles,
+    Run,
+    SceneFolder,
+    TaskConfig,
+    Threads,
+    with_effect_files,
+)
 from surgisoft.cli.progress import progress
 
 
@@ -90,11 +99,11 @@ def train(
     if not run.result.done:
         print(
             f"stopped after {run.result.steps:,} steps; continue with: "
-            f"surgisoft train --resume {run.folder}"
+            f"{with_effect_files(f'surgisoft train --resume {run.folder}')}"
         )
         raise typer.Exit(INTERRUPTED)
     print(_summary(run.folder, run.result))
-    print(f"next: surgisoft evaluate {run.folder}")
+    print(f"next: {with_effect_files(f'surgisoft evaluate {run.folder}')}")
 
 
 def _measures(found: dict | None) -> str:

@@ -29,7 +29,7 @@ from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings import Recording
-from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
 WORST = 5
@@ -169,7 +169,7 @@ def compare(
     model: Model,
     recordings: Recordings,
     part: Part = "all",
-    reference: Sequence[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | TrainingResiduals | None = None,
 ) -> tuple[Comparison, ResidualTable]:
     """Evaluate a model on recordings; both may be given by their paths.
 

@@ -39,7 +39,7 @@ from surgisoft.diagnosis.selection import (
 from surgisoft.errors import unknown_name
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
-from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
 MOST_RIVALS = CRITERIA.selection.most_competing
@@ -131,7 +131,7 @@ def diagnose(
     model: Model,
     recordings: Recordings,
     progress: Progress | None = None,
-    reference: Sequence[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | TrainingResiduals | None = None,
     without: Collection[str] = (),
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.

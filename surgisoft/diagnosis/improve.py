@@ -19,8 +19,8 @@ from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
 MOST_EFFECTS = 6
@@ -113,7 +113,7 @@ def improve(
     recordings: Recordings,
     most_effects: int = MOST_EFFECTS,
     progress: Progress | None = None,
-    reference: Sequence[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | TrainingResiduals | None = None,
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 

@@ -8,8 +8,8 @@ from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import check_fits, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 Model = ArmModel | str | Path
 """A model, or its folder."""
@@ -36,7 +36,7 @@ def open_inputs(
 def identification_problem(
     model: ArmModel,
     recordings: list[Recording],
-    reference: Sequence[Recording] | KnownError | None = None,
+    reference: Sequence[Recording] | TrainingResiduals | None = None,
 ) -> Problem:
     """The training rows of a model's residual table, with its residuals from before.
 
@@ -47,7 +47,7 @@ def identification_problem(
 
 
 def with_known_residuals(
-    problem: Problem, reference: Sequence[Recording] | KnownError | None = None
+    problem: Problem, reference: Sequence[Recording] | TrainingResiduals | None = None
 ) -> Problem:
     """The problem with the residuals of a reference, or those that its model keeps of its fit."""
     known = problem.model.training_residuals if reference is None else reference

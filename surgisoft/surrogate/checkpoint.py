@@ -17,10 +17,10 @@ from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.own import check_files, files_of
-from surgisoft.surrogate.known_error import FILE as KNOWN_ERROR
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 FORMAT = 1
 """Version of the folder's layout."""
@@ -28,7 +28,7 @@ FORMAT = 1
 DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "default_arm"
 """Name and folder of the arm that comes with the package."""
 
-OWN_FILES = ("config.json", "weights.safetensors", "report.json", KNOWN_ERROR)
+OWN_FILES = ("config.json", "weights.safetensors", "report.json", RESIDUALS_FILE)
 """Files of a model's folder. Replacing a model leaves all other files in place."""
 
 NETWORKS = {
@@ -88,7 +88,7 @@ def save_model(
     folder: str | Path,
     report: dict | None = None,
     force: bool = False,
-    known: KnownError | None = None,
+    known: TrainingResiduals | None = None,
 ) -> None:
     """Write a model to a folder, completely or not at all.
 
@@ -144,7 +144,8 @@ def load_model(
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+            f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
+            "folder that 'surgisoft fit' made"
         )
     try:
         config = json.loads((folder / "config.json").read_text())
@@ -187,17 +188,17 @@ def load_model(
         raise InputError(
             f"{folder}: damaged model ({type(error).__name__}: {str(error)[:120]}); fit it again"
         ) from error
-    model.training_residuals = load_known_error(folder)
+    model.training_residuals = load_training_residuals(folder)
     return model.to(device).eval().requires_grad_(False)
 
 
-def load_known_error(folder: str | Path) -> KnownError | None:
+def load_training_residuals(folder: str | Path) -> TrainingResiduals | None:
     """The training residuals in a model's folder; None where the folder has none."""
     try:
-        return KnownError.load(_place(folder))
+        return TrainingResiduals.load(_place(folder))
     except Exception as error:
         raise InputError(
-            f"{folder}: damaged {KNOWN_ERROR} ({type(error).__name__}: {str(error)[:120]}); "
+            f"{folder}: damaged {RESIDUALS_FILE} ({type(error).__name__}: {str(error)[:120]}); "
             "fit the model again, or delete that file"
         ) from error
 

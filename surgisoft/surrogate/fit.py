@@ -23,7 +23,6 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.known_error import KnownError
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
 from surgisoft.surrogate.scan import direction_scan
@@ -39,6 +38,7 @@ from surgisoft.surrogate.training import (
     validated_error,
 )
 from surgisoft.surrogate.training import train as train_model
+from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 NEIGHBOURS = 24
 """Rows of nearby pressure that are compared with each row."""
@@ -234,7 +234,7 @@ class FitResult:
     """Duration of the fit, s."""
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
-    known: KnownError | None = None
+    known: TrainingResiduals | None = None
     """Residuals on the rows that the model was fitted to and validated on."""
 
     def report(self) -> dict:
@@ -316,7 +316,7 @@ def fit(
         if value is None:
             result.warnings.append(f"key point {number} is missing in all held-out rows")
     result.model.eval().requires_grad_(False)
-    result.known = KnownError.of(result.model, [train] if valid is None else [train, valid])
+    result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
     result.seconds = time.perf_counter() - start
     return result

@@ -1,7 +1,7 @@
 """The arm model: a network between line and material effects in front, body and sensor behind."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -12,9 +12,7 @@ from surgisoft.surrogate.chain import Chain, Taps
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
-
-if TYPE_CHECKING:
-    from surgisoft.surrogate.known_error import KnownError
+from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
@@ -44,7 +42,7 @@ class ArmModel(nn.Module):
     Both pass signals through the same `Chain` and agree.
     """
 
-    training_residuals: "KnownError | None" = None
+    training_residuals: TrainingResiduals | None = None
     """Residuals of the model on rows of its fit; None where they are not known."""
 
     def __init__(
@@ -96,6 +94,19 @@ class ArmModel(nn.Module):
         if network is None and effects is None:
             fresh.training_residuals = self.training_residuals
         return fresh.to(self.rest_mm.device).train(self.training)
+
+    @torch.no_grad()
+    def residuals_on(self, histories: Iterable[History], rows: int = ROWS) -> TrainingResiduals:
+        """Residuals of this model on at most `rows` measured rows of histories, evenly thinned."""
+        parts = []
+        for history in histories:
+            residual = history.rows(history.key_points - self.predict(history))
+            seen = (~residual.isnan()).all(-1).any(-1)
+            direction = history.rows(self.trace(history).direction)
+            parts.append((history.rows(history.pressure)[seen], direction[seen], residual[seen]))
+        whole = [torch.cat(part) for part in zip(*parts, strict=True)]
+        step = max(1, -(-len(whole[0]) // rows))
+        return TrainingResiduals(*(part[::step].float().contiguous() for part in whole))
 
     @property
     def chain(self) -> Chain:

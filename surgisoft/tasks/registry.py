@@ -1,7 +1,8 @@
 """The list of tasks, and their configurations as values, plain tables and TOML files.
 
-A new task is one file and one line in `TASKS`. Gymnasium ids, training presets, the promises in
-`tests/tasks/test_tasks.py` and the reference in the docs follow from that line.
+A new task is one file and one line in `TASKS`. Training presets, the promises in
+`tests/tasks/test_tasks.py` and the reference in the docs follow from that line; the Gymnasium id of
+a task of one agent follows from its name in `surgisoft.environments.ONE_AGENT`.
 """
 
 from __future__ import annotations

@@ -65,6 +65,9 @@ COMMANDS = {
 }
 """What opens a model that holds the effect of the documentation, by command."""
 
+NEXT = {"compare": 1, "amend": 1, "train": 1}
+"""Lines with the command to run next that these always print."""
+
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
@@ -126,7 +129,13 @@ def test_a_command_opens_the_model_only_with_its_file(name, capsys):
     assert not own.FILES
     code = run([*arguments, "--effect-file", "slack.py"])
     refused = {"amend": (0, 1), "improve": (0, 1), "scene check": (0, 1)}
-    assert code in refused.get(name, (0,)), capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert code in refused.get(name, (0,)), printed.err
+    following = [
+        line for line in printed.out.splitlines() if line.startswith("next") and "surgisoft" in line
+    ]
+    assert len(following) == NEXT.get(name, len(following))
+    assert all(line.endswith(" --effect-file slack.py") for line in following), following
 
 
 def test_amend_takes_the_file_as_the_effect_that_the_model_has(capsys):

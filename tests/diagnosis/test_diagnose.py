@@ -13,7 +13,7 @@ from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
+from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
 
 
 def recorded(hidden=(), take=3, points=6000):
@@ -99,7 +99,7 @@ def test_a_key_point_that_was_never_measured_is_left_out():
     said = diagnose(
         load_model("default"),
         [replace(recording, key_points_mm=points)],
-        reference=load_known_error("default"),
+        reference=load_training_residuals("default"),
     )
     assert said.verdict.effects == ("misalignment",)
     assert np.isfinite(said.error_mm.before)
@@ -161,7 +161,7 @@ def test_what_is_weak_about_the_data_is_told(found):
     from surgisoft.diagnosis.residuals import problem_of
 
     model, recording = default_arm(), recorded()
-    problem = problem_of(model, [recording]).with_reference(load_known_error("default"))
+    problem = problem_of(model, [recording]).with_reference(load_training_residuals("default"))
     assert data_quality_warnings(problem) == []
     away = replace(problem, pressure=np.full_like(problem.pressure, 3.0))
     assert "far from those" in data_quality_warnings(away)[0]

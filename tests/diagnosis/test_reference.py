@@ -70,7 +70,7 @@ def test_rows_of_a_reference_are_fitted_and_not_judged():
         judged = fold == number
         np.testing.assert_allclose(found.grams[:, number], one.grams[:, 0], rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(
-            found.judged[:, judged[:10]], one.judged[:, judged], rtol=1e-4, atol=1e-4
+            found.held_out[:, judged[:10]], one.held_out[:, judged], rtol=1e-4, atol=1e-4
         )
 
 
@@ -88,13 +88,13 @@ def test_command_takes_a_reference(model, tmp_path, capsys):
 def test_a_fitted_model_keeps_where_it_is_off(tmp_path):
     """The rows kept are the fit's own: measured less what the loaded model predicts there."""
     from surgisoft.measurement.histories import arm_spec, history_of
-    from surgisoft.surrogate.checkpoint import load_known_error, load_model
+    from surgisoft.surrogate.checkpoint import load_model, load_training_residuals
     from surgisoft.surrogate.fit import FitConfig, fit
 
     before = measured(2)
     result = fit(history_of([before]), None, arm_spec([before]), FitConfig(hidden=(8,), epochs=10))
     save_model(result.model, tmp_path / "arm", known=result.known)
-    known, model = load_known_error(tmp_path / "arm"), load_model(tmp_path / "arm")
+    known, model = load_training_residuals(tmp_path / "arm"), load_model(tmp_path / "arm")
     history = history_of([before])
     step = ROWS // len(known.residual_mm)
     np.testing.assert_array_equal(known.actuation, history.pressure[0, ::step])
@@ -102,13 +102,13 @@ def test_a_fitted_model_keeps_where_it_is_off(tmp_path):
     np.testing.assert_allclose(known.residual_mm, off[::step], atol=1e-4)
     assert torch.equal(model.training_residuals.residual_mm, known.residual_mm)
     save_model(model, tmp_path / "again")
-    assert torch.equal(load_known_error(tmp_path / "again").residual_mm, known.residual_mm)
+    assert torch.equal(load_training_residuals(tmp_path / "again").residual_mm, known.residual_mm)
     model.training_residuals = None
     save_model(model, tmp_path / "arm", force=True)
-    assert load_known_error(tmp_path / "arm") is None
+    assert load_training_residuals(tmp_path / "arm") is None
 
 
-def test_damaged_known_error_is_told(model, tmp_path, capsys):
+def test_damaged_training_residuals_are_reported(model, tmp_path, capsys):
     save_model(model, tmp_path / "arm")
     (tmp_path / "arm" / "known_error.safetensors").write_bytes(b"not this")
     save_recording(measured(1), tmp_path / "now.parquet")

@@ -13,7 +13,7 @@ from surgisoft.diagnosis.selection import ModelSelection, Option, Score
 from surgisoft.diagnosis.statistics import sign_flip_p_values
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import load_known_error, load_model
+from surgisoft.surrogate.checkpoint import load_model, load_training_residuals
 
 NAMES = ("blend", "left", "right")
 LOSS = {"": 100, "0": 40, "1": 55, "2": 50, "01": 20, "02": 18, "12": 2, "012": 2}
@@ -129,7 +129,7 @@ def test_exchanges_that_go_in_a_circle_end_at_the_best(table, monkeypatch):
 def test_two_effects_of_a_robot_are_both_named():
     rig = VirtualRig(0, take=3, hidden=(("creep", 1.2), ("payload", 1.2)))
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=3))
-    model, known = load_model("default"), load_known_error("default")
+    model, known = load_model("default"), load_training_residuals("default")
     found = diagnose(model, [recording], reference=known)
     assert found.verdict.kind == "several"
     assert set(found.verdict.effects) == {"creep", "payload"}
@@ -157,7 +157,7 @@ def test_what_is_outside_the_list_is_not_called_by_its_nearest_relative(name):
     mount only now and then."""
     rig = VirtualRig(0, take=5, hidden=((name, 2.0),))
     recording, _ = rig.record(make_protocol("mixed", rig.limits, 6000, seed=5))
-    model, known = load_model("default"), load_known_error("default")
+    model, known = load_model("default"), load_training_residuals("default")
     found = diagnose(model, [recording], reference=known)
     assert found.verdict.kind == "unknown_effect"
     assert found.ranking[0].confidence <= 0.25

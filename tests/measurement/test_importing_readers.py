@@ -9,8 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from surgisoft.cli import run
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing import READERS, import_files, load_map
+from surgisoft.measurement.importing import READERS, RawTable, Reader, import_files, load_map
 
 MAP = """\
 [file.log]
@@ -71,6 +72,42 @@ def test_a_reader_of_another_package(tmp_path, plugin):
     np.save(path, values)
     (part,) = import_files([path], load_map(write_map(tmp_path, "npy")), "r")
     np.testing.assert_array_equal(part.recording.key_points_mm[:, 0], values[:, 2:])
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "raw.npy: cannot be read as a numpy array (EOFError: No data left in file)"),
+        (b"no array", "raw.npy: cannot be read as a numpy array (ValueError: "),
+        (np.zeros((5, 2)), "raw.npy: got 5 rows of 2 columns, expected 5 columns: t, u, x, y, z"),
+    ],
+)
+def test_a_file_that_the_reader_of_the_documentation_cannot_read(
+    tmp_path, plugin, monkeypatch, capsys, content, expected
+):
+    monkeypatch.chdir(tmp_path)
+    if isinstance(content, bytes):
+        Path("raw.npy").write_bytes(content)
+    else:
+        np.save("raw.npy", content)
+    write_map(tmp_path, "npy")
+    assert run(["import", "raw.npy", "--map", "map.toml", "-o", "out.parquet"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"surgisoft: error: {expected}")
+    assert not Path("out.parquet").exists()
+
+
+def test_a_reader_that_names_more_columns_than_its_cells_have(tmp_path, monkeypatch):
+    class Cells:
+        def numbers(self, positions):
+            return np.zeros((3, 2))[:, list(positions)]
+
+    names = ["t", "u", "x", "y", "z"]
+    two = Reader("two columns", lambda path, role: RawTable(path, names, Cells()))
+    monkeypatch.setitem(READERS, "text", two)
+    (tmp_path / "a.csv").write_text("t,u\n")
+    with pytest.raises(InputError, match=r"a\.csv: got fewer columns than the 5 that its reader"):
+        import_files([tmp_path / "a.csv"], load_map(write_map(tmp_path, "text")), "r")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
-from surgisoft.surrogate.checkpoint import default_arm, load_known_error, load_model
+from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
 
 
 def test_it_tells_a_walk_on_the_rig_that_it_has_never_seen():
@@ -48,7 +48,7 @@ def test_the_word_default_opens_it(tmp_path, monkeypatch):
 
 def test_where_its_network_is_off_comes_with_it():
     """The residual on rows of its fit, as large as what it was validated to."""
-    known, model = load_known_error("default"), default_arm()
+    known, model = load_training_residuals("default"), default_arm()
     size = known.residual_mm.square().sum(-1).mean().sqrt().item()
     assert 0.03 < size < 1.5 * model.validation.rmse_mm
     assert known.actuation.shape[1] == model.spec.chambers

@@ -191,7 +191,7 @@ def test_saving_never_half_writes_nor_overwrites(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda d: (d / "config.json").unlink(), "config.json missing"),
+        (lambda d: (d / "config.json").unlink(), "config.json is missing"),
         (lambda d: (d / "config.json").write_text("{"), "damaged model"),
         (lambda d: (d / "weights.safetensors").write_bytes(b"123"), "damaged model"),
         (lambda d: (d / "config.json").write_text('{"format": 99}'), "format 99"),

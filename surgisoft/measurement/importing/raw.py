@@ -118,7 +118,13 @@ class RawTable:
     def numbers(self, columns: Sequence[Column]) -> np.ndarray:
         """The cells (T, len(columns)) float64, NaN where missing; infinite ones are an error."""
         positions = [self.position(column) for column in columns]
-        cells = self.cells.numbers(positions)
+        try:
+            cells = self.cells.numbers(positions)
+        except IndexError as error:
+            raise InputError(
+                f"{self.path}: got fewer columns than the {len(self.names)} that its reader names "
+                f"({', '.join(self.names[:8])})"
+            ) from error
         if np.isinf(cells).any():
             row, i = np.argwhere(np.isinf(cells))[0].tolist()
             raise InputError(

@@ -1,5 +1,6 @@
 """Effects of the users' own: the documentation's example, by file and by package."""
 
+import math
 import re
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -11,6 +12,7 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import load_model, save_model
 from surgisoft.surrogate.effects import (
+    Context,
     hypothesis_of,
     known_effects,
     make_effect,
@@ -23,7 +25,7 @@ from surgisoft.surrogate.networks import ConstantCurvature
 from tests.surrogate.effects.arms import FACTS
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
-EXAMPLE, SECOND = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
+EXAMPLE, BREATHING, SECOND = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +60,30 @@ def test_the_documentations_effect_works(slack):
     assert torch.equal(effect.sensitivities(x, memory), torch.tensor([[[10.0, 0.0, 0.0]]]))
     effect.loss.data.fill_(0.5)
     assert effect.apply(x, memory).tolist() == [[-5.0, 0.0, 20.0]]
+    assert effect.plausible()
+
+
+def test_the_documentations_effect_with_memory_works(tmp_path):
+    path = tmp_path / "breathing.py"
+    path.write_text(BREATHING)
+    assert register_effect_file(path) == "breathing"
+    effect = make_effect("breathing", FACTS)
+    points = torch.zeros(2, 40, 5, 3)
+    seen = Context(torch.full((2, 40), 0.25))
+    memory = effect.scan(effect.rest(points[:, 0]), points, seen)
+    assert torch.equal(effect.apply(points, memory), points)
+    effect.sine.data[2], effect.log_period.data[:] = 3.0, math.log(5.0)
+    turns = torch.arange(1, 41) * 0.25 / 5.0
+    expected = 3.0 * (2 * math.pi * turns).sin()
+    moved = effect.apply(points, memory)
+    torch.testing.assert_close(moved[0, :, 4, 2], expected, atol=1e-5, rtol=0)
+    assert not moved[..., :2].any()
+    step = effect.rest(points[:, 0])
+    for t in range(40):
+        now = Context(seen.dt_s[:, t])
+        step, shifted = effect.step(step, points[:, t], now)
+        torch.testing.assert_close(shifted, moved[:, t], atol=1e-5, rtol=0)
+    assert len(hypothesis_of(known_effects()["breathing"]).candidates(FACTS, points)) == 134
     assert effect.plausible()
 
 

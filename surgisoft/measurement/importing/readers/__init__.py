@@ -85,5 +85,15 @@ def _is_binary(path: Path) -> bool:
 
 
 def open_raw(path: Path, role: FileRole) -> RawTable:
-    """The raw table of a file."""
-    return chosen(path, role).read(path, role)
+    """The raw table of a file.
+
+    A reader checks what it reads; what one of another package does not check is a bad file too.
+    """
+    found = chosen(path, role)
+    try:
+        return found.read(path, role)
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        raise InputError(f"{path}: cannot be read as {found.about} ({reason})") from error

@@ -45,8 +45,11 @@ class Way:
     """One engine for a kind of query: `ask(n)` computes the first n queries."""
 
     name: str
+    """Name of the engine."""
     ask: Callable[[int], np.ndarray]
+    """Results of the first n queries."""
     most: int = SIZES[-1]
+    """Largest batch that is measured."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Work:
 
 
 def split_to(mesh: Mesh, faces: int) -> Mesh:
-    """The same surface with so many faces: edges are halved, the longest first."""
+    """A mesh of the same surface with so many faces: edges are halved, the longest first."""
     vertices, triangles = mesh.vertices_mm.tolist(), mesh.faces.tolist()
     while len(triangles) < faces:
         sides: dict[tuple[int, int], list[tuple[int, int]]] = {}

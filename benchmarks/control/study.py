@@ -133,7 +133,7 @@ def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
 
 
 def _learned(folder: Path, task: str, seed: int, report: Progress) -> Trained:
-    """A finished run as it is; else one that is trained with the task's own number of steps."""
+    """A finished run as it is, or one trained with the task's number of steps."""
     there = RunFolder(folder) if (folder / "config.json").is_file() else None
     if there is not None and there.config["task"] != task:
         raise InputError(f"{folder}: was trained on {there.config['task']}, expected {task}")

@@ -37,7 +37,9 @@ class Goal:
     """One goal of the project for a measure."""
 
     task: str
+    """Name of the task."""
     place: str
+    """Plant: `simulation` or `rig`."""
     number: str
     """Name of the measure."""
     limit: float
@@ -86,7 +88,7 @@ def _setting(config: ControlConfig) -> str:
 
 
 def _goals(results: Results) -> str:
-    """Each goal beside the worst seed and the script."""
+    """Table of goals with the worst seed and the scripted expert."""
     lines = [
         "| what | goal | paper | learned, each seed | scripted | random |",
         "|---|---|---|---|---|---|",
@@ -147,7 +149,7 @@ def _training(results: Results) -> str:
 
 
 def _paper(results: Results, config: ControlConfig) -> str:
-    """Time that the paper's number of steps takes, from measured rates."""
+    """Duration of the paper's number of steps, from measured rates."""
     rows = [("paper", results.paper)]
     fast = [run.cost for run in results.runs if (run.task, run.preset) == (RATE_TASK, "fast")]
     if fast:
@@ -178,7 +180,7 @@ def _paper(results: Results, config: ControlConfig) -> str:
 
 
 def _numbers(some: list[Played]) -> str:
-    """All numbers of one task in one place, a column for each driver."""
+    """All measures of one task on one plant, one column per policy."""
     names = [n for n in NUMBERS if any(_applies(p.numbers.get(n)) for p in some)]
     lines = [
         "| | " + " | ".join(p.driver for p in some) + " |",

@@ -38,8 +38,8 @@ UNKNOWN = (
 )
 """Hidden effects that are not in the model's list."""
 LEFT_OUT = ("sensor_crosstalk",)
-"""Neither: a linear map of the pressures is the list's coupling with its gains, whatever made it,
-and no single name is right."""
+"""Hidden effects that are neither known nor unknown: a linear map of the pressures equals coupling
+with gain mismatch of the list, so no single name is right."""
 PAIRS = (
     ("creep", "payload"),
     ("line_lag", "misalignment"),

@@ -135,7 +135,7 @@ def _noise(case: Case) -> float:
 
 
 def _as_noisy(case: Case, recording: Recording) -> Recording:
-    """The recording with what a case adds to the rig's own noise."""
+    """The recording with the noise that a case adds to that of the rig."""
     if case.noise != "correlated":
         return recording
     return _with_correlated_noise(recording, case.take)

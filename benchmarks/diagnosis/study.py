@@ -32,10 +32,15 @@ class Outcome:
     """Result of the diagnosis of a case."""
 
     case: Case
+    """The case."""
     kind: str
+    """Kind of the verdict."""
     effects: tuple[str, ...]
+    """Effects that the verdict names."""
     ranking: tuple[str, ...]
+    """Effects in the order of their rank."""
     confidence: float
+    """Confidence of the verdict."""
     effect_mm: float
     """RMS change of the key points by the hidden effects, mm."""
     discrepancy_mm: float
@@ -43,6 +48,7 @@ class Outcome:
     seconds: float
     """Processor time of the diagnosis, s."""
     statistics: dict
+    """Statistics of the decision, for calibration."""
     settled: Settled | None = None
     """Result of the recommended experiment; None where the case is not ambiguous."""
     settled_untouched: Settled | None = None

@@ -17,7 +17,7 @@ TASK = "track_circle"
 SIGHTS = ("blind", "cameras")
 """Without the cameras' key points, where the model alone estimates the body, and with them."""
 TRAIN, PLAY = 100, 8
-"""Lengths of a training and of a driver's episodes, by the meter."""
+"""Weights of a training and of a policy's episodes in the progress."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ MODELS = ("before", "after", "oracle")
 LASTING = ("learned", "scripted")
 """Policies that are trained on, or use, an arm model."""
 STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
-"""Length of one effect, by the meter."""
+"""Weight of one effect in the progress."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Outcome:
     verdicts: tuple[dict, ...]
     """Output of `diagnose --json`; a second one after a further experiment."""
     experiment: dict | None
-    """That experiment, as output of `next-experiment --json`."""
+    """Output of `next-experiment --json` for the further experiment."""
     amended: tuple[str, ...]
     """Effects that were added; none where no fall was claimed."""
     parameters: tuple[dict, ...]
@@ -249,7 +249,7 @@ class Study:
         }
 
     def _oracle(self, case: Case, before: Path, bench: Bench, report: Progress) -> Path:
-        """A model that was told the effect's name: amended on more data, or fitted with it."""
+        """A model that is given the effect's name: amended on more data, or fitted with it."""
         if not case.hidden:
             return self.base(True, report)
         about = {"model": model_digest(before), "told": case.effect, **bench.about}
@@ -298,7 +298,7 @@ class Study:
     def _paced(
         self, name: str, before: Path, effects, bench: Bench, drivers: PolicyEvaluation, meter
     ):
-        """The same effects amended on circles at the task's own pace, where that is called for."""
+        """Results of amending by the same effects on circles at the task's pace, where needed."""
         about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
         folder = self.kept.place(f"models/{name}-paced", about)
         seen = bench.circles(PACED_TAKE)

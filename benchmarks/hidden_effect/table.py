@@ -86,7 +86,7 @@ def _verdict(said: dict) -> str:
 
 
 def _said(outcomes: list[Outcome]) -> list[str]:
-    """What was said of each effect, in words."""
+    """Verdict on each effect, in words."""
     answer = []
     for o in outcomes:
         lines = [f"**{o.case}**"]
@@ -112,7 +112,7 @@ def _said(outcomes: list[Outcome]) -> list[str]:
 
 
 def _driven(outcomes: list[Outcome], sight: str) -> str:
-    """Tracking errors of all drivers."""
+    """Tracking errors of all policies."""
     lines = [
         "| hidden | policy before | policy after | policy, oracle "
         "| scripted before | scripted after | scripted, oracle | random |",
@@ -155,7 +155,7 @@ def _brought(outcomes: list[Outcome]) -> list[str]:
 
 
 def _why(outcomes: list[Outcome]) -> list[str]:
-    """Where a driver got worse: whether the arm trails the models, by the rate of actuation."""
+    """Where a policy got worse: whether the arm trails the models, by the rate of actuation."""
     answer = []
     for o in outcomes:
         if o.paced is None:

@@ -59,11 +59,13 @@ class _Notes:
     """Intermediate results of one episode while it runs."""
 
     contact: Contact | None = None
+    """See `EpisodeCheck`, as for the next four fields."""
     steps: int = 0
     contact_differs: int = 0
     beam_differs: int = 0
     beam_off_mm: float = 0.0
     closest: list[tuple[float, int, dict[str, ArmShape]]] = field(default_factory=list)
+    """(clearance in mm, step, arms) at the steps of least clearance by the batched geometry."""
 
 
 class ExactChecks:

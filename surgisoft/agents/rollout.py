@@ -61,7 +61,7 @@ class Rollout:
 
     @property
     def time_s(self) -> Tensor:
-        """(N,) s: how long each episode took."""
+        """(N,) s: duration of each episode."""
         return self.steps * self.dt_s
 
     def mean(self, name: str) -> Tensor:
@@ -69,7 +69,7 @@ class Rollout:
         return self.measures[name].nanmean(1)
 
     def rms(self, name: str) -> Tensor:
-        """(N,): root of the mean square."""
+        """(N,): root mean square of a measure over each episode."""
         return self.measures[name].square().nanmean(1).sqrt()
 
     def quantile(self, name: str, share: float) -> Tensor:
@@ -77,11 +77,11 @@ class Rollout:
         return self.measures[name].nanquantile(share, 1)
 
     def largest(self, name: str) -> Tensor:
-        """(N,): the largest value."""
+        """(N,): largest value of a measure in each episode."""
         return _extreme(self.measures[name], torch.amax, -torch.inf)
 
     def smallest(self, name: str) -> Tensor:
-        """(N,): the smallest value."""
+        """(N,): smallest value of a measure in each episode."""
         return _extreme(self.measures[name], torch.amin, torch.inf)
 
     def end(self, name: str) -> Tensor:

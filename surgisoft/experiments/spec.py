@@ -167,7 +167,7 @@ class Experiment:
     """Content of an experiment's file, with absolute paths."""
 
     name: Name
-    """Its name."""
+    """Name of the experiment."""
     scene: str
     """Folder of the scene, relative to the file."""
     phases: tuple[Phase, ...]

@@ -44,7 +44,7 @@ class Cells(Protocol):
         ...
 
     def place(self, row: int) -> str:
-        """Where a row, counted from 0, stands in the file, for messages."""
+        """File and place of a row, counted from 0, for messages."""
         ...
 
 

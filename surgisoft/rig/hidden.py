@@ -261,7 +261,7 @@ HIDDEN: dict[str, Hidden] = {
 
 
 def switch_on(setup: Setup, names: Iterable[tuple[str, float]], seed: int) -> Setup:
-    """The setup with the named effects, each with its strength (0: off)."""
+    """Apply the named effects to the setup, each with its amplitude (0: off)."""
     seen: set[str] = set()
     for name, strength in names:
         if name not in HIDDEN:

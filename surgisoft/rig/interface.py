@@ -25,7 +25,7 @@ class Sample:
     key_points_mm: np.ndarray
     """(n, 3) centres of the key planes, arm base frame [mm]; NaN where the cameras lost one."""
     temp_C: float | None = None
-    """Temperature beside the arm [degrees Celsius], where there is a thermometer."""
+    """Temperature near the arm [degrees Celsius], where there is a thermometer."""
 
 
 @dataclass(frozen=True, eq=False)

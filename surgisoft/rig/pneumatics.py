@@ -1,4 +1,4 @@
-"""Pneumatics: one syringe pump on a lead screw, pressure sensor and PID controller a chamber.
+"""Pneumatics: one syringe pump on a lead screw, sensor and PID controller per chamber.
 
 As in Chen et al. (2025, sec. III-B and IV-B): syringe, tube and chamber form a closed air circuit;
 the controller's output is the motor's speed; pulling the piston back gives pressures below

@@ -40,7 +40,7 @@ from surgisoft.rig.pneumatics import PumpDesign, build_pumps
 MOUNT = (0.42, 0.0, math.sqrt(1.0 - 0.42**2))
 """Default unit vector of weight in the arm base frame: hanging, tilted by 25 degrees."""
 REST_S = 30.0
-"""Time that a reset takes: venting and resting [s]."""
+"""Duration of a reset: venting and resting [s]."""
 HEAVIEST_G = 20.0
 """Largest payload that is accepted [g]; a hanging arm carries it, an upright one buckles."""
 CHUNK = 64

@@ -20,7 +20,7 @@ OBSERVATION_LIMIT = 20.0
 """Observations are clipped to plus and minus this; tasks scale theirs to be far below it."""
 
 Goal = TypeVar("Goal", bound=TensorDataclass)
-"""Type of a task's goal, the part of its state beside the world: a frozen dataclass of tensors."""
+"""Type of a task's goal, the part of its state that is not the world: a dataclass of tensors."""
 
 
 @dataclass(frozen=True, eq=False)

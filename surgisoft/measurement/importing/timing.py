@@ -14,9 +14,9 @@ AHEAD_S = 3.0
 LEAST_STEP_S = 0.005
 """Shortest time between samples [s]."""
 ROWS = 4000
-"""Moves that are looked at, evenly over the recording."""
+"""Largest number of moves for an estimate, evenly over the recording."""
 LEAST_ROWS = 200
-"""Fewest moves."""
+"""Least number of moves for an estimate."""
 STEPS = 25
 """Shifts on each side of zero, before those around the best one."""
 BLOCKS = 30
@@ -126,7 +126,7 @@ class Moves:
         return rows, np.concatenate(moved)
 
     def _errors(self, rows, moved: np.ndarray, length: int, shift: int) -> np.ndarray:
-        """(BLOCKS,) squared error of moves (S, d), each left out of its own fit [mm^2]."""
+        """(BLOCKS,) cross-validated squared error of moves (S, d), block by block [mm^2]."""
         parts = zip(self.actuation, rows, strict=True)
         features = np.concatenate(
             [_features(p[at - shift]) - _features(p[at - shift - length]) for p, at in parts]
@@ -293,9 +293,9 @@ def body_lead(recording: Recording) -> Lead | None:
 
 
 def timing_notes(recording: Recording, delay_s: float) -> list[str]:
-    """What the data say about the actuation's clock, with what to put into the import's map.
+    """Notes about a delay of the actuation's clock, with what to put into the import's map.
 
-    delay_s: by how much the map has already taken the actuation's log to be late [s].
+    delay_s: delay of the actuation's log that the map already corrects [s].
     """
     notes = []
     period = held_period_s(recording)

@@ -182,9 +182,9 @@ def scene_world(
     engine: str | None = None,
     arm: str | Path | None = None,
 ) -> World:
-    """The two arms of a scene (or its folder), named `laser` and `endoscope`, among its bodies.
+    """World of a scene (or its folder): its bodies and the two arms `laser` and `endoscope`.
 
-    arm: a model for both in place of the scene's own, as for `named_arm`.
+    arm: a model for both arms instead of those that the scene names, as for `named_arm`.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)

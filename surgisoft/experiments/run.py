@@ -101,7 +101,8 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
             raise InputError(f"{folder}: already there and no results; choose another folder")
         if not force:
             raise InputError(
-                f"{folder}: results are already there; --resume goes on, --force begins anew"
+                f"{folder}: results are already there; --resume continues them, "
+                "--force replaces them"
             )
     check_playable(spec)
     if force and there:

@@ -16,7 +16,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
-from surgisoft.surrogate.effects.own import check_files, files_of
+from surgisoft.surrogate.effects.user_defined import check_files, files_of
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE

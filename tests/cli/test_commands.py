@@ -154,7 +154,7 @@ def test_one_name_means_one_thing_in_every_command():
             assert told.setdefault(name, kind) == kind, f"{name} of {command}"
 
 
-def test_every_option_of_many_values_says_so():
+def test_every_option_of_many_values_shows_it_in_the_help():
     several = [(command, option) for command, option in _options() if option.multiple]
     assert {name for _, option in several for name in option.opts} == MANY
     for command, option in several:
@@ -199,7 +199,7 @@ def test_old_names_of_options_still_work_and_are_not_shown(tmp_path, capsys):
         "scene new nope.stl -o new",
     ],
 )
-def test_a_missing_file_is_told_before_pytorch_is_loaded(command, tmp_path):
+def test_a_missing_file_is_reported_before_pytorch_is_loaded(command, tmp_path):
     code = (
         "import sys; from surgisoft.cli import run;"
         "code = run(sys.argv[1:]); print(code, 'torch' in sys.modules)"
@@ -224,7 +224,7 @@ def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypat
     assert all(path.exists() for path in files)
 
 
-def test_compare_says_the_next_command(lab, tmp_path, capsys):
+def test_compare_prints_the_next_command(lab, tmp_path, capsys):
     file = tmp_path / "c.json"
     arguments = ["compare", str(lab / "arm"), str(lab / "test.parquet"), "--json", str(file)]
     assert run(arguments) == 0

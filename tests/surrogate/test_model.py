@@ -184,7 +184,7 @@ def test_saving_never_half_writes_nor_overwrites(tmp_path):
     assert (tmp_path / "arm" / "NOTES.md").read_text() == "mine"
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("keep me")
-    with pytest.raises(InputError, match="no model"):
+    with pytest.raises(InputError, match="not a model"):
         save_model(arm, tmp_path / "letters", force=True)
 
 

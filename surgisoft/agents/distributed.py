@@ -81,7 +81,7 @@ def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
         raise InputError(f"--device '{device}': expected cpu or cuda")
     kind = torch.device(device)
     if kind.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"--device '{device}': PyTorch sees no GPU here; use --device cpu")
+        raise InputError(f"--device '{device}': PyTorch finds no GPU; use --device cpu")
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
         yield Processes(), kind

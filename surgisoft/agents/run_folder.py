@@ -135,7 +135,7 @@ class RunFolder:
         except (ValueError, KeyError, TypeError):
             known = False
         if not known:
-            raise InputError(f"{file}: no training run of format {FORMAT}; train it anew")
+            raise InputError(f"{file}: not a training run of format {FORMAT}; train it again")
 
     @property
     def agents(self) -> dict[str, dict]:

@@ -80,7 +80,7 @@ class TrainingRequest:
         """Resolve the request to a `Plan`; raises InputError for contradicting options."""
         if self.steps is not None and self.minutes is not None:
             raise InputError(
-                f"--steps {self.steps} and --minutes {self.minutes:g}: give one of them, the "
+                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
                 "training ends by one or the other"
             )
         own = task_config(self.task, self.config, self.arm, self.scene)
@@ -134,9 +134,7 @@ def train(
         names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
         if names:
             given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-            raise InputError(
-                f"--resume goes on with what the run was started with: leave {given} out"
-            )
+            raise InputError(f"--resume continues with the options of the run: leave out {given}")
         plan, folder = None, Path(resume_from)
     elif task is None:
         raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")

@@ -162,7 +162,7 @@ class Training:
         count, device = len(saved["processes"]), self.task.world.device
         if count != self.processes.count:
             raise InputError(
-                f"the run was trained by {count} processes, came {self.processes.count}; resume "
+                f"the run was trained by {count} processes, now there are {self.processes.count}; resume "
                 f"it with torchrun --nproc-per-node {count}"
             )
         for agent, ppo in self.agents.items():

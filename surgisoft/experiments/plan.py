@@ -96,7 +96,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             )
         bad = [value for value in vary.values if isinstance(value, str) or value < 0]
         if bad:
-            raise (place / "values").error(f"got {bad[0]!r}", "strengths from 0")
+            raise (place / "values").error(f"got {bad[0]!r}", "amplitudes from 0")
     elif top == "fault" and name in ("chamber", "at_s") and spec.faults:
         kind = int if name == "chamber" else int | float
         bad = [v for v in vary.values if not isinstance(v, kind) or v < (name == "chamber")]

@@ -165,7 +165,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     unit_mm = spec.key_points.unit or tables[spec.key_points.file].unit
     if not unit_mm:
         raise InputError(
-            f"{tables[spec.key_points.file].path}: does not say the positions' unit, "
+            f"{tables[spec.key_points.file].path}: does not state the unit of the positions, "
             "expected unit in [key_points] of the map"
         )
     placed = read_points(joined, spec.key_points, points, spec.frame, unit_mm)

@@ -133,5 +133,5 @@ def check_files(wanted: dict[str, dict], label: str) -> None:
             raise InputError(
                 f"{label}: {FILES[name].path} is not the file that its effect '{name}' was made "
                 f"with (sha256 {FILES[name].sha256[:12]}, expected {file['sha256'][:12]}); "
-                "name the same file, or amend the model anew"
+                "name the same file, or amend the model again"
             )

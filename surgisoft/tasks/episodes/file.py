@@ -55,7 +55,7 @@ def load_episode(path: str | Path) -> EpisodeLog:
     except InputError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise InputError(f"{path}: is no whole episode; {wanted}") from None
+        raise InputError(f"{path}: is not a complete episode; {wanted}") from None
 
 
 def _split(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:

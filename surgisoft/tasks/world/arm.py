@@ -223,7 +223,7 @@ class ModelArm:
         """`samples` is the number K of centreline points."""
         spec = mounted.model.spec
         if spec.unit != "kPa":
-            raise InputError(f"arm '{name}' is driven in {spec.unit}, expected a model in kPa")
+            raise InputError(f"arm '{name}': its model has the unit {spec.unit}, expected kPa")
         start = spec.rest if mounted.start_kPa is None else mounted.start_kPa
         if len(start) != spec.chambers:
             raise InputError(

@@ -106,10 +106,10 @@ register_with_gymnasium()
 
 def __getattr__(name: str) -> object:
     """Import a function when it is first asked for (PEP 562)."""
-    own = _OTHER_NAMES.get(name, name)
-    if own not in _PLACES:
+    present = _OTHER_NAMES.get(name, name)
+    if present not in _PLACES:
         raise AttributeError(f"module 'surgisoft' has no attribute '{name}'")
-    found = getattr(import_module(f"surgisoft.{_PLACES[own]}"), own)
+    found = getattr(import_module(f"surgisoft.{_PLACES[present]}"), present)
     globals()[name] = found
     return found
 

@@ -267,13 +267,13 @@ def _is_union(base: typing.Any) -> bool:
     return typing.get_origin(base) in (typing.Union, types.UnionType)
 
 
-def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = None):
-    """The value as `hint` asks for; messages state what `said` (default: the hint) asks for."""
+def _value(hint: typing.Any, value: object, where: Where, stated: typing.Any = None):
+    """The value as `hint` asks for; messages state what `stated` (default: the hint) asks for."""
     base, rules = _split(hint)
-    said = hint if said is None else said
+    stated = hint if stated is None else stated
 
     def bad() -> InputError:
-        return where.error(f"got {describe(value)}", expectation(said))
+        return where.error(f"got {describe(value)}", expectation(stated))
 
     if base is typing.Any:
         converted = value
@@ -283,7 +283,7 @@ def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = Non
         part = next((part for part in typing.get_args(base) if _admits(part, value)), None)
         if part is None:
             raise bad()
-        converted = None if part is types.NoneType else _value(part, value, where, said)
+        converted = None if part is types.NoneType else _value(part, value, where, stated)
     elif typing.get_origin(base) is dict:
         if not isinstance(value, dict):
             raise bad()
@@ -296,7 +296,7 @@ def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = Non
     elif base is float:
         converted = _float(value, bad)
         if not math.isfinite(converted):
-            raise where.error(f"got {converted}", f"a finite number ({expectation(said)})")
+            raise where.error(f"got {converted}", f"a finite number ({expectation(stated)})")
     else:
         converted = value
     if not all(rule.holds(converted) for rule in rules):

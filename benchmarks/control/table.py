@@ -167,10 +167,10 @@ def _paper(results: Results, config: ControlConfig) -> str:
     text = "\n".join(lines)
     if results.whole:
         whole = results.whole
-        told = " ".join(arguments(RATE_TASK, config.whole_steps, Path("RUN")))
+        options = " ".join(arguments(RATE_TASK, config.whole_steps, Path("RUN")))
         minutes = whole.wall_s * PAPER_STEPS / whole.steps / 60
         text += (
-            f"\n\nTwo processes (`torchrun {told}`) trained {whole.steps:,} steps in "
+            f"\n\nTwo processes (`torchrun {options}`) trained {whole.steps:,} steps in "
             f"{whole.wall_s:.0f} s of wall time, {minutes:.1f} minutes for {PAPER_STEPS:,}, "
             "updates and evaluations included: measured, not computed from a rate. The goal is 5 "
             f"minutes on two cores, which is {'reached' if minutes <= 5 else 'missed'}. Below, "

@@ -100,9 +100,9 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
         pair = PAIRS[i % len(PAIRS)]
         plan.append((tuple((name, 1.2) for name in pair), False))
     plan += [((), True)] * round(shares["undertrained"] * count)
-    answer = []
+    drawn = []
     for take, (hidden, undertrained) in enumerate(plan):
-        answer.append(
+        drawn.append(
             Case(
                 robot=int(rng.choice(robots)),
                 hidden=hidden,
@@ -113,4 +113,4 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
                 undertrained=undertrained,
             )
         )
-    return answer
+    return drawn

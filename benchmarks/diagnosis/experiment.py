@@ -48,9 +48,9 @@ def settle(
     advice = recommend(problem_of(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
     new = record_experiment(case, SETUPS[advice.setting], advice.protocol)
     some = [new] if advice.by_hand else [recording, new]
-    said = diagnose(model, some, reference=known, without=advice.removes)
-    left = effect_left(advice, said)
-    named = [row.effect for row in said.ranking]
+    diagnosis = diagnose(model, some, reference=known, without=advice.removes)
+    left = effect_left(advice, diagnosis)
+    named = [row.effect for row in diagnosis.ranking]
     return Settled(
         experiment=advice.name,
         setting=advice.setting,

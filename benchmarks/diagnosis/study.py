@@ -130,26 +130,26 @@ def run(
         if outcome.amended is not None or case not in wanted
     }
     total, done = len(robots) + len(some), 0
-    answer = {case: known[case] for case in some if case in known}
+    by_case = {case: known[case] for case in some if case in known}
     with workers(processes) as pool:
         for future in as_completed([pool.submit(base_model, r, folder, u) for r, u in robots]):
             future.result()
             done += 1
             report(done, total, "base models")
-        done += len(answer)
+        done += len(by_case)
         jobs = [
             pool.submit(run_case, case, folder, case in wanted)
             for case in some
-            if case not in answer
+            if case not in by_case
         ]
         for future in as_completed(jobs):
             outcome = future.result()
-            answer[outcome.case] = outcome
+            by_case[outcome.case] = outcome
             done += 1
-            report(done, total, f"{len(answer)} of {len(some)} robots")
+            report(done, total, f"{len(by_case)} of {len(some)} robots")
             with log.open("a") as file:
                 file.write(json.dumps(asdict(outcome)) + "\n")
-    return [answer[case] for case in some]
+    return [by_case[case] for case in some]
 
 
 def fingerprint() -> str:
@@ -167,7 +167,7 @@ def fingerprint() -> str:
 
 def read_outcomes(log: Path) -> dict[Case, Outcome]:
     """Stored outcomes; an incomplete last line is left out."""
-    answer = {}
+    by_case = {}
     for line in log.read_text().splitlines() if log.is_file() else []:
         try:
             values = json.loads(line)
@@ -185,5 +185,5 @@ def read_outcomes(log: Path) -> dict[Case, Outcome]:
             amended=worth and Amended(**worth | {"effects": tuple(worth["effects"])}),
             **values,
         )
-        answer[outcome.case] = outcome
-    return answer
+        by_case[outcome.case] = outcome
+    return by_case

@@ -46,9 +46,9 @@ class PolicyEvaluation:
         names: of `learned`, `scripted`, `random`.
         """
         plan = plan_of(TASK, self.seed, self.steps, arm)
-        told = _inputs(plan, arm)
+        inputs = _inputs(plan, arm)
         tell = meter.stage(TRAIN, f"{title}: policy")
-        run = trained(self.kept.place(f"policies/{TASK}", told), plan, tell)
+        run = trained(self.kept.place(f"policies/{TASK}", inputs), plan, tell)
         found = {}
         for sight in SIGHTS:
             rig = RigConfig(self.specimen, self.hidden, cameras=sight == "cameras")
@@ -56,14 +56,16 @@ class PolicyEvaluation:
                 driver = str(run.path) if name == "learned" else name
                 tell = meter.stage(PLAY, f"{title}: {name} on the rig, {sight}")
                 found[f"{name}/{sight}"] = self._played(
-                    f"{title.split(',')[0]}-{name}", driver, told, arm, rig, tell
+                    f"{title.split(',')[0]}-{name}", driver, inputs, arm, rig, tell
                 )
         return found, asdict(cost(run))
 
-    def _played(self, name: str, driver: str, told: dict, arm: Path, rig: RigConfig, tell) -> dict:
+    def _played(
+        self, name: str, driver: str, inputs: dict, arm: Path, rig: RigConfig, tell
+    ) -> dict:
         """Summary of the mean error of each episode on the rig, mm."""
         about = {
-            "plan": told,
+            "plan": inputs,
             "learned": driver not in ("scripted", "random"),
             "rig": to_table(rig),
             "episodes": self.episodes,

@@ -241,11 +241,11 @@ class Study:
                 save_model(result.model, folder, result.to_json(), force=True)
             return result.to_json()
 
-        told = self.kept.values(f"amendments/{name}", about, make)
+        amended = self.kept.values(f"amendments/{name}", about, make)
         return {
-            "model": folder if told["claimed"] else None,
-            "parameters": told["parameters"],
-            "claim": told["sentence"],
+            "model": folder if amended["claimed"] else None,
+            "parameters": amended["parameters"],
+            "claim": amended["sentence"],
         }
 
     def _oracle(self, case: Case, before: Path, bench: Bench, report: Progress) -> Path:
@@ -313,13 +313,13 @@ class Study:
                 "mixed_mm": fall_of(first, first.with_model(result.model)).after
             }
 
-        told = self.kept.values(f"amendments/{name}-paced", about, make)
+        amended = self.kept.values(f"amendments/{name}-paced", about, make)
         beside = Stages(lambda done, total, note: meter.stage(0, note), 1.0)
         found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
         return {
-            "claim": told["sentence"],
-            "parameters": told["parameters"],
-            "mixed_mm": told["mixed_mm"],
+            "claim": amended["sentence"],
+            "parameters": amended["parameters"],
+            "mixed_mm": amended["mixed_mm"],
             "driven": found,
         }
 

@@ -87,7 +87,7 @@ def _verdict(said: dict) -> str:
 
 def _said(outcomes: list[Outcome]) -> list[str]:
     """Verdict on each effect, in words."""
-    answer = []
+    paragraphs = []
     for o in outcomes:
         lines = [f"**{o.case}**"]
         lines += [f"- diagnose: {said['verdict']['sentence']}" for said in o.verdicts[:1]]
@@ -107,8 +107,8 @@ def _said(outcomes: list[Outcome]) -> list[str]:
             unit = f" {p['unit']}" if p["unit"] else ""
             value = values_text(p["value"])
             lines.append(f"- {p['effect']} {p['name']}: {value}{unit} ({low} to {high})")
-        answer.append("\n".join([lines[0], "", *lines[1:]]))
-    return answer
+        paragraphs.append("\n".join([lines[0], "", *lines[1:]]))
+    return paragraphs
 
 
 def _driven(outcomes: list[Outcome], sight: str) -> str:
@@ -156,7 +156,7 @@ def _brought(outcomes: list[Outcome]) -> list[str]:
 
 def _why(outcomes: list[Outcome]) -> list[str]:
     """Where a policy got worse: whether the arm trails the models, by the rate of actuation."""
-    answer = []
+    paragraphs = []
     for o in outcomes:
         if o.paced is None:
             continue
@@ -173,9 +173,9 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             ]
             span = f"{band['low']:g} to {band['high']:g}"
             lines.append(f"| {span} | {band['rows']} | " + " | ".join(cells) + " |")
-        answer.append("\n".join(lines))
+        paragraphs.append("\n".join(lines))
         if o.case in FORMS:
-            answer.append(FORMS[o.case])
+            paragraphs.append(FORMS[o.case])
         found = o.paced["driven"]
         cells = [
             f"{driver} {_interval(found[f'{driver}/{sight}'])} mm {word}"
@@ -187,13 +187,13 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             f"{p['name']} {values_text(p['value'])} {p['unit']}".strip()
             for p in o.paced["parameters"]
         )
-        answer.append(
+        paragraphs.append(
             "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
             f"slow circles instead: {o.paced['claim']} ({values}). On the mixed judging recording, "
             f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
             f"on it and script, on the rig: {'; '.join(cells)}."
         )
-    return answer
+    return paragraphs
 
 
 def _costs(outcomes: list[Outcome]) -> str:

@@ -59,9 +59,9 @@ class Processes:
         """What each process has, in the leader; None in the others."""
         if self.count == 1:
             return [value]
-        answer = [None] * self.count if self.leads else None
-        dist.gather_object(value, answer, dst=0)
-        return answer
+        gathered = [None] * self.count if self.leads else None
+        dist.gather_object(value, gathered, dst=0)
+        return gathered
 
     def wait(self) -> None:
         """Until every process has come here."""

@@ -69,14 +69,14 @@ class Evaluation:
 
     def to_json(self) -> dict:
         """Numbers and lists for JSON; what does not apply is null."""
-        answer = {
+        document = {
             "overall": {name: json_safe(asdict(value)) for name, value in self.overall.items()},
             "per_episode": {
                 name: json_safe(value.tolist()) for name, value in self.per_episode.items()
             },
         }
         if self.checks is not None:
-            answer["referee"] = {
+            document["referee"] = {
                 "instants": sum(v.steps for v in self.checks),
                 "contact_differs": sum(v.contact_differs for v in self.checks),
                 "beam_differs": sum(v.beam_differs for v in self.checks),
@@ -84,7 +84,7 @@ class Evaluation:
                 "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.checks)),
                 "contacts": [_contact(v) for v in self.checks],
             }
-        return answer
+        return document
 
 
 def evaluate(

@@ -63,7 +63,7 @@ def groups_of(agent: str, agents: Collection[str]) -> tuple[str, ...]:
 
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
     """One PPO for each agent: an actor on its observation, a critic on the joint state."""
-    seen, answer, device = env.get_observations().clone(), {}, env.task.world.device
+    seen, by_agent, device = env.get_observations().clone(), {}, env.task.world.device
     for agent in env.task.agents:
         view = SimpleNamespace(
             num_envs=env.num_envs, num_actions=env.task.world.arms[agent].chambers
@@ -80,8 +80,8 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             # One call for all weights instead of a dozen small ones for each.
             group["fused"] = True
         ppo.train_mode()
-        answer[agent] = ppo
-    return answer
+        by_agent[agent] = ppo
+    return by_agent
 
 
 def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:

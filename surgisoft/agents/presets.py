@@ -96,9 +96,9 @@ def preset_for(name: str, task: str, **changes) -> Preset:
     """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
-    own = spec_of(task).preset if name == "fast" else {}
+    of_task = spec_of(task).preset if name == "fast" else {}
     given = {key: value for key, value in changes.items() if value is not None}
-    return replace(PRESETS[name], **{**own, **given})
+    return replace(PRESETS[name], **{**of_task, **given})
 
 
 def steps_for(name: str, task: str) -> int:

@@ -83,14 +83,14 @@ class TrainingRequest:
                 f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
                 "training ends by one or the other"
             )
-        own = task_config(self.task, self.config, self.arm, self.scene)
+        config = task_config(self.task, self.config, self.arm, self.scene)
         numbers = preset_for(self.preset, self.task, envs=self.envs)
         steps = self.steps
         if steps is None and self.minutes is None:
             steps = steps_for(self.preset, self.task)
         return Plan(
             self.task,
-            own,
+            config,
             self.preset,
             numbers,
             steps,

@@ -76,14 +76,15 @@ def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
     varied = ["lesion", *(vary.field for vary in spec.vary)]
     found = []
     for label in dict.fromkeys(row["setting"] for row in rows):
-        own = [row for row in rows if row["setting"] == label]
-        numbers = [n for n in own[0] if n not in (*TEXTS, *varied, "episode")]
+        episodes = [row for row in rows if row["setting"] == label]
+        numbers = [n for n in episodes[0] if n not in (*TEXTS, *varied, "episode")]
         overall = {
-            name: summary(_numbers([row[name] for row in own]), name in RATES) for name in numbers
+            name: summary(_numbers([row[name] for row in episodes]), name in RATES)
+            for name in numbers
         }
-        values = {name: own[0][name] for name in varied if name in own[0]}
-        outcomes = dict(Counter(row["outcome"] for row in own).most_common())
-        found.append(SettingResult(label, own[0]["case"], values, own, overall, outcomes))
+        values = {name: episodes[0][name] for name in varied if name in episodes[0]}
+        outcomes = dict(Counter(row["outcome"] for row in episodes).most_common())
+        found.append(SettingResult(label, episodes[0]["case"], values, episodes, overall, outcomes))
     return Results(spec, folder, found)
 
 

@@ -195,7 +195,7 @@ class CircleAblation:
         offsets = [pointing["laser"].offset_mm(laser.seen_mm, target) for target in ahead]
         look = pointing["endoscope"].offset_mm(eye.seen_mm, self.centre_mm(state))
         angle = 2.0 * math.pi * cut.share(self.round)[:, None]
-        own = {
+        of_arm = {
             "laser": {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),
                 RING_PLACE: torch.cat((angle.sin(), angle.cos()), 1),
@@ -210,7 +210,7 @@ class CircleAblation:
             APART: (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0,
         }
         return {
-            name: {**body_blocks(self.world.arms[name], arms[name]), **own[name], **shared}
+            name: {**body_blocks(self.world.arms[name], arms[name]), **of_arm[name], **shared}
             for name in self.agents
         }
 

@@ -53,7 +53,7 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
         ([*SMALL, "--device", "abacus"], "abacus"),
         ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
         (["--resume", "nowhere"], "no training run there"),
-        (["--resume", "nowhere", "--seed", "1"], "leave --seed out"),
+        (["--resume", "nowhere", "--seed", "1"], "leave out --seed"),
         (["--task", "track_circle", "--envs", "0"], "--envs"),
     ],
 )

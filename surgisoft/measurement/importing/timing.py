@@ -160,11 +160,11 @@ def _seen_on(grid: np.ndarray, t_s: np.ndarray, point: np.ndarray, step: float) 
     known = ~np.isnan(point).any(axis=1)
     if known.sum() < 2:
         return np.full((len(grid), 3), np.nan)
-    own = t_s[known]
-    after = np.clip(np.searchsorted(own, grid), 1, len(own) - 1)
-    lost = own[after] - own[after - 1] > max(GAP_S, 5 * step)
-    lost |= (grid < own[0]) | (grid > own[-1])
-    return np.where(lost[:, None], np.nan, _on(grid, own, point[known]))
+    known_s = t_s[known]
+    after = np.clip(np.searchsorted(known_s, grid), 1, len(known_s) - 1)
+    lost = known_s[after] - known_s[after - 1] > max(GAP_S, 5 * step)
+    lost |= (grid < known_s[0]) | (grid > known_s[-1])
+    return np.where(lost[:, None], np.nan, _on(grid, known_s, point[known]))
 
 
 def _spread(column: np.ndarray) -> float:

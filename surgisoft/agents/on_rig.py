@@ -1,4 +1,4 @@
-"""Tasks with virtual rigs as the plants: every arm of every episode is a rig of its own.
+"""Tasks with virtual rigs as plants: every arm of every episode is a separate rig.
 
 Commands go to the rig's pumps, pressures and key points come from its sensors and cameras; goals,
 scene and scores of the task stay as they are. The true body, the beam and the errors are those of

@@ -1,6 +1,6 @@
 """Independent PPO with centralised critics: one rsl-rl PPO for each agent of a shared world.
 
-Centralised training with decentralised execution (CTDE): an actor sees its own agent's observation,
+Centralised training with decentralised execution (CTDE): an actor sees its agent's observation,
 its critic the observations of all agents (`vec_env.STATE`), a privileged input that only training
 needs. Agents share neither networks nor rewards (independent learners; De Witt et al. 2020, IPPO;
 with the joint observation in the critic as in MAPPO, Yu et al. 2022).

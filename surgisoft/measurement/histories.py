@@ -177,7 +177,7 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
             if came != expected:
                 raise InputError(
                     f"{recording.label}: {what}: {came}, but the model has {expected}; "
-                    "use recordings of the model's own arm"
+                    "use recordings of the arm that the model was fitted to"
                 )
         extent = _extent_mm(recording.key_points_mm)
         if spec.length_mm and (extent > SIZES * spec.length_mm or extent < spec.length_mm / SIZES):

@@ -195,8 +195,8 @@ def effective_pressures(
 def follow_lines(effects: Effects, step: float, strains: np.ndarray, history: History) -> None:
     """Let the lines' memories follow their strains (J,) over one period [s].
 
-    Rate: the wall beside a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d = e - y what the
-    strain y lacks of the strain e that the wall would take by itself. While e stands still,
+    Rate: the wall parallel to a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d = e - y what
+    the strain y lacks of the strain e that the wall would take by itself. While e stands still,
     d(t) = d / (1 + 0.1 (E / c)^2 |d| t).
     """
     for j in range(strains.shape[0]):

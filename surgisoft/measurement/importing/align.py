@@ -34,7 +34,7 @@ class Between:
 
     @classmethod
     def of(cls, log_s: np.ndarray, t_s: np.ndarray) -> "Between":
-        """Times t_s (T,) among a log's own increasing times (R,) [s]."""
+        """Places of times t_s (T,) among a log's increasing times (R,) [s]."""
         before = np.searchsorted(log_s, t_s + SAME_TIME_S, side="right") - 1
         before = np.clip(before, 0, max(len(log_s) - 2, 0))
         after = np.minimum(before + 1, len(log_s) - 1)

@@ -352,7 +352,7 @@ def _as_runs(parts: list[Imported], spec: ImportMap, name: str) -> Imported:
 
 
 def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
-    """(3,) mean direction of the files' directions; each file has its own rest pose."""
+    """(3,) mean of the files' directions, which differ because each file has another rest frame."""
     if recordings[0].gravity is None:
         return None
     mean = np.mean([recording.gravity for recording in recordings], axis=0)

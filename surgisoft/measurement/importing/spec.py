@@ -1,6 +1,6 @@
 """The map file of an import as frozen dataclasses; docs/recordings.md describes every field.
 
-A map says how a laboratory's own files become recordings: which files, columns, units and frame.
+A map describes how a laboratory's files become recordings: which files, columns, units and frame.
 `load_map` reads one; surgisoft/config.py gives every bad field its line.
 """
 

@@ -83,7 +83,7 @@ def make_protocol(
     """A protocol of the catalogue, or a schedule file by its path.
 
     limits: (m, 2) lowest and highest actuation [kPa]; points: samples (default: the catalogue's);
-    seed: of the random parts; each protocol has its own random number stream.
+    seed: of the random parts; protocols have different random number streams.
     """
     if str(name).endswith(".csv"):
         if points is not None:

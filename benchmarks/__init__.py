@@ -1,1 +1,1 @@
-"""Benchmarks: studies whose printed results are kept under docs/results, and timings."""
+"""Benchmarks: studies whose results are stored under docs/results, and timings."""

@@ -1,4 +1,4 @@
-"""Record what the command line answers, and compare two such records number by number.
+"""Record results of the command line, and compare two such records number by number.
 
     python benchmarks/answers.py record --out before            # with the code as it is
     python benchmarks/answers.py record --out after --inputs before/inputs    # after a change
@@ -26,8 +26,8 @@ name behind the old one. Names that are stored as they come (effects, tasks' mea
 entity paths) are translated by `SAME_NAMES` before two records are compared. After a change of
 the tables delete the items' JSON files (not `OUT/raw`) and record again: nothing is run twice.
 
-Times on the clock and on the processor are left out; they are the only answers that two runs of
-the same code on the same machine do not share.
+Times on the clock and on the processor are left out; they are the only results in which two runs of
+the same code on the same machine differ.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Tolerance:
     relative: float
     """Share of the larger number."""
     absolute: float
-    """In the number's own unit; the larger of both limits counts."""
+    """In the unit of the number; the larger of both limits counts."""
     reason: str
     """Why that much."""
     counts: bool = False
@@ -137,7 +137,7 @@ COMPARE = {
 entries of a list, `a[name]` makes an object of the list by that field, `a.*` the only entry."""
 
 FIT_TEST = {n: p for n, p in COMPARE.items() if not n.startswith(("axis", "band", "worst"))}
-"""What is kept of `compare --json` for a model that was just fitted."""
+"""What is recorded of `compare --json` for a model that was just fitted."""
 
 DIAGNOSE = {
     "kind": ("verdict.kind",),
@@ -402,24 +402,34 @@ def scene_checks(text: str) -> dict:
 
 @dataclass
 class Done:
-    """A command that has ended."""
+    """Result of a command that has ended."""
 
     folder: Path
+    """Folder of the command's files."""
     code: int
+    """Exit code."""
     output: str
+    """Text on standard output."""
 
 
 @dataclass
 class Session:
-    """Where commands run and where their outputs go."""
+    """Folders in which commands run and to which their outputs go."""
 
     out: Path
+    """Folder of the record."""
     inputs: Path
+    """Folder of recordings, models and runs that several items read."""
     data: Path
+    """Folder of the public data sets."""
     meshes: Path
+    """Folder of the public meshes."""
     maps: Path
+    """Folder of the import maps."""
     scene: Path
+    """Folder of the scene."""
     python: list[str]
+    """Command that starts the interpreter under test."""
 
     def call(self, folder: Path, args: Iterable, codes: tuple[int, ...] = (0,)) -> Done:
         """Run `python -m surgisoft.cli ARGS`, unless it ended there before.
@@ -549,7 +559,7 @@ HALF = [
     "contact",
     "misalignment",
 ]
-"""Effects that are hidden at half their strength, too, in another specimen."""
+"""Effects that are also hidden at half their amplitude, in another robot."""
 
 RECORDINGS = {
     "mixed_0_clean": "mixed --seed 0",
@@ -594,7 +604,7 @@ MODELS = {
     "asu_model": ("asu", "--epochs 20 --seed 1"),
     "arm_5": ("walk_5", "--effects hysteresis --inputs pressure --epochs 60 --seed 1"),
 }
-"""Input model -> recording, arguments of `fit`. The default arm was fitted to specimen 0."""
+"""Input model -> recording, arguments of `fit`. The default arm was fitted to robot 0."""
 
 CIRCLE = "--task track_circle --steps 200000 --seed 1"
 RING = "--task circle_ablation --steps 200000 --seed 1"
@@ -608,7 +618,7 @@ ITEMS: dict[str, Callable[[Session], dict]] = {}
 
 
 def read_json(done: Done, file: str = "answer.json") -> dict:
-    """The JSON file that a command was told to write into its folder."""
+    """The JSON file that a command wrote into its folder."""
     path = done.folder / file
     if not path.is_file():
         raise Absent(f"no {file} was written")
@@ -626,6 +636,8 @@ def add(name: str):
 
 
 def add_compare(case: str) -> None:
+    """Add an item for `compare` on a recording."""
+
     @add(f"compare.{case}")
     def _(session: Session) -> dict:
         recording = session.recording(case)
@@ -651,13 +663,15 @@ def add_diagnose(case: str, *more: str, name: str = "", model: str = "default") 
 
 
 def diagnosed(done: Done) -> dict:
-    """What a diagnosis said."""
+    """Recorded numbers of a diagnosis."""
     values = take(read_json(done), DIAGNOSE)
     values["ranking"] = values["ranking"][:3]
     return values
 
 
 def add_fit(name: str, recording: str, words: str) -> None:
+    """Add an item for `fit` of a model."""
+
     @add(f"fit.{name}")
     def _(session: Session) -> dict:
         train, valid = session.recording(recording), session.recording("test")
@@ -672,6 +686,8 @@ def add_fit(name: str, recording: str, words: str) -> None:
 
 
 def add_evaluate(name: str, driver: str, words: str, replay: bool = False) -> None:
+    """Add an item for `evaluate` of a policy."""
+
     @add(f"evaluate.{name}")
     def _(session: Session) -> dict:
         return take(read_json(evaluated(session, name, driver, words, replay)), EVALUATE)
@@ -685,7 +701,7 @@ def add_evaluate(name: str, driver: str, words: str, replay: bool = False) -> No
 
 
 def evaluated(session: Session, name: str, driver: str, words: str, replay: bool) -> Done:
-    """Run `evaluate`."""
+    """Run `evaluate` of a policy."""
     who = session.policy() if driver == "policy" else driver
     scene = ["--scene", session.scene] if "circle_ablation" in words else []
     film = ["--replay", "{out}/episode.rrd"] if replay else []
@@ -694,6 +710,8 @@ def evaluated(session: Session, name: str, driver: str, words: str, replay: bool
 
 
 def add_collect(name: str, words: str) -> None:
+    """Add an item for `collect` of a recording."""
+
     @add(f"collect.{name}")
     def _(session: Session) -> dict:
         done = session.raw(
@@ -703,6 +721,8 @@ def add_collect(name: str, words: str) -> None:
 
 
 def add_scene(name: str, meshes: Callable[[Session], list[str]], words: str = "") -> None:
+    """Add an item for `scene new` and `scene check`."""
+
     @add(f"scene.{name}")
     def _(session: Session) -> dict:
         made = session.raw(
@@ -730,6 +750,8 @@ def openhelp(session: Session) -> list[str]:
 
 
 def add_amend(name: str, case: str, words: str) -> None:
+    """Add an item for `amend` of a model."""
+
     @add(f"amend.{name}")
     def _(session: Session) -> dict:
         recording = session.recording(case)
@@ -744,6 +766,8 @@ def add_amend(name: str, case: str, words: str) -> None:
 
 
 def add_improve(case: str) -> None:
+    """Add an item for `improve` of a model."""
+
     @add(f"improve.{case}")
     def _(session: Session) -> dict:
         recording = session.recording(case)
@@ -758,6 +782,8 @@ def add_improve(case: str) -> None:
 
 
 def add_next_experiment(name: str, words: str, case: str | None = None) -> None:
+    """Add an item for `next-experiment`."""
+
     @add(f"next_experiment.{name}")
     def _(session: Session) -> dict:
         recordings = [session.recording(case)] if case else []
@@ -771,6 +797,8 @@ def add_next_experiment(name: str, words: str, case: str | None = None) -> None:
 
 
 def add_train(name: str, words: str) -> None:
+    """Add an item for `train` of a task."""
+
     @add(f"train.{name}")
     def _(session: Session) -> dict:
         done = session.raw(f"train.{name}", "train", *words.split(), "-o", "{out}/run")
@@ -783,6 +811,8 @@ def add_train(name: str, words: str) -> None:
 
 
 def add_refusal(name: str, *args) -> None:
+    """Add an item for a command that must refuse its input."""
+
     @add(f"refusal.{name}")
     def _(session: Session) -> dict:
         walk = session.recording("walk")
@@ -867,6 +897,8 @@ def _(session: Session) -> dict:
 
 
 def add_import(name: str) -> None:
+    """Add an item for `import` of a public data set."""
+
     @add(f"import.{name}")
     def _(session: Session) -> dict:
         file = f"{name}.parquet"
@@ -877,6 +909,7 @@ def add_import(name: str) -> None:
 
 
 def add_public(command: str, model: str, recording: str, names: Callable[[Done], dict]) -> None:
+    """Add an item for a command on a public data set."""
     name = f"import.{command}_{recording}"
 
     @add(name)
@@ -978,7 +1011,7 @@ def chosen(only: str | None) -> list[str]:
 
 
 def asked_code(python: list[str]) -> dict:
-    """Where the package that answers lies, and a hash of its source."""
+    """Folder and source hash of the package under test."""
     word = "import surgisoft; print(surgisoft.__file__)"
     ran = subprocess.run([*python, "-c", word], capture_output=True, text=True, check=False)
     if ran.returncode:

@@ -1,4 +1,4 @@
-"""Arm evaluations a second, beside this machine's matrix-product peak, in one run.
+"""Arm evaluations per second, compared with this machine's peak of matrix products.
 
     python benchmarks/arm.py [THREADS]
 
@@ -26,7 +26,7 @@ SPEC = ArmSpec(3, 5, (-15.0,) * 3, (54.0,) * 3, band=(0.2,) * 3)
 
 
 def best_seconds(work, repeats: int = 5, least: float = 0.4) -> float:
-    """Seconds of one call: the best of several rounds of at least `least` seconds."""
+    """Duration of one call, s: the best of several rounds of at least `least` seconds."""
     work()
     best = float("inf")
     for _ in range(repeats):
@@ -39,7 +39,7 @@ def best_seconds(work, repeats: int = 5, least: float = 0.4) -> float:
 
 
 def peak() -> float:
-    """Operations a second of a 2048 x 2048 x 2048 float32 product."""
+    """Operations per second of a 2048 x 2048 x 2048 float32 product."""
     a = torch.randn(2048, 2048)
     return 2 * 2048**3 / best_seconds(lambda: a @ a, repeats=2, least=0.25)
 
@@ -54,14 +54,14 @@ def arm(effects: tuple[str, ...]) -> ArmModel:
 
 
 def stepper(effects: tuple[str, ...], dp: torch.Tensor):
-    """A call that steps a batch once by dp (B, 3)."""
+    """A function that steps a batch once by dp (B, 3)."""
     model = arm(effects)
     state = model.initial_state(len(dp))
     return lambda: model.step(state, dp, 0.05)
 
 
 def network(x: torch.Tensor):
-    """A call of the network alone."""
+    """A function that evaluates the network alone."""
     model = arm(())
     return lambda: model.network(x, x)
 

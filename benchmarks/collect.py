@@ -1,8 +1,8 @@
-"""How fast the virtual rig collects, what its arms are like, and what each hidden effect does.
+"""Speed of the virtual rig, properties of its robots, and size of each hidden effect.
 
     python benchmarks/collect.py [--seeds 1 2 3] [--json FILE]
 
-The first call compiles (about half a minute); compiling is not part of the figures.
+The first call compiles (about half a minute); the reported times exclude compilation.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from surgisoft.rig.virtual import MOUNT
 
 
 def speed() -> dict:
-    """Seconds of the paper's collection and reads a second of a closed loop."""
+    """Duration of the paper's collection, s, and samples per second of a closed loop."""
     rig = VirtualRig(1)
     rig.record(make_protocol("mixed", rig.limits, 100))
     grid = make_protocol("grid", rig.limits)
@@ -55,7 +55,7 @@ def arm(seed: int) -> dict:
 
 
 def effect(name: str, seeds: list[int]) -> dict:
-    """Shift of the measured tip by an effect of strength 1 over the `mixed` protocol, noise off."""
+    """Shift of the measured tip by an effect of amplitude 1 over protocol `mixed`, noise off."""
     rms, largest = [], []
     for seed in seeds:
         protocol = make_protocol("mixed", VirtualRig(seed).limits, seed=seed)
@@ -68,6 +68,7 @@ def effect(name: str, seeds: list[int]) -> dict:
 
 
 def main() -> None:
+    """Print speed, robots and effects, and write them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--json", help="write the figures to this file")

@@ -12,16 +12,17 @@ from surgisoft.files import write_atomically
 
 app = typer.Typer(help="Long studies on the virtual rig.", no_args_is_help=True)
 
-Images = Annotated[Path | None, typer.Option(metavar="DIR", help="Draw the pictures here.")]
-"""Option of the studies that draw."""
+Images = Annotated[Path | None, typer.Option(metavar="DIR", help="Write pictures to this folder.")]
+"""Option of the studies with pictures."""
 Output = Annotated[
-    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write Markdown here.")
+    Path | None,
+    typer.Option("-o", "--output", metavar="FILE", help="Write the results to this file."),
 ]
 """Option of all studies."""
 
 
 def _numbers(option: str, text: str) -> list[int]:
-    """Whole numbers between commas, or one line that says what was expected."""
+    """Whole numbers separated by commas; raises InputError for other text."""
     from surgisoft.errors import InputError
 
     try:
@@ -31,7 +32,7 @@ def _numbers(option: str, text: str) -> list[int]:
 
 
 def _show(title: str, command: str, body: str, output: Path | None) -> None:
-    """Print a study's results under the command and the day, and write them where asked for."""
+    """Print a study's results with the command and the date, and write them to `output`."""
     today = datetime.date.today().isoformat()
     text = f"# {title}\n\nPrinted by `{command}` on {today}.\n\n{body}"
     if output:
@@ -41,11 +42,12 @@ def _show(title: str, command: str, body: str, output: Path | None) -> None:
 
 @app.command()
 def modelling(
-    seeds: Annotated[str, typer.Option(help="Robots, by the seed of their casting.")] = "1,2,3",
+    seeds: Annotated[str, typer.Option(help="Seeds of the robots, with commas.")] = "1,2,3",
     points: Annotated[
-        int | None, typer.Option(min=64, help="Training points; default the paper's 13,824.")
+        int | None,
+        typer.Option(min=64, help="Number of training points; default 13,824, as in the paper."),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Fits that run side by side.")] = 2,
+    processes: Annotated[int, typer.Option(min=1, help="Number of fits in parallel.")] = 2,
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -65,24 +67,29 @@ def modelling(
 def diagnosis(
     robots: Annotated[
         str,
-        typer.Option(help="Robots, by the seed of their casting; 101 to 127 were seen before."),
+        typer.Option(help="Seeds of the robots, with commas; 101 to 127 served for calibration."),
     ] = "128,129,130,131",
-    count: Annotated[int, typer.Option(min=8, help="Robots with their recordings, in all.")] = 400,
+    count: Annotated[
+        int, typer.Option(min=8, help="Number of cases, each a robot with a recording.")
+    ] = 400,
     seed: Annotated[
-        int, typer.Option(min=0, help="Draws the cases; 1 to 10 were seen before.")
+        int, typer.Option(min=0, help="Seed of the cases; 1 to 10 served for calibration.")
     ] = 11,
-    processes: Annotated[int, typer.Option(min=1, help="Robots side by side.")] = 2,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
     work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Keeps base models and what was said of each robot.")
+        Path,
+        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
     ] = Path("runs/benchmark-diagnosis"),
     amend: Annotated[
         int,
-        typer.Option(min=0, help="Cases with one effect of the list whose model is amended too."),
+        typer.Option(
+            min=0, help="Number of cases with one known effect whose model is amended, too."
+        ),
     ] = 45,
     images: Images = None,
     output: Output = None,
 ) -> None:
-    """The benchmark of `diagnose`: virtual robots with hidden effects, clean ones, unknown ones."""
+    """Benchmark of `diagnose` on virtual robots: hidden effects, none, or unknown ones."""
     from benchmarks.diagnosis.cases import cases
     from benchmarks.diagnosis.study import run
     from benchmarks.diagnosis.table import draw, markdown
@@ -101,20 +108,24 @@ def diagnosis(
 @app.command("hidden-effect")
 def hidden_effect(
     effects: Annotated[
-        str, typer.Option(help="Effects that the model lacks, one after the other.")
+        str, typer.Option(help="Effects that the model lacks, with commas; one study each.")
     ] = "creep,line_lag,payload,hysteresis",
-    specimen: Annotated[int, typer.Option(min=0, help="Which arm was cast.")] = 0,
-    strength: Annotated[float, typer.Option(help="Strength of what is hidden in the rig.")] = 1.0,
+    specimen: Annotated[int, typer.Option(min=0, help="Seed of the robot.")] = 0,
+    strength: Annotated[float, typer.Option(help="Amplitude of the hidden effects.")] = 1.0,
     steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 2_000_000,
-    episodes: Annotated[int, typer.Option(min=2, help="Episodes of each driver.")] = 10,
+    episodes: Annotated[int, typer.Option(min=2, help="Episodes of each policy.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of training and of episodes.")] = 0,
     work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Keeps recordings, models and policies: goes on.")
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of recordings, models and policies; existing ones are reused.",
+        ),
     ] = Path("runs/benchmark-hidden-effect"),
     images: Images = None,
     output: Output = None,
 ) -> None:
-    """The loop closed: train, diagnose on a rig that hides an effect, amend, train anew."""
+    """Train, diagnose on a rig with a hidden effect, amend, and train again."""
     import torch
 
     from benchmarks.hidden_effect.study import StudyConfig, run
@@ -143,7 +154,7 @@ def control(
         Path,
         typer.Option(
             metavar="DIR",
-            help="Training runs as TASK-seed-N: taken as they are, trained where missing.",
+            help="Folder of training runs named TASK-seed-N; missing ones are trained.",
         ),
     ] = Path("runs/benchmark-control"),
     tasks: Annotated[
@@ -154,7 +165,7 @@ def control(
     rig_episodes: Annotated[int, typer.Option(min=2, help="Episodes on the rig.")] = 20,
     output: Output = None,
 ) -> None:
-    """Learned beside scripted beside random on every task, in simulation and on the rig."""
+    """Learned, scripted and random policies on every task, in simulation and on the rig."""
     import torch
 
     from benchmarks.control.study import TASKS, ControlConfig, run

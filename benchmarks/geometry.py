@@ -1,4 +1,4 @@
-"""How fast the geometry is: rays, clearances and collisions a second, each engine in one run.
+"""Speed of the geometry engines: rays, clearances and collisions per second.
 
     python benchmarks/geometry.py            a minute or so on one core
     python benchmarks/geometry.py --json F   the same numbers as JSON
@@ -98,12 +98,14 @@ def rate(function, items: int, repeats: int = 3) -> float:
 
 
 def seconds(function) -> float:
+    """Duration of one call, s."""
     start = time.perf_counter()
     function()
     return time.perf_counter() - start
 
 
 def fcl_capsules(line: np.ndarray) -> list[fcl.CollisionObject]:
+    """FCL capsules along a centreline (K, 3) mm."""
     axes = line[1:] - line[:-1]
     turns, lengths = frames.rotation_from_z(axes), frames.norm(axes)
     middles = 0.5 * (line[1:] + line[:-1])
@@ -163,7 +165,7 @@ def picture_rate(mesh: Mesh) -> dict[str, float]:
 
 
 def raw_fcl_ray(checker: CollisionChecker, origin, aim) -> int:
-    """What FCL itself takes to name the candidate faces."""
+    """Names of the candidate faces of a ray, by a plain FCL call."""
     end = origin + RANGE_MM * aim
     side = frames.rotation_from_z(aim)[:, 0] * 1e-3
     model = surface_model(np.stack((origin, end, end + side)), np.array([[0, 1, 2]]))
@@ -226,6 +228,7 @@ def body_rates(mesh: Mesh, cache: Path) -> dict[str, dict[str, float]]:
 
 
 def raw_fcl_distance(target, line) -> float:
+    """Distance of a chain of capsules to a target, mm, by plain FCL calls."""
     return min(
         fcl.distance(c, target, fcl.DistanceRequest(), fcl.DistanceResult())
         for c in fcl_capsules(line)
@@ -233,6 +236,7 @@ def raw_fcl_distance(target, line) -> float:
 
 
 def raw_fcl_collide(target, line) -> bool:
+    """Whether a chain of capsules collides with a target, by plain FCL calls."""
     return any(
         fcl.collide(c, target, fcl.CollisionRequest(), fcl.CollisionResult())
         for c in fcl_capsules(line)
@@ -271,6 +275,7 @@ def scaling_row(faces: int) -> dict[str, float]:
 
 
 def show(title: str, rates: dict[str, float], baselines: dict[str, str]) -> None:
+    """Print one table of rates, with ratios to the baselines."""
     print(f"\n{title}")
     names = [name for name in rates if any(name.startswith(b) for b in baselines.values())]
     for name, value in rates.items():
@@ -284,6 +289,7 @@ def show(title: str, rates: dict[str, float], baselines: dict[str, str]) -> None
 
 
 def main(argv: list[str]) -> None:
+    """Parse the arguments, measure and print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--json", type=Path, help="write the numbers here as well")
     parser.add_argument("--faces", type=int, default=20_000, help="faces of the organ")

@@ -37,21 +37,24 @@ RANGE_MM, HORIZON_MM, WITHIN_MM = 200.0, 60.0, 5.0
 REFEREED = {"near": 512, "far": 128}
 ROUNDS = 4
 LONGEST_S = 2.0
-"""An engine that takes longer than this for a batch is not asked for a larger one."""
+"""An engine that is slower than this for a batch is not measured with a larger one."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """One engine's way to answer a question: `ask(n)` answers the first n queries."""
+    """One engine for a kind of query: `ask(n)` computes the first n queries."""
 
     name: str
+    """Name of the engine."""
     ask: Callable[[int], np.ndarray]
+    """Results of the first n queries."""
     most: int = SIZES[-1]
+    """Largest batch that is measured."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """The queries that every engine gets; positions in mm, in the mesh's frame."""
+    """Queries that every engine gets; positions in mm, in the mesh's frame."""
 
     origins: np.ndarray
     aims: np.ndarray
@@ -61,7 +64,7 @@ class Work:
 
 
 def split_to(mesh: Mesh, faces: int) -> Mesh:
-    """The same surface with so many faces: edges are halved, the longest first."""
+    """A mesh of the same surface with so many faces: edges are halved, the longest first."""
     vertices, triangles = mesh.vertices_mm.tolist(), mesh.faces.tolist()
     while len(triangles) < faces:
         sides: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -200,7 +203,7 @@ def own_ways(mesh: Mesh, work: Work, cache: Path, device: str) -> dict[str, list
 
 
 def fcl_ways(mesh: Mesh, work: Work) -> dict[str, list[Way]]:
-    """The checker, one query a call: the truth that errors are taken against."""
+    """FCL, one query per call: the reference for errors."""
     from surgisoft.scene.capsules import ArmShape
     from surgisoft.scene.collision import CollisionChecker
     from surgisoft.scene.inside import points_inside
@@ -368,7 +371,7 @@ TITLES = {
 
 
 def timed(ways: list[Way], clock) -> dict[str, dict[int, float]]:
-    """Seconds a query by engine and batch; the engines take turns, the best round counts."""
+    """Seconds per query by engine and batch; the best of several interleaved rounds counts."""
     table: dict[str, dict[int, float]] = {way.name: {} for way in ways}
     for size in SIZES:
         asked = []
@@ -388,7 +391,7 @@ def timed(ways: list[Way], clock) -> dict[str, dict[int, float]]:
 
 
 def error_of(question: str, way: Way, truth: np.ndarray) -> str:
-    """What an engine gets wrong, measured against FCL or the winding number."""
+    """Error of an engine against FCL or the winding number, as text."""
     found = way.ask(len(truth))
     if question in ("inside", "skin"):
         return f"{int((found != truth).sum())} of {len(truth)} wrong"
@@ -411,7 +414,7 @@ def error_of(question: str, way: Way, truth: np.ndarray) -> str:
 
 
 def show(question: str, ways: list[Way], clock) -> dict:
-    """Print one table; the first way is the project's, the last one the truth."""
+    """Print one table; the first engine is the project's, the last one the reference."""
     print(f"\n{TITLES[question]}")
     print("  " + f"{'us a query in batches of':<34}" + "".join(f"{n:>17,}" for n in SIZES))
     table = timed(ways, clock)
@@ -446,7 +449,7 @@ MODULES = {
 
 
 def cost(engine: str, faces: int, cache: Path) -> dict[str, float]:
-    """What one engine takes in a fresh process for one mesh: processor seconds and MB."""
+    """Processor seconds and MB of one engine in a fresh process for one mesh."""
     mesh = phantom()
     if faces > len(mesh.faces):
         mesh = split_to(mesh, faces)
@@ -484,7 +487,7 @@ def own_clearance(mesh: Mesh, work: Work, cache: Path) -> Way:
 
 
 def costs(faces: int, engines: list[str]) -> dict[str, dict[str, float]]:
-    """Print what each engine costs in a fresh process, caches empty and then filled."""
+    """Print the cost of each engine in a fresh process, with empty and with filled caches."""
     print(
         f"\na fresh process, {faces:,} faces: import, build, first arm (processor s); memory (MB)"
     )
@@ -513,7 +516,7 @@ def costs(faces: int, engines: list[str]) -> dict[str, dict[str, float]]:
 
 
 def absent(module: str) -> str | None:
-    """Why an optional engine is left out, None if it is there."""
+    """Reason why an optional engine is left out; None if it is installed."""
     try:
         import_module(module)
     except (ImportError, OSError) as error:
@@ -522,6 +525,7 @@ def absent(module: str) -> str | None:
 
 
 def main(argv: list[str]) -> None:
+    """Parse the arguments, measure and print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--json", type=Path, help="write the numbers here as well")
     parser.add_argument("--faces", type=int, default=50_000, help="faces of the finer mesh")

@@ -85,6 +85,7 @@ def segment_triangle_d2(
 
 @wp.kernel
 def rays(mesh: wp.uint64, o: Points, d: Points, reach: float, out: Numbers, face: Faces):
+    """Distance and face of each ray, in float32."""
     i = wp.tid()
     hit = wp.mesh_query_ray(mesh, o[i], d[i], reach)
     out[i] = reach
@@ -104,6 +105,7 @@ def rays_float64(
     out: Numbers64,
     face: Faces,
 ):
+    """Distance and face of each ray; the distance is recomputed in float64 in the face's plane."""
     i = wp.tid()
     hit = wp.mesh_query_ray(mesh, wp.vec3(o[i]), wp.vec3(d[i]), wp.float32(reach))
     out[i] = reach
@@ -120,6 +122,7 @@ def rays_float64(
 
 @wp.kernel
 def points(mesh: wp.uint64, p: Points, out: Numbers, face: Faces):
+    """Distance and nearest face of each point."""
     i = wp.tid()
     found = wp.mesh_query_point_no_sign(mesh, p[i], FAR)
     at = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
@@ -129,16 +132,19 @@ def points(mesh: wp.uint64, p: Points, out: Numbers, face: Faces):
 
 @wp.kernel
 def inside_three_rays(mesh: wp.uint64, p: Points, out: wp.array(dtype=wp.bool)):
+    """Whether each point is inside, by three rays."""
     out[wp.tid()] = wp.mesh_query_point(mesh, p[wp.tid()], FAR).sign < 0.0
 
 
 @wp.kernel
 def inside_parity(mesh: wp.uint64, p: Points, out: wp.array(dtype=wp.bool)):
+    """Whether each point is inside, by the parity of hits."""
     out[wp.tid()] = wp.mesh_query_point_sign_parity(mesh, p[wp.tid()], FAR, 3).sign < 0.0
 
 
 @wp.kernel
 def inside_winding(mesh: wp.uint64, p: Points, out: wp.array(dtype=wp.bool)):
+    """Whether each point is inside, by the winding number."""
     out[wp.tid()] = wp.mesh_query_point_sign_winding_number(mesh, p[wp.tid()], FAR).sign < 0.0
 
 
@@ -415,7 +421,7 @@ class WarpSurface:
         return self._ask(rays, len(origins), given, (wp.float32, wp.int32))
 
     def rays_float64(self, origins, aims, reach):
-        """The same, distances taken again in float64 in the plane of the face."""
+        """Distances (N,) float64 mm and faces (N,) of rays, recomputed in the face's plane."""
         given = self.corners, self._in(origins, wp.vec3d), self._in(aims, wp.vec3d), reach
         return self._ask(rays_float64, len(origins), given, (wp.float64, wp.int32))
 

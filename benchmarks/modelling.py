@@ -1,4 +1,4 @@
-"""The paper's modelling results on the virtual rig: which model predicts the body how well."""
+"""Benchmark `modelling`: prediction errors of models as in the paper, on the virtual rig."""
 
 import multiprocessing
 import tempfile
@@ -11,11 +11,11 @@ from surgisoft.progress import Progress
 from surgisoft.workers import begin_worker
 
 ARCHITECTURES = ("64,64", "128,128", "64,64,64", "128,128,128", "64,64,64,64", "128,128,128,128")
-"""Six HAW-NN architectures of 2 to 4 hidden layers (the paper does not list its own)."""
+"""Six HAW-NN architectures of 2 to 4 hidden layers (the paper does not list those it used)."""
 PAPER = {"pressure": 0.3947, "pressure+direction": 0.0693}
 """Lowest test MSE of the paper on its real robot (Chen et al. 2025, sec. V-A)."""
 RECURRENT_EPOCHS = 100
-"""Epochs of the recurrent baseline; it stops earlier where held-out data says so."""
+"""Largest number of epochs of the recurrent baseline, which uses early stopping."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Case:
     """One model to fit."""
 
     name: str
-    """What the table calls it."""
+    """Name in the table."""
     inputs: str
     """`pressure` or `pressure+direction`."""
     options: dict
@@ -35,19 +35,19 @@ class Outcome:
     """One fitted model on one robot's test set."""
 
     seed: int
-    """The robot."""
+    """Seed of the robot."""
     case: Case
-    """The model."""
+    """Name of the model's case."""
     mse_mm2: float
     """Test MSE of a coordinate, mm^2."""
     rmse_mm: float
     """Test RMSE of a key point's distance, mm."""
     per_key_point_mm: tuple[float, ...]
-    """The same of each key point, base to tip, mm."""
+    """Test RMSE of each key point's distance, base to tip, mm."""
     seconds: float
-    """Time of the fit, s."""
+    """Duration of the fit, s."""
     kept: str
-    """What the fitted model is made of."""
+    """Summary of the fitted model."""
 
 
 def cases() -> list[Case]:
@@ -94,7 +94,7 @@ def collect(seed: int, folder: Path, points: int | None) -> float:
 
 
 def fit_one(task: tuple[int, Case, Path]) -> Outcome:
-    """Fit one model on one robot and judge it on the test set; the model is kept in the folder."""
+    """Fit one model on one robot and evaluate it on the test set; the folder stores the model."""
     import torch
 
     from surgisoft.diagnosis.compare import compare
@@ -127,7 +127,7 @@ def fit_one(task: tuple[int, Case, Path]) -> Outcome:
 
 
 def model_name(seed: int, case: Case) -> str:
-    """Folder of one fitted model."""
+    """Name of the folder of one fitted model."""
     plain = "".join(letter if letter.isalnum() else "-" for letter in f"{case.name}-{case.inputs}")
     return f"model-{seed}-{plain}"
 
@@ -139,7 +139,7 @@ def run(
     report: Progress,
     images: Path | None = None,
 ) -> str:
-    """The whole study; returns its Markdown. `images` receives loops and bodies of one robot."""
+    """Run the whole study and return its Markdown; `images`: folder for pictures of one robot."""
     tasks_of = cases()
     with tempfile.TemporaryDirectory(prefix="surgisoft-") as temporary:
         folder = Path(temporary)
@@ -160,7 +160,7 @@ def run(
 
 
 def draw(seed: int, folder: Path, images: Path) -> None:
-    """Loops of three models on an amplitude ladder, and bodies of the best, of one robot."""
+    """Draw loops of three models on an amplitude ladder, and bodies of the best, of one robot."""
     from surgisoft.diagnosis.pages.pictures import body, ladder_loops, save
     from surgisoft.diagnosis.residuals import residuals
     from surgisoft.measurement.recordings import load_recording
@@ -195,7 +195,7 @@ def removed(outcomes: list[Outcome], floors: dict[int, float], seed: int) -> flo
 
 
 def markdown(seeds: list[int], floors: dict[int, float], outcomes: list[Outcome]) -> str:
-    """The tables."""
+    """Tables of the study as Markdown."""
     robots = " | ".join(f"robot {seed}" for seed in seeds)
     lines = [
         f"| model | inputs | {robots} | mean MSE mm2 | RMSE mm | key points base to tip, mm | s |",

@@ -1,4 +1,4 @@
-"""What a step of training costs, and where: rollout and update, beside the matrix-product peak.
+"""Cost of a training step by rollout and update, compared with the peak of matrix products.
 
     python benchmarks/training.py [TASK]
 
@@ -24,13 +24,13 @@ from surgisoft.agents.training import Training
 from surgisoft.tasks.registry import make_task
 
 ROWS = ((256, 8, 4), (256, 5, 4), (1024, 8, 4), (1024, 5, 4), (1024, 5, 16), (4096, 5, 4))
-"""Episodes side by side, epochs and minibatches of an update; the preset's are marked."""
+"""Parallel episodes, epochs and minibatches of an update; those of the preset are marked."""
 SAMPLES = 60_000
-"""Steps that each row is measured over, at least."""
+"""Least number of steps over which each row is measured."""
 
 
 def peak() -> float:
-    """Operations a second of processor time of a 2048 x 2048 x 2048 float32 product."""
+    """Operations per second of processor time of a 2048 x 2048 x 2048 float32 product."""
     a = torch.randn(2048, 2048)
     a @ a
     begin = time.process_time()

@@ -1,4 +1,4 @@
-"""Multi-agent surgical scenarios for soft robots, with arm models judged by measurements.
+"""Multi-agent surgical scenarios for soft robots, with arm models validated by measurements.
 
 The names below are the package's functions. Each takes paths or objects and gives the result of
 the command of its name. They are imported when they are first used: `import surgisoft` is quick.
@@ -9,9 +9,9 @@ System identification of an arm:
     load_recording(s), save_recording
     collect                      a recording from a rig, by default the virtual one
     fit                          recordings -> model (grey-box: network and physical effects)
-    compare                      how wrong is a model, and what does its error depend on?
-    diagnose                     which physical effect is missing?
-    next_experiment              what to record to distinguish competing effects
+    compare                      a model's error, and what the error depends on
+    diagnose                     the physical effect that a model lacks
+    next_experiment              the experiment that best distinguishes competing effects
     amend, improve               add effects, and validate them on held-out data
     register_effect_file         a user-defined effect
 
@@ -74,7 +74,7 @@ _PLACES = {
 }
 """The module of each function, inside the package."""
 _OTHER_NAMES = {"load": "load_model"}
-"""Second names."""
+"""Further names of functions."""
 
 __all__ = [
     "__version__",
@@ -106,10 +106,10 @@ register_with_gymnasium()
 
 def __getattr__(name: str) -> object:
     """Import a function when it is first asked for (PEP 562)."""
-    own = _OTHER_NAMES.get(name, name)
-    if own not in _PLACES:
+    present = _OTHER_NAMES.get(name, name)
+    if present not in _PLACES:
         raise AttributeError(f"module 'surgisoft' has no attribute '{name}'")
-    found = getattr(import_module(f"surgisoft.{_PLACES[own]}"), own)
+    found = getattr(import_module(f"surgisoft.{_PLACES[present]}"), present)
     globals()[name] = found
     return found
 

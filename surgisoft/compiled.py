@@ -1,9 +1,10 @@
-"""How inner loops are compiled: by numba, kept on disk, division as in IEEE 754."""
+"""Compilation of inner loops by numba: cached on disk, division as in IEEE 754."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -17,10 +18,10 @@ def _source_stamp(folder: Path) -> str:
     return hashlib.sha256(b"".join(s for s in sources if b"@compiled" in s)).hexdigest()
 
 
-def compiled(function):
-    """Compile without the interpreter's lock, kept on disk between runs.
+def compiled(function: Callable) -> Callable:
+    """Compile a function with numba, without the interpreter's lock, cached on disk between runs.
 
-    numba looks for changes in the function's own file only, so a kernel that calls one of another
+    numba looks for changes in the file of the function only, so a kernel that calls one of another
     file would go on running the other's old code; the stamp of all files of its folder closes that
     hole. The stamp is part of the index's version too, which numba reads before it unpickles the
     index: a class that was renamed since would stop the program there.

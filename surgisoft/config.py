@@ -1,4 +1,4 @@
-"""Reads TOML into frozen dataclasses and writes them back; a bad field gives one line.
+"""TOML files as frozen dataclasses, read and written; a bad field gives a message of one line.
 
 A field's type says what is expected: `float`, `int`, `str`, `bool`, a `Literal` of texts, a fixed
 tuple such as `tuple[float, float, float]`, `tuple[X, ...]`, `dict[str, X]` (tables whose names are
@@ -36,20 +36,22 @@ LARGEST_INTEGER = 2**63
 
 @dataclass(frozen=True)
 class Rule:
-    """What a value must hold beyond its type; the text completes 'expected ...'."""
+    """A condition on a value beyond its type."""
 
     expected: str
+    """Text that completes 'expected ...' in messages."""
     holds: typing.Callable[[typing.Any], bool]
+    """Whether a value satisfies the rule."""
 
 
 def one_of(names: typing.Iterable[str]) -> Rule:
-    """A text out of a list."""
+    """Rule for one text of a list."""
     known = tuple(names)
     return Rule(f"one of {', '.join(known)}", lambda value: value in known)
 
 
 def at_least(least: int) -> Rule:
-    """An integer from this one upwards."""
+    """Rule for an integer of at least this size."""
     return Rule(f"an integer >= {least}", lambda value: value >= least)
 
 
@@ -59,25 +61,28 @@ POSITIVE = Rule("a number > 0", lambda value: value > 0)
 
 @dataclass(frozen=True)
 class Where:
-    """A place in a file, for messages."""
+    """A field of a file, to name it in messages."""
 
     path: Path
+    """Path of the file."""
     text: str = ""
+    """Content of the file, to find the line; empty: without line."""
     keys: tuple[str | int, ...] = ()
+    """Names and indices that lead to the field."""
 
     def __truediv__(self, key: str | int) -> "Where":
         return dataclasses.replace(self, keys=(*self.keys, key))
 
     @property
     def field(self) -> str:
-        """The dotted name, `mounts[1].tool`."""
+        """Dotted name of the field, such as `mounts[1].tool`."""
         name = ""
         for key in self.keys:
             name += f"[{key}]" if isinstance(key, int) else f".{key}" if name else key
         return name
 
     def error(self, came: str, expected: str) -> InputError:
-        """One line: file, line, field, what came, what was expected."""
+        """InputError in one line: file, line, field, what came and what was expected."""
         line = line_of(self.text, self.keys)
         place = f"{self.path}:{line}" if line else str(self.path)
         field = f"{_short(self.field)}: " if self.keys else ""
@@ -262,13 +267,13 @@ def _is_union(base: typing.Any) -> bool:
     return typing.get_origin(base) in (typing.Union, types.UnionType)
 
 
-def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = None):
-    """The value as `hint` asks for; messages state what `said` (default: the hint) asks for."""
+def _value(hint: typing.Any, value: object, where: Where, stated: typing.Any = None):
+    """The value as `hint` asks for; messages state what `stated` (default: the hint) asks for."""
     base, rules = _split(hint)
-    said = hint if said is None else said
+    stated = hint if stated is None else stated
 
     def bad() -> InputError:
-        return where.error(f"got {describe(value)}", expectation(said))
+        return where.error(f"got {describe(value)}", expectation(stated))
 
     if base is typing.Any:
         converted = value
@@ -278,7 +283,7 @@ def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = Non
         part = next((part for part in typing.get_args(base) if _admits(part, value)), None)
         if part is None:
             raise bad()
-        converted = None if part is types.NoneType else _value(part, value, where, said)
+        converted = None if part is types.NoneType else _value(part, value, where, stated)
     elif typing.get_origin(base) is dict:
         if not isinstance(value, dict):
             raise bad()
@@ -291,7 +296,7 @@ def _value(hint: typing.Any, value: object, where: Where, said: typing.Any = Non
     elif base is float:
         converted = _float(value, bad)
         if not math.isfinite(converted):
-            raise where.error(f"got {converted}", f"a finite number ({expectation(said)})")
+            raise where.error(f"got {converted}", f"a finite number ({expectation(stated)})")
     else:
         converted = value
     if not all(rule.holds(converted) for rule in rules):

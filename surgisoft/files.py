@@ -1,4 +1,4 @@
-"""Files and folders that are written whole or not at all, and values as strict JSON.
+"""Atomic writing of files and folders, and values as strict JSON.
 
 A reader never sees half a file: the content goes to a temporary name beside the target, which is
 renamed to the target at the end. What is written has the permissions that the user's umask gives
@@ -38,8 +38,8 @@ def new_file(path: str | Path) -> Iterator[Path]:
 def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     """A temporary folder to fill; it becomes `folder` when the block ends without an exception.
 
-    Where `folder` exists, the new one takes its place. Of the old content, what the new folder does
-    not have is kept, except the files of the names in `own`, which belong to the old version.
+    Where `folder` exists, the new one replaces it. Old files that the new folder does not have are
+    copied to it, except those named in `own`, which belong to the old version.
     """
     folder = Path(folder).resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def json_safe(value: Any) -> Any:
-    """The value in what strict JSON can say: NaN and infinite numbers become None.
+    """The value for strict JSON: NaN and infinite numbers become None.
 
     Goes through dicts, lists and tuples; numpy arrays become lists and numpy scalars numbers.
     """

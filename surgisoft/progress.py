@@ -1,7 +1,7 @@
-"""How a function that works for long reports its progress to its caller.
+"""Reporting of progress from long-running functions to their callers.
 
-Every such function takes a `Progress`, by default `silent`, and calls it with how much is done, how
-much there is to do (any unit), and a note for people. The command line draws it as a bar; the
+Every such function has a parameter `Progress`, by default `silent`, and calls it with the amount
+done, the total amount (any unit) and a note for people. The command line draws it as a bar; the
 adapters here make one progress out of several stages, or from a function that reports text only.
 """
 
@@ -12,10 +12,10 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """What a function that works for long calls now and then."""
+    """Callback of a long-running function."""
 
     def __call__(self, done: float, total: float, note: str = "", /) -> None:
-        """done of total, in any unit; note: what is being done."""
+        """Report `done` of `total`, in any unit; note: the present activity."""
 
 
 def silent(done: float, total: float, note: str = "") -> None:
@@ -32,7 +32,7 @@ def noted(progress: Progress, note: str) -> Progress:
 
 
 def text_only(progress: Progress) -> Callable[[str], None]:
-    """For functions that report text without amounts: each text becomes the note."""
+    """Function that passes text on as the note of a `Progress`, without amounts."""
 
     def report(text: str) -> None:
         progress(0.0, 0.0, text)
@@ -41,10 +41,10 @@ def text_only(progress: Progress) -> Callable[[str], None]:
 
 
 class Stages:
-    """One `Progress` over stages of unlike length."""
+    """One `Progress` over several stages of different length."""
 
     def __init__(self, progress: Progress, total: float):
-        """total: the sum of the stages' weights."""
+        """total: sum of the weights of all stages."""
         self._progress, self.total, self.done = progress, total, 0.0
 
     def stage(self, weight: float, note: str) -> Progress:

@@ -1,4 +1,4 @@
-"""Processes that work side by side, each on one thread, and end with the one that asked."""
+"""Pools of worker processes, one thread each, that end with the process that started them."""
 
 import contextlib
 import multiprocessing
@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What libraries of linear algebra read when a process starts."""
+"""Environment variables by which libraries of linear algebra set their number of threads."""
 
 
 def begin_worker(prepare: Callable[[], object] | None = None) -> None:
-    """One thread; Ctrl-C is for the process that asked, and this one ends with it.
+    """Initialise a worker: one thread, no reaction to Ctrl-C, and end with the parent process.
 
-    However that ends, by a kill too: the system then closes the pipe that is waited for.
-    prepare: called in the new process, which begins without the state of the one that asked.
+    The worker also ends when the parent is killed: the system then closes the pipe that is waited
+    for. prepare: called in the new process, which begins without the state of its parent.
     """
     import torch
 
@@ -26,20 +26,20 @@ def begin_worker(prepare: Callable[[], object] | None = None) -> None:
     parent = multiprocessing.parent_process()
     if parent is None:
         raise RuntimeError("begin_worker is for a new process, and this is the first one")
-    asker = parent.sentinel
+    parent_exit = parent.sentinel
 
-    def end_with_it() -> None:
-        multiprocessing.connection.wait([asker])
+    def end_with_parent() -> None:
+        multiprocessing.connection.wait([parent_exit])
         os._exit(1)
 
-    threading.Thread(target=end_with_it, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     if prepare is not None:
         prepare()
 
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """So many threads of torch inside the block, or inside the function that this decorates.
+    """Set the number of torch's threads inside a block, or inside a decorated function.
 
     The number of threads decides in which order sums are added, and so about their last digits.
     """
@@ -57,7 +57,7 @@ def torch_threads(count: int) -> Iterator[None]:
 def workers(
     processes: int, prepare: Callable[[], object] | None = None
 ) -> Iterator[ProcessPoolExecutor]:
-    """So many processes; what is still waiting is given up where the block is left by an error.
+    """Pool of so many worker processes; an error in the block cancels the work that waits.
 
     prepare: called once in each new process.
     """

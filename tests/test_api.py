@@ -104,7 +104,7 @@ def test_collect_and_fit_give_what_the_commands_write(tmp_path, monkeypatch):
     assert kept.equal(fitted.training_residuals.residual_mm)
 
 
-def test_a_rig_of_ones_own_is_recorded_by_the_same_function():
+def test_a_user_defined_rig_is_recorded_by_the_same_function():
     from surgisoft.errors import InputError
     from surgisoft.rig import VirtualRig
 

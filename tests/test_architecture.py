@@ -186,7 +186,7 @@ def test_an_import_that_runs_up_is_found(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.name)
-def test_the_ground_stands_on_nothing(path):
+def test_the_base_modules_import_no_part(path):
     if path.name not in ("__init__.py", "__main__.py"):
         parts = {name.split(".")[1] for name in _imports(path) if name.startswith("surgisoft.")}
         assert parts <= GROUND

@@ -62,7 +62,7 @@ def test_a_failed_folder_leaves_the_old_one_alone(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["model"]
 
 
-def test_a_replaced_folder_keeps_what_is_not_its_own(tmp_path):
+def test_a_replaced_folder_keeps_foreign_files(tmp_path):
     folder = tmp_path / "model"
     (folder / "notes").mkdir(parents=True)
     (folder / "notes" / "mine.txt").write_text("mine")
@@ -85,7 +85,7 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path):
     assert (tmp_path / "there" / "a").read_text() == "a"
 
 
-def test_json_says_null_for_what_is_not_finite(tmp_path):
+def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
     value = {"a": [1.5, math.nan], "b": (math.inf, "x"), "c": np.array([1.0, -np.inf])}
     write_json(tmp_path / "a.json", value | {"d": np.float64("nan"), "e": np.int64(3), "f": None})
     text = (tmp_path / "a.json").read_text()

@@ -44,7 +44,7 @@ def plan_of(
     arm: Path | None = None,
     preset: str = "fast",
 ) -> Plan:
-    """A training run, by default with the task's number of steps and the default arm."""
+    """Plan of a training run, by default with the task's number of steps and the default arm."""
     config = config_of(task)
     if arm is not None:
         config = with_fields(config, arm=str(arm))
@@ -53,7 +53,7 @@ def plan_of(
 
 
 def trained(folder: Path, plan: Plan, report: Progress) -> RunFolder:
-    """The run of a plan: the one in the folder, finished if it was cut off, or a new one."""
+    """The training run of a plan: that in the folder, completed if interrupted, or a new one."""
     own, device = Processes(), torch.device("cpu")
 
     def tell(p) -> None:
@@ -103,7 +103,7 @@ def played(
 
 
 def _check_same(run: RunFolder, plan: Plan) -> None:
-    """Raise where a folder holds a run of another plan."""
+    """Raise InputError where a folder holds a run of another plan."""
     came, hyper = run.config, json.loads(json.dumps(asdict(plan.preset)))
     for what, there, expected in (
         ("task", came["task"], plan.task),

@@ -24,16 +24,16 @@ from surgisoft.tasks.registry import config_of
 LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
 """Tasks that policies are trained for."""
 TASKS = (*LEARNED, "track_body", "keyhole")
-"""All tasks that are played; the last ones by the script and at random only."""
+"""All evaluated tasks; the last ones have no learned policy."""
 PLACES = ("simulation", "rig")
-"""Where they are played."""
+"""Plants of the evaluation."""
 RATE_TASK = "track_circle"
 """Task on which the rate of a preset is measured."""
 
 
 @dataclass(frozen=True)
 class ControlConfig:
-    """How large the study is."""
+    """Size of the study."""
 
     tasks: tuple[str, ...] = TASKS
     """Names of the tasks."""
@@ -46,9 +46,9 @@ class ControlConfig:
     episode_seed: int = 1000
     """Seed of the evaluated episodes; training and checkpoint selection use others."""
     rate_steps: int = 1_048_576
-    """Steps of preset `paper` by which its rate is measured; 0: it is not."""
+    """Steps of preset `paper` for measuring its rate; 0: no measurement."""
     whole_steps: int = PAPER_STEPS
-    """Steps that two processes train together on `RATE_TASK`; 0: they do not."""
+    """Steps of a training by two processes on `RATE_TASK`; 0: none."""
 
     def __post_init__(self):
         for name in self.tasks:
@@ -63,13 +63,13 @@ class Trained:
     """One training run."""
 
     task: str
-    """What was learned."""
+    """Name of the task."""
     seed: int
-    """Its seed."""
+    """Seed of the training."""
     preset: str
-    """Its preset."""
+    """Preset of the training."""
     cost: Cost
-    """Its cost."""
+    """Cost of the training."""
     best: dict[str, float]
     """Evaluation of the selected checkpoint."""
 
@@ -79,7 +79,7 @@ class Played:
     """Evaluation of one policy on one task and plant."""
 
     task: str
-    """What was played."""
+    """Name of the task."""
     place: str
     """`simulation` or `rig`."""
     driver: str
@@ -93,13 +93,13 @@ class Results:
     """All results of the benchmark."""
 
     runs: tuple[Trained, ...]
-    """Every policy's training."""
+    """All training runs."""
     played: tuple[Played, ...]
-    """Every driver in every place."""
+    """Evaluations of all policies on all plants."""
     paper: Cost | None
     """The run that measures the rate of preset `paper`."""
     whole: Cost | None = None
-    """The run of as many steps as the paper's, by two processes; its wall time is what counts."""
+    """A run with the paper's number of steps by two processes, for its wall time."""
 
 
 def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
@@ -133,7 +133,7 @@ def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
 
 
 def _learned(folder: Path, task: str, seed: int, report: Progress) -> Trained:
-    """A finished run as it is; else one that is trained with the task's own number of steps."""
+    """A finished run as it is, or one trained with the task's number of steps."""
     there = RunFolder(folder) if (folder / "config.json").is_file() else None
     if there is not None and there.config["task"] != task:
         raise InputError(f"{folder}: was trained on {there.config['task']}, expected {task}")

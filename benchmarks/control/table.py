@@ -1,4 +1,4 @@
-"""The control study as Markdown."""
+"""Tables of the benchmark `control` as Markdown."""
 
 from __future__ import annotations
 
@@ -29,23 +29,25 @@ NUMBERS = (
     "time_s",
     "failed",
 )
-"""Numbers of an evaluation that are shown where they apply, in this order."""
+"""Measures in the tables, where they apply, in this order."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """One figure that is asked for."""
+    """One goal of the project for a measure."""
 
     task: str
+    """Name of the task."""
     place: str
+    """Plant: `simulation` or `rig`."""
     number: str
-    """A number of an evaluation."""
+    """Name of the measure."""
     limit: float
     """Largest value, or least where the number is a share of success."""
     at_least: bool = False
     """Whether the limit is the least value."""
     paper: str = ""
-    """The paper's figure (Chen et al. 2025, sec. V)."""
+    """Value in the paper (Chen et al. 2025, sec. V)."""
 
 
 GOALS = (
@@ -59,11 +61,11 @@ GOALS = (
     Goal("circle_ablation", "simulation", "in_view", 0.95, at_least=True),
     Goal("circle_ablation", "simulation", "beam_error_mean_mm", 0.1),
 )
-"""What the project set out to reach, beside what the paper has."""
+"""Goals of the project, with the values of the paper."""
 
 
 def markdown(results: Results, config: ControlConfig) -> str:
-    """All tables."""
+    """All tables of the benchmark."""
     parts = [_setting(config), "## Goals", _goals(results), "## Training", _training(results)]
     if results.paper:
         parts += [f"### {PAPER_STEPS:,} steps", _paper(results, config)]
@@ -86,7 +88,7 @@ def _setting(config: ControlConfig) -> str:
 
 
 def _goals(results: Results) -> str:
-    """Each goal beside the worst seed and the script."""
+    """Table of goals with the worst seed and the scripted expert."""
     lines = [
         "| what | goal | paper | learned, each seed | scripted | random |",
         "|---|---|---|---|---|---|",
@@ -147,7 +149,7 @@ def _training(results: Results) -> str:
 
 
 def _paper(results: Results, config: ControlConfig) -> str:
-    """Time that the paper's number of steps takes, from measured rates."""
+    """Duration of the paper's number of steps, from measured rates."""
     rows = [("paper", results.paper)]
     fast = [run.cost for run in results.runs if (run.task, run.preset) == (RATE_TASK, "fast")]
     if fast:
@@ -165,10 +167,10 @@ def _paper(results: Results, config: ControlConfig) -> str:
     text = "\n".join(lines)
     if results.whole:
         whole = results.whole
-        told = " ".join(arguments(RATE_TASK, config.whole_steps, Path("RUN")))
+        options = " ".join(arguments(RATE_TASK, config.whole_steps, Path("RUN")))
         minutes = whole.wall_s * PAPER_STEPS / whole.steps / 60
         text += (
-            f"\n\nTwo processes (`torchrun {told}`) trained {whole.steps:,} steps in "
+            f"\n\nTwo processes (`torchrun {options}`) trained {whole.steps:,} steps in "
             f"{whole.wall_s:.0f} s of wall time, {minutes:.1f} minutes for {PAPER_STEPS:,}, "
             "updates and evaluations included: measured, not computed from a rate. The goal is 5 "
             f"minutes on two cores, which is {'reached' if minutes <= 5 else 'missed'}. Below, "
@@ -178,7 +180,7 @@ def _paper(results: Results, config: ControlConfig) -> str:
 
 
 def _numbers(some: list[Played]) -> str:
-    """All numbers of one task in one place, a column for each driver."""
+    """All measures of one task on one plant, one column per policy."""
     names = [n for n in NUMBERS if any(_applies(p.numbers.get(n)) for p in some)]
     lines = [
         "| | " + " | ".join(p.driver for p in some) + " |",

@@ -1,4 +1,4 @@
-"""The paper's number of steps, trained whole by two processes that torchrun starts."""
+"""A training run with the paper's number of steps by two processes under torchrun."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from surgisoft.errors import InputError
 from surgisoft.progress import Progress
 
 ENVS = 4096
-"""Episodes side by side in each process: what a small tensor operation costs is shared by many."""
+"""Parallel episodes in each process: they share the overhead of small tensor operations."""
 LOOK_S = 2.0
-"""Time between two looks at how far the processes are, s."""
+"""Time between two checks of the processes' progress, s."""
 
 
 def arguments(task: str, steps: int, folder: Path) -> list[str]:
-    """What torchrun is told: a new run, or the one in the folder gone on with."""
+    """Arguments of torchrun for a new run, or for resuming the one in the folder."""
     resumed = (folder / "config.json").is_file()
     new = ["--task", task, "--steps", str(steps), "--envs", str(ENVS), "-o", str(folder)]
     own = ["--resume", str(folder)] if resumed else new
@@ -27,7 +27,7 @@ def arguments(task: str, steps: int, folder: Path) -> list[str]:
 
 
 def trained_by_two(folder: Path, task: str, steps: int, report: Progress) -> RunFolder:
-    """The run in a folder, trained with preset `fast` by two processes where it is missing."""
+    """The run in a folder; where it is missing, two processes train it with preset `fast`."""
     if (folder / "config.json").is_file() and _checked(folder, task) and _steps(folder) >= steps:
         return RunFolder(folder)
     log = folder.with_suffix(".log")

@@ -1,7 +1,4 @@
-"""Figures of the diagnosis benchmark beyond the first answer.
-
-What the recommended experiments settled, what amending was worth, and what lies outside the list.
-"""
+"""Tables of the diagnosis benchmark on recommended experiments, amendments and unknown effects."""
 
 from collections import Counter
 
@@ -13,7 +10,7 @@ from benchmarks.diagnosis.study import Outcome
 from surgisoft.diagnosis.design.schedules import AS_IT_STANDS
 
 SHOWS = 1.1
-"""Least factor by which a hidden effect raises the error of the locked quarter to be judged by."""
+"""Least factor by which a hidden effect must raise the error of the held-out quarter."""
 
 
 def rate(hits: list[bool]) -> str:
@@ -26,21 +23,21 @@ def rate(hits: list[bool]) -> str:
 
 
 def open_cases(some: list[Outcome]) -> list[Outcome]:
-    """Called ambiguous, with the hidden effect among the rivals, and an experiment recorded."""
+    """Cases with the verdict ambiguous, the hidden effect competing, and a recorded experiment."""
     return [o for o in some if o.settled is not None and o.case.truth[0] in o.effects]
 
 
 def right_after(outcome: Outcome) -> bool:
-    """Whether the hidden effect comes first once an ambiguous case has had its experiment."""
+    """Whether the hidden effect ranks first after the experiment of an ambiguous case."""
     if outcome.settled is not None:
         return outcome.settled.first == outcome.case.truth[0]
     return outcome.ranking[:1] == outcome.case.truth
 
 
 def judged_amendments(some: list[Outcome]) -> list[Outcome]:
-    """Amended, or tried to, with a hidden effect at least as large as the surrogate's error.
+    """Cases with an attempted amendment and a hidden effect no smaller than the model discrepancy.
 
-    And that shows in the locked quarter, or nothing could fall there.
+    The effect must also raise the error of the held-out quarter, or no fall could show.
     """
     return [
         o
@@ -98,7 +95,7 @@ def _right(outcome: Outcome, settled: Settled) -> bool:
 
 
 def pooled_share(judged: list[Outcome]) -> float:
-    """Sum of the falls over the sum of the oracle's falls."""
+    """Ratio of the summed falls of the error to those of the oracle."""
     falls = [(o.amended.before - o.amended.after) for o in judged]
     best = [(o.amended.before - o.amended.oracle) for o in judged]
     return float(np.sum(falls) / np.sum(best))
@@ -116,7 +113,7 @@ def _fall(judged: list[Outcome]) -> str:
 
 
 def outside(outcomes: list[Outcome]) -> str:
-    """What was said of effects outside the list, and how well the nearest one imitates them."""
+    """Verdicts on effects outside the list, and how well the nearest known one imitates them."""
     kinds: dict[str, list[Outcome]] = {}
     for o in outcomes:
         if o.case.truth == ("unknown",):
@@ -140,7 +137,7 @@ def outside(outcomes: list[Outcome]) -> str:
 
 
 def experiments(outcomes: list[Outcome]) -> str:
-    """Every ambiguous case with its experiment."""
+    """Table of every ambiguous case with its experiment."""
     asked = [o for o in outcomes if o.settled is not None]
     if not asked:
         return ""

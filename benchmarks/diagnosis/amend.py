@@ -1,8 +1,8 @@
-"""Amendments in the diagnosis benchmark: how far the error falls beside what could be reached.
+"""Amendments in the diagnosis benchmark: fall of the error compared with an oracle.
 
-The oracle knows the effect's own form and size: the base model's error on the same robot, schedule
-and noise with nothing hidden, its network re-tuned to that where `amend` would. All errors are of
-the locked quarter, as `amend` judges.
+The oracle knows the exact form and size of the effect: the base model's error on the same robot,
+schedule and noise with nothing hidden, its network re-tuned to that where `amend` would. All errors
+are of the held-out quarter, which `amend` validates on.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ from surgisoft.surrogate.model import ArmModel
 
 @dataclass(frozen=True)
 class Amended:
-    """What amending by the diagnosed effects was worth; RMS errors on the locked quarter."""
+    """Result of amending by the diagnosed effects; RMS errors on the held-out quarter."""
 
     effects: tuple[str, ...]
-    """The effects that were put in; none where the diagnosis named none."""
+    """Effects that were added; none where the diagnosis named none."""
     before: float
-    """Of the model as it was, mm."""
+    """Error of the original model, mm."""
     after: float
-    """Of the model that `amend` leaves: the old one where no fall is claimed, mm."""
+    """Error of the model after `amend`, the original one where no fall is claimed, mm."""
     oracle: float
-    """Of the model on a robot with nothing hidden, its network re-tuned where that pays, mm."""
+    """Error of the model on a robot without hidden effects, its network re-tuned if useful, mm."""
 
     @property
     def share(self) -> float:
-        """The fall as a share of the oracle's."""
+        """Fall of the error as a share of the oracle's."""
         return (self.before - self.after) / (self.before - self.oracle)
 
 
@@ -49,6 +49,6 @@ def amended(model: ArmModel, recorded: Recorded, effects: tuple[str, ...]) -> Am
 
 
 def locked_error(model: ArmModel, recording: Recording) -> float:
-    """RMS distance of a key point on the locked quarter of a recording, mm."""
+    """RMS distance of a key point on the held-out quarter of a recording, mm."""
     problem = problem_of(model, [recording], EVERY_ROW, part="held_out")
     return float(np.sqrt(np.nanmean(np.square(problem.residual).sum(2))))

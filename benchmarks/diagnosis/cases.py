@@ -1,6 +1,6 @@
-"""The cases of the diagnosis benchmark: which robot, what is hidden in it, and how it is looked at.
+"""Cases of the diagnosis benchmark: robot, hidden effects, excitation, noise and surrogate.
 
-The hidden effects of the rig have other forms than the model's.
+The formulas of the rig's hidden effects differ on purpose from those of the model.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ KNOWN = {
     "thermal_drift": "drift",
     "twist": "twist",
 }
-"""The rig's hidden effects and the effects of the model's list that they are."""
+"""Hidden effect of the rig -> the corresponding effect of the model's list."""
 MEMORY = {"hysteresis", "rate_dependence", "line_lag", "creep", "softening", "drift"}
 """Effects that a static surrogate cannot imitate."""
 UNKNOWN = (
@@ -38,8 +38,8 @@ UNKNOWN = (
 )
 """Hidden effects that are not in the model's list."""
 LEFT_OUT = ("sensor_crosstalk",)
-"""Neither: a linear map of the pressures is the list's coupling with its gains, whatever made it,
-and no single name is right."""
+"""Hidden effects that are neither known nor unknown: a linear map of the pressures equals coupling
+with gain mismatch of the list, so no single name is right."""
 PAIRS = (
     ("creep", "payload"),
     ("line_lag", "misalignment"),
@@ -57,20 +57,20 @@ EXCITATIONS = {"poor": ("ramps", 3000), "medium": ("mixed", 6000), "rich": ("mix
 
 @dataclass(frozen=True)
 class Case:
-    """One robot and what is hidden in it."""
+    """One robot with its hidden effects, recording and surrogate."""
 
     robot: int
-    """Seed of the specimen."""
+    """Seed of the robot."""
     hidden: tuple[tuple[str, float], ...]
-    """Hidden effects and strengths."""
+    """Hidden effects and their amplitudes."""
     discrepancy_mm: float
-    """Validated error that the surrogate is bent to, mm; 0: as it was fitted."""
+    """Validated error to which the surrogate is deformed, mm; 0: as it was fitted."""
     noise: str
     """`white`, `loud` or `correlated`."""
     excitation: str
     """A name of EXCITATIONS."""
     take: int
-    """Draws schedule and noise."""
+    """Number of the trial, which determines schedule and noise."""
     undertrained: bool = False
     """Whether the surrogate was fitted for a few epochs only."""
 
@@ -100,9 +100,9 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
         pair = PAIRS[i % len(PAIRS)]
         plan.append((tuple((name, 1.2) for name in pair), False))
     plan += [((), True)] * round(shares["undertrained"] * count)
-    answer = []
+    drawn = []
     for take, (hidden, undertrained) in enumerate(plan):
-        answer.append(
+        drawn.append(
             Case(
                 robot=int(rng.choice(robots)),
                 hidden=hidden,
@@ -113,4 +113,4 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
                 undertrained=undertrained,
             )
         )
-    return answer
+    return drawn

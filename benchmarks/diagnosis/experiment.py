@@ -1,8 +1,8 @@
-"""Ambiguous cases of the diagnosis benchmark: the recommended experiment, recorded and read.
+"""Recommended experiments of ambiguous cases in the diagnosis benchmark.
 
-As a user would: `next-experiment MODEL OLD --between RIVALS`, `collect SCHEDULE`, `diagnose MODEL
-OLD NEW`. Where the experiment takes something away from the bench, NEW alone is diagnosed, for OLD
-was recorded on another bench.
+The steps are those of a user: `next-experiment MODEL OLD --between EFFECTS`, `collect SCHEDULE`,
+`diagnose MODEL OLD NEW`. Where the experiment removes something from the setup, NEW alone is
+diagnosed, because OLD was recorded on another setup.
 """
 
 from dataclasses import dataclass
@@ -20,20 +20,20 @@ from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 @dataclass(frozen=True)
 class Settled:
-    """What the recommended experiment said of an ambiguous case."""
+    """Result of the recommended experiment of an ambiguous case."""
 
     experiment: str
-    """Its name."""
+    """Name of the experiment."""
     setting: str
-    """The change of the bench."""
+    """Change of the experimental setup."""
     minutes: float
-    """Time on the bench, minutes."""
+    """Duration of the experiment, minutes."""
     expected: float
-    """Chance that it promised of naming the right one, for the worst pair."""
+    """Predicted probability of naming the right effect, for the worst pair."""
     effect: str | None
-    """The effect that is left; None where it is still open."""
+    """Effect that the new diagnosis names; None where it is still ambiguous."""
     first: str | None
-    """The effect that is left, or the first of the new ranking where it is still open."""
+    """That effect, or the first of the new ranking where it is still ambiguous."""
 
 
 def settle(
@@ -48,9 +48,9 @@ def settle(
     advice = recommend(problem_of(model, [recording]), rivals[:MOST_RIVALS], settings=settings)
     new = record_experiment(case, SETUPS[advice.setting], advice.protocol)
     some = [new] if advice.by_hand else [recording, new]
-    said = diagnose(model, some, reference=known, without=advice.removes)
-    left = effect_left(advice, said)
-    named = [row.effect for row in said.ranking]
+    diagnosis = diagnose(model, some, reference=known, without=advice.removes)
+    left = effect_left(advice, diagnosis)
+    named = [row.effect for row in diagnosis.ranking]
     return Settled(
         experiment=advice.name,
         setting=advice.setting,
@@ -68,7 +68,7 @@ def settle_both(
     recording: Recording,
     rivals: tuple[str, ...],
 ) -> tuple[Settled, Settled]:
-    """As recommended, and as recommended where nobody may touch the bench."""
+    """Results of the recommended experiment, and of one without a change of the setup."""
     free = settle(case, model, known, recording, rivals)
     if free.setting == AS_IT_STANDS:
         return free, free

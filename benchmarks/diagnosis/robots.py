@@ -1,6 +1,6 @@
-"""The robots of the diagnosis benchmark: their base models, and what is recorded of them.
+"""Robots of the diagnosis benchmark: base models and recordings.
 
-Base models are fitted once for a specimen and then bent on purpose, by a smooth change of their
+Base models are fitted once for a robot and then deformed on purpose, by a smooth change of their
 weights, to a wanted validated error.
 """
 
@@ -28,11 +28,11 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training import Data, model_rows, validated_error
 
 GRID_POINTS = 4096
-"""Settled points that a base model is fitted to."""
+"""Number of steady-state samples to which a base model is fitted."""
 
 
 def base_model(robot: int, folder: Path, undertrained: bool = False) -> ArmModel:
-    """The fitted model of a specimen, kept in a folder between uses."""
+    """Fitted model of a robot, stored in a folder between uses."""
     place = folder / f"robot-{robot}{'-undertrained' if undertrained else ''}"
     if (place / "config.json").is_file():
         return load_model(place)
@@ -50,14 +50,14 @@ def base_model(robot: int, folder: Path, undertrained: bool = False) -> ArmModel
 
 @lru_cache(maxsize=16)
 def validation_of(robot: int) -> History:
-    """The settled points that a specimen's models are validated on."""
+    """Steady-state samples on which the models of a robot are validated."""
     rig = VirtualRig(robot)
     valid, _ = rig.record(make_protocol("validation", rig.limits, None, seed=robot))
     return history_of([valid])
 
 
 def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
-    """The model with a smooth static error, so that its validated error is `wanted_mm`."""
+    """Copy of the model with a smooth static error, so that its validated error is `wanted_mm`."""
     history = validation_of(robot)
     generator = torch.Generator().manual_seed(seed)
     noise = {
@@ -65,38 +65,38 @@ def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
         for name, value in model.network.layers.state_dict().items()
         if name.endswith("weight")
     }
-    low, high, answer = 0.0, 0.5, model
+    low, high, deformed = 0.0, 0.5, model
     for _ in range(12):
         middle = 0.5 * (low + high)
-        answer = copy.deepcopy(model)
+        deformed = copy.deepcopy(model)
         with torch.no_grad():
-            for name, value in answer.network.layers.named_parameters():
+            for name, value in deformed.network.layers.named_parameters():
                 if name in noise:
                     value.add_(middle * noise[name])
-        rows = Data(history, history, None).validation_rows(answer)
-        found = validated_error(rows.target, model_rows(answer, rows))
-        answer.validation = replace(found, noise_mm=model.validation.noise_mm)
+        rows = Data(history, history, None).validation_rows(deformed)
+        found = validated_error(rows.target, model_rows(deformed, rows))
+        deformed.validation = replace(found, noise_mm=model.validation.noise_mm)
         if found.rmse_mm < wanted_mm:
             low = middle
         else:
             high = middle
-    return answer
+    return deformed
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What was recorded of a case."""
+    """Recordings of a case."""
 
     recording: Recording
-    """With what is hidden."""
+    """Recording with the hidden effects."""
     plain: Recording
-    """The same arm, schedule and noise with nothing hidden: what no bench could record."""
+    """Recording of the same arm, schedule and noise without hidden effects."""
     effect_mm: float
-    """RMS change of the key points by what is hidden, mm."""
+    """RMS change of the key points by the hidden effects, mm."""
 
 
 def record(case: Case) -> Recorded:
-    """Play a case's schedule on its robot, with and without what is hidden."""
+    """Record a case's schedule on its robot, with and without the hidden effects."""
     protocol, points = EXCITATIONS[case.excitation]
     both = []
     for hidden in dict.fromkeys([case.hidden, ()]):
@@ -110,13 +110,13 @@ def record(case: Case) -> Recorded:
 
 
 EXPERIMENT_TAKE = 500_000
-"""Added to a case's take: the noise of a later recording is another."""
+"""Added to a case's trial number, so that a later recording has other noise."""
 
 
 def record_experiment(case: Case, setting: Setup, protocol: Protocol) -> Recording:
-    """A schedule played on a case's robot after a change of the bench.
+    """Record a schedule on a case's robot after a change of the experimental setup.
 
-    Where that takes something away, the hidden effect that it takes away is switched off.
+    Where the change removes a hidden effect, that effect is switched off.
     """
     stays = [each for each in case.hidden if KNOWN.get(each[0]) not in setting.removes]
     rig = VirtualRig(
@@ -135,7 +135,7 @@ def _noise(case: Case) -> float:
 
 
 def _as_noisy(case: Case, recording: Recording) -> Recording:
-    """The recording with what a case adds to the rig's own noise."""
+    """The recording with the noise that a case adds to that of the rig."""
     if case.noise != "correlated":
         return recording
     return _with_correlated_noise(recording, case.take)

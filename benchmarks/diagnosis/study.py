@@ -1,9 +1,9 @@
-"""The benchmark of the diagnosis: many virtual robots, each with a truth that is known.
+"""Benchmark `diagnosis`: many virtual robots with known hidden effects.
 
-Robots are specimens of the virtual rig; their hidden effects have other forms than the model's.
-Every robot draws: the hidden effect (or none, one outside the list, or two), its strength, noise,
-excitation and the surrogate's own error. An ambiguous case goes on with the recommended experiment;
-of some cases the model is amended by what was named.
+The formulas of their hidden effects differ from those of the model.
+Every case draws the hidden effect (or none, one outside the list, or two), its amplitude, noise,
+excitation and the model discrepancy. An ambiguous case continues with the recommended experiment;
+in some cases the model is amended by the named effects.
 """
 
 import hashlib
@@ -29,37 +29,43 @@ from surgisoft.workers import workers
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the diagnosis said of a case."""
+    """Result of the diagnosis of a case."""
 
     case: Case
+    """The case."""
     kind: str
+    """Kind of the verdict."""
     effects: tuple[str, ...]
+    """Effects that the verdict names."""
     ranking: tuple[str, ...]
+    """Effects in the order of their rank."""
     confidence: float
+    """Confidence of the verdict."""
     effect_mm: float
-    """RMS change of the key points by what is hidden, mm."""
+    """RMS change of the key points by the hidden effects, mm."""
     discrepancy_mm: float
     """Validated error of the surrogate, mm."""
     seconds: float
     """Processor time of the diagnosis, s."""
     statistics: dict
+    """Statistics of the decision, for calibration."""
     settled: Settled | None = None
-    """What the recommended experiment said; None where the case is not ambiguous."""
+    """Result of the recommended experiment; None where the case is not ambiguous."""
     settled_untouched: Settled | None = None
-    """The same where the bench may not be changed."""
+    """Result of the experiment that is recommended without a change of the setup."""
     amended: Amended | None = None
-    """What amending by the answer was worth; None where it was not asked for."""
+    """Result of amending by the named effects; None where it was not requested."""
     case_seconds: float = 0.0
     """Processor time of the whole case, s."""
 
 
 def to_amend(some: list[Case], number: int) -> set[Case]:
-    """The first so many cases with one effect of the list; `cases` goes through them in turn."""
+    """The first so many cases with one effect of the list, all effects alternating."""
     return set([case for case in some if case.single][:number])
 
 
 def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
-    """Record, bend the surrogate, diagnose; experiment where ambiguous; amend where asked for."""
+    """Record, deform the surrogate, diagnose; experiment if ambiguous; amend if requested."""
     begin = time.process_time()
     torch.set_num_threads(1)
     model = base_model(case.robot, folder, case.undertrained)
@@ -94,7 +100,7 @@ def run_case(case: Case, folder: Path, amending: bool = False) -> Outcome:
 
 
 def _answer(kind: str, effects: tuple[str, ...], settled: Settled | None) -> tuple[str, ...]:
-    """The effects that a user would amend by, after the recommended experiment."""
+    """Effects by which a user would amend, after the recommended experiment."""
     if kind != "ambiguous":
         return effects
     return ((settled and settled.effect) or effects[0],)
@@ -107,10 +113,10 @@ def run(
     report: Progress,
     amend: int = 0,
 ) -> list[Outcome]:
-    """All outcomes; base models first, then the cases, over processes.
+    """Run all cases in parallel, base models first, and return their outcomes.
 
-    amend: cases whose model is amended too. What was said of a case is kept in the folder, so that
-    a run that was cut off goes on.
+    amend: number of cases whose model is amended, too. Outcomes are stored in the folder, so that
+    an interrupted run continues.
     """
     robots = sorted({(case.robot, case.undertrained) for case in some})
     if not robots:
@@ -124,30 +130,30 @@ def run(
         if outcome.amended is not None or case not in wanted
     }
     total, done = len(robots) + len(some), 0
-    answer = {case: known[case] for case in some if case in known}
+    by_case = {case: known[case] for case in some if case in known}
     with workers(processes) as pool:
         for future in as_completed([pool.submit(base_model, r, folder, u) for r, u in robots]):
             future.result()
             done += 1
             report(done, total, "base models")
-        done += len(answer)
+        done += len(by_case)
         jobs = [
             pool.submit(run_case, case, folder, case in wanted)
             for case in some
-            if case not in answer
+            if case not in by_case
         ]
         for future in as_completed(jobs):
             outcome = future.result()
-            answer[outcome.case] = outcome
+            by_case[outcome.case] = outcome
             done += 1
-            report(done, total, f"{len(answer)} of {len(some)} robots")
+            report(done, total, f"{len(by_case)} of {len(some)} robots")
             with log.open("a") as file:
                 file.write(json.dumps(asdict(outcome)) + "\n")
-    return [answer[case] for case in some]
+    return [by_case[case] for case in some]
 
 
 def fingerprint() -> str:
-    """What the outcomes depend on: the code of the diagnosis, the effects, the rig, the cases."""
+    """Hash of what the outcomes depend on: the code of the diagnosis, effects, rig and cases."""
     package = Path(surgisoft.__file__).parent
     folders = ("diagnosis", "surrogate", "rig", "measurement/protocols")
     files = [path for folder in folders for path in (package / folder).rglob("*.py")]
@@ -160,8 +166,8 @@ def fingerprint() -> str:
 
 
 def read_outcomes(log: Path) -> dict[Case, Outcome]:
-    """Outcomes that were kept; a line that was cut off is left out."""
-    answer = {}
+    """Stored outcomes; an incomplete last line is left out."""
+    by_case = {}
     for line in log.read_text().splitlines() if log.is_file() else []:
         try:
             values = json.loads(line)
@@ -179,5 +185,5 @@ def read_outcomes(log: Path) -> dict[Case, Outcome]:
             amended=worth and Amended(**worth | {"effects": tuple(worth["effects"])}),
             **values,
         )
-        answer[outcome.case] = outcome
-    return answer
+        by_case[outcome.case] = outcome
+    return by_case

@@ -1,4 +1,4 @@
-"""Figures of the diagnosis benchmark: each goal with what was measured, confusion, reliability."""
+"""Tables of the diagnosis benchmark: goals and results, confusion matrix, reliability diagram."""
 
 import itertools
 from collections import Counter
@@ -19,7 +19,7 @@ from benchmarks.diagnosis.cases import MEMORY
 from benchmarks.diagnosis.study import Outcome
 
 SURE = 0.95
-"""Confidence from which a statement counts as sure."""
+"""Least confidence of a statement that counts as sure."""
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Bins of the reliability diagram."""
 OTHER, UNDERTRAINED = "unknown_effect", "surrogate_undertrained"
@@ -41,12 +41,12 @@ def markdown(outcomes: list[Outcome]) -> str:
 
 
 def single(outcomes: list[Outcome]) -> list[Outcome]:
-    """One effect of the list is hidden, and the surrogate was trained."""
+    """Cases with one hidden effect of the list and a trained surrogate."""
     return [o for o in outcomes if o.case.single]
 
 
 def first_right(outcome: Outcome, among: int = 1) -> bool:
-    """Whether the hidden effect is among the first of the ranking."""
+    """Whether a hidden effect is among the first of the ranking."""
     return outcome.case.truth[0] in outcome.ranking[:among]
 
 
@@ -142,7 +142,7 @@ def _reliability(outcomes: list[Outcome]) -> str:
 
 
 def _confusion(outcomes: list[Outcome]) -> str:
-    """What was hidden (rows) and what was said: the first effect named, or the kind of verdict."""
+    """Confusion matrix: hidden effect by the first effect named, or the kind of verdict."""
     table: dict[str, Counter] = {}
     for o in outcomes:
         if len(o.case.hidden) > 1:
@@ -163,7 +163,7 @@ def _confusion(outcomes: list[Outcome]) -> str:
 
 
 def draw(outcomes: list[Outcome], folder: Path) -> Path:
-    """The reliability diagram as a picture; returns its path."""
+    """Draw the reliability diagram; returns the path of the picture."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,4 +1,4 @@
-"""Policies trained on a model, and all policies evaluated on the rig that hides an effect."""
+"""Policies trained on a model and evaluated on the rig with a hidden effect."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from surgisoft.progress import Stages
 from surgisoft.tasks.registry import with_fields
 
 TASK = "track_circle"
-"""What the policies learn."""
+"""Task of the policies."""
 SIGHTS = ("blind", "cameras")
-"""Without the cameras' key points, where the model alone says where the body is, and with them."""
+"""Without the cameras' key points, where the model alone estimates the body, and with them."""
 TRAIN, PLAY = 100, 8
-"""Lengths of a training and of a driver's episodes, by the meter."""
+"""Weights of a training and of a policy's episodes in the progress."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class PolicyEvaluation:
     """How policies are trained, and the rig on which they are evaluated."""
 
     kept: Cache
-    """Where policies and results are kept."""
+    """Folder of policies and results."""
     specimen: int
     """Seed of the virtual robot."""
     hidden: tuple[tuple[str, float], ...]
-    """Hidden effects of the rig and their strengths."""
+    """Hidden effects of the rig and their amplitudes."""
     steps: int
     """Training steps of each policy."""
     seed: int
@@ -46,9 +46,9 @@ class PolicyEvaluation:
         names: of `learned`, `scripted`, `random`.
         """
         plan = plan_of(TASK, self.seed, self.steps, arm)
-        told = _inputs(plan, arm)
+        inputs = _inputs(plan, arm)
         tell = meter.stage(TRAIN, f"{title}: policy")
-        run = trained(self.kept.place(f"policies/{TASK}", told), plan, tell)
+        run = trained(self.kept.place(f"policies/{TASK}", inputs), plan, tell)
         found = {}
         for sight in SIGHTS:
             rig = RigConfig(self.specimen, self.hidden, cameras=sight == "cameras")
@@ -56,14 +56,16 @@ class PolicyEvaluation:
                 driver = str(run.path) if name == "learned" else name
                 tell = meter.stage(PLAY, f"{title}: {name} on the rig, {sight}")
                 found[f"{name}/{sight}"] = self._played(
-                    f"{title.split(',')[0]}-{name}", driver, told, arm, rig, tell
+                    f"{title.split(',')[0]}-{name}", driver, inputs, arm, rig, tell
                 )
         return found, asdict(cost(run))
 
-    def _played(self, name: str, driver: str, told: dict, arm: Path, rig: RigConfig, tell) -> dict:
+    def _played(
+        self, name: str, driver: str, inputs: dict, arm: Path, rig: RigConfig, tell
+    ) -> dict:
         """Summary of the mean error of each episode on the rig, mm."""
         about = {
-            "plan": told,
+            "plan": inputs,
             "learned": driver not in ("scripted", "random"),
             "rig": to_table(rig),
             "episodes": self.episodes,

@@ -1,4 +1,4 @@
-"""Models judged by how fast the actuation changes: does the arm trail them, or run ahead?"""
+"""Errors of models by the rate of actuation: whether the arm trails them or runs ahead."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def by_rate(models: dict[str, Path], recording: Recording) -> list[dict]:
     problem = problem_of(load_model(first), [recording], EVERY_ROW, part="all")
     rows = problem.index.numpy()
     left = {key: problem.with_model(load_model(folder)).residual for key, folder in models.items()}
-    answer = []
+    rates = []
     for low, high in itertools.pairwise(BANDS):
         inside = (rate[rows] >= low) & (rate[rows] < high)
         band = {"low": low, "high": high, "rows": int(inside.sum())}
@@ -38,8 +38,8 @@ def by_rate(models: dict[str, Path], recording: Recording) -> list[dict]:
                 "rmse_mm": float(np.sqrt(np.nanmean(np.square(residual[inside]).sum(2)))),
                 "trails_s": trails_s(residual[inside], velocity[rows][inside]),
             }
-        answer.append(band)
-    return answer
+        rates.append(band)
+    return rates
 
 
 def trails_s(residual: np.ndarray, velocity: np.ndarray) -> float:

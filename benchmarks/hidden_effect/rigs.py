@@ -1,4 +1,4 @@
-"""A rig with something hidden in it, and the recordings that are made on it, kept in a folder."""
+"""A rig with a hidden effect, and the recordings made on it, stored in a folder."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ LOOP_S, RUN_S = 20.0, 120.0
 
 
 def circles(samples: int, limits: np.ndarray, seed: int) -> Protocol:
-    """Chambers pushed one after the other, so that the tip goes round in LOOP_S.
+    """Protocol that actuates the chambers in turn, so that the tip goes round in LOOP_S.
 
-    Runs of RUN_S, `samples` at 20 Hz in all; each has its own mean, size and sense of rotation.
+    Runs of RUN_S, `samples` at 20 Hz in all; each has its mean, size and sense of rotation.
     limits: (m, 2) [kPa].
     """
     rng = np.random.default_rng([seed, 20])
@@ -50,38 +50,38 @@ def circles(samples: int, limits: np.ndarray, seed: int) -> Protocol:
 
 @dataclass(frozen=True)
 class Bench:
-    """One arm with what is hidden in it."""
+    """One robot with its hidden effects."""
 
     kept: Cache
-    """Where recordings are kept."""
+    """Folder of the recordings."""
     specimen: int
-    """Seed of the arm's casting."""
+    """Seed of the robot."""
     hidden: tuple[tuple[str, float], ...]
-    """Hidden effects and their strengths."""
+    """Hidden effects and their amplitudes."""
     samples: int
     """Samples of a `mixed` recording, at 20 Hz."""
 
     @property
     def about(self) -> dict:
-        """What a result of this bench depends on."""
+        """Inputs that determine a result on this rig, for the cache."""
         hidden = [list(pair) for pair in self.hidden]
         return {"specimen": self.specimen, "hidden": hidden, "samples": self.samples}
 
     def mixed(self, take: int, report: Progress = _silent) -> Recording:
-        """A recording of the `mixed` protocol; another take draws another schedule and noise."""
+        """A recording of the `mixed` protocol; another trial has another schedule and noise."""
         limits = VirtualRig(self.specimen).limits
         protocol = make_protocol("mixed", limits, self.samples, seed=take)
         return self.record(protocol, take, report=report)
 
     def circles(self, take: int, report: Progress = _silent) -> Recording:
-        """A recording of slow rounds of the tip, as the tracking tasks ask for them."""
+        """A recording of slow circles of the tip, at the pace of the tracking tasks."""
         limits = VirtualRig(self.specimen).limits
         return self.record(circles(self.samples, limits, take), take, report=report)
 
     def record(
         self, protocol: Protocol, take: int, setting: str = AS_IT_STANDS, report: Progress = _silent
     ) -> Recording:
-        """A recording of a protocol on the bench as it stands, or after a change of it."""
+        """A recording of a protocol with the present setup, or after a change of it."""
         about = {**self.about, "take": take, "setting": setting, "protocol": protocol.name}
         about["commands"] = protocol.commands.tolist()
         file = Path(f"{self.kept.place(f'recordings/{protocol.name}', about)}.parquet")

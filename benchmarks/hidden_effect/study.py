@@ -1,10 +1,10 @@
-"""The loop closed: a rig that hides an effect, a diagnosis, a better model, a better policy.
+"""Benchmark `hidden-effect`: diagnosis, amended model and retrained policy on a rig.
 
-For every effect: (1) a policy is trained on the model without it and played on the rig that has it;
-(2) the model is compared with recordings of that rig, diagnosed, asked for a further experiment
-where two effects cannot be told apart, and amended by what the diagnosis names, right or wrong;
-(3) a policy is trained anew on the amended model and played on the same rig. Beside it stands an
-oracle that was told the effect's name, and a recording of its own judges all models.
+For every effect: (1) a policy is trained on the model without it and evaluated on the rig with it;
+(2) the model is compared with recordings of that rig and diagnosed, with a further experiment where
+two effects cannot be distinguished, and amended by the named effects, right or wrong; (3) a policy
+is trained on the amended model and evaluated on the same rig. The comparison includes an oracle
+that is given the effect's name. A separate recording validates all models.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.fit import FitConfig, fit
 
 DEFAULT_SPECIMEN = 0
-"""The specimen that the default arm model was fitted on."""
+"""Seed of the robot that the default arm model was fitted to."""
 ORACLE_TAKES = 3
-"""Recordings that the oracle is fitted on; the diagnosis has one."""
+"""Number of recordings for the oracle; the diagnosis has one."""
 TAKE, JUDGING_TAKE, FURTHER_TAKE, PACED_TAKE = 1, 9, 20, 33
-"""Numbers of the recordings: diagnosed, judging, next experiment, circles at the task's pace."""
+"""Trial numbers of the recordings: diagnosis, validation, next experiment, circles."""
 MODELS = ("before", "after", "oracle")
-"""The model without the effect, the one amended by the diagnosis, the one told the name."""
+"""The model without the effect, the one amended by the diagnosis, and the oracle."""
 LASTING = ("learned", "scripted")
-"""PolicyEvaluation that know the arm by a model."""
+"""Policies that are trained on, or use, an arm model."""
 STAGES = 3 * 15 + 3 * TRAIN + 14 * PLAY
-"""Length of one effect, by the meter."""
+"""Weight of one effect in the progress."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Case:
     """One effect that a model lacks."""
 
     effect: str
-    """Its name in the model's list."""
+    """Name of the effect in the model's list."""
     hidden: bool
     """Whether it is switched on in the rig after the model was fitted; else the arm has it anyway
     and the model is one that leaves it out."""
@@ -70,22 +70,22 @@ start."""
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """How large the study is."""
+    """Size of the study."""
 
     specimen: int = DEFAULT_SPECIMEN
-    """Seed of the arm's casting."""
+    """Seed of the robot."""
     strength: float = 1.0
-    """Strength of the hidden effects; 1 moves the tip by about 1 mm."""
+    """Amplitude of the hidden effects; 1 moves the tip by about 1 mm."""
     steps: int = 1_000_000
     """Training steps of each policy."""
     seed: int = 0
     """Seed of the training and of the episodes."""
     episodes: int = 10
-    """Episodes of each driver on the rig."""
+    """Episodes of each policy on the rig."""
     samples: int = 12000
     """Samples of a recording, at 20 Hz."""
     grid_points: int = 13824
-    """Settled points that a model is fitted to, where one has to be."""
+    """Number of steady-state samples for fitting a model, where that is needed."""
 
     def __post_init__(self):
         if not 0.0 < self.strength <= 10.0:
@@ -94,28 +94,28 @@ class StudyConfig:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one effect; errors in mm."""
+    """Results for one effect; errors in mm."""
 
     case: str
-    """Its name."""
+    """Name of the effect."""
     verdicts: tuple[dict, ...]
-    """What `diagnose --json` says; a second one where an experiment was asked for."""
+    """Output of `diagnose --json`; a second one after a further experiment."""
     experiment: dict | None
-    """That experiment, as `next-experiment --json` tells it."""
+    """Output of `next-experiment --json` for the further experiment."""
     amended: tuple[str, ...]
-    """The effects that were put in; none where no fall was claimed."""
+    """Effects that were added; none where no fall was claimed."""
     parameters: tuple[dict, ...]
-    """Their parameters."""
+    """Parameters of those effects."""
     claim: str
-    """What `amend` said."""
+    """Sentence of `amend`."""
     model_mm: dict[str, float]
-    """RMS distance of a key point on the judging recording: before, after, oracle, floor."""
+    """RMS distance of a key point on the validation recording: before, after, oracle, floor."""
     falls: dict[str, dict]
     """after, oracle -> `Fall` from before."""
     rates: tuple[dict, ...]
     """The models by the rate of the actuation, see `by_rate`."""
     paced: dict | None
-    """Where drivers got worse: the same amended on circles at the task's pace instead."""
+    """Where policies got worse: the results of amending on circles at the task's pace instead."""
     driven: dict[str, dict]
     """MODEL/DRIVER/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
     training: dict[str, dict]
@@ -123,13 +123,13 @@ class Outcome:
 
 
 class Study:
-    """One specimen; models, recordings, policies and results are kept in a folder."""
+    """The study of one robot; a folder stores models, recordings, policies and results."""
 
     def __init__(self, config: StudyConfig, folder: Path):
         self.config, self.kept = config, Cache(folder)
 
     def run(self, name: str, meter: Stages) -> Outcome:
-        """All of one effect, or what of it was left to do."""
+        """Results of one effect; computes what the folder lacks."""
         case, config = CASES[name], self.config
         hidden = ((case.effect, config.strength),) if case.hidden else ()
         before = self.base(case.hidden, meter.stage(15, f"{name}: base model"))
@@ -168,7 +168,7 @@ class Study:
         )
 
     def base(self, memory: bool, report: Progress) -> Path:
-        """A model of the specimen as it was cast: with its hysteresis, or from pressure alone."""
+        """A model of the robot without hidden effects: with hysteresis, or from pressure alone."""
         config = self.config
         about = {"specimen": config.specimen, "memory": memory, "points": config.grid_points}
         name = "models/base" if memory else "models/pressure-only"
@@ -241,15 +241,15 @@ class Study:
                 save_model(result.model, folder, result.to_json(), force=True)
             return result.to_json()
 
-        told = self.kept.values(f"amendments/{name}", about, make)
+        amended = self.kept.values(f"amendments/{name}", about, make)
         return {
-            "model": folder if told["claimed"] else None,
-            "parameters": told["parameters"],
-            "claim": told["sentence"],
+            "model": folder if amended["claimed"] else None,
+            "parameters": amended["parameters"],
+            "claim": amended["sentence"],
         }
 
     def _oracle(self, case: Case, before: Path, bench: Bench, report: Progress) -> Path:
-        """A model that was told the effect's name: amended on more data, or fitted with it."""
+        """A model that is given the effect's name: amended on more data, or fitted with it."""
         if not case.hidden:
             return self.base(True, report)
         about = {"model": model_digest(before), "told": case.effect, **bench.about}
@@ -298,7 +298,7 @@ class Study:
     def _paced(
         self, name: str, before: Path, effects, bench: Bench, drivers: PolicyEvaluation, meter
     ):
-        """The same effects amended on circles at the task's own pace, where that is called for."""
+        """Results of amending by the same effects on circles at the task's pace, where needed."""
         about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
         folder = self.kept.place(f"models/{name}-paced", about)
         seen = bench.circles(PACED_TAKE)
@@ -313,25 +313,25 @@ class Study:
                 "mixed_mm": fall_of(first, first.with_model(result.model)).after
             }
 
-        told = self.kept.values(f"amendments/{name}-paced", about, make)
+        amended = self.kept.values(f"amendments/{name}-paced", about, make)
         beside = Stages(lambda done, total, note: meter.stage(0, note), 1.0)
         found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
         return {
-            "claim": told["sentence"],
-            "parameters": told["parameters"],
-            "mixed_mm": told["mixed_mm"],
+            "claim": amended["sentence"],
+            "parameters": amended["parameters"],
+            "mixed_mm": amended["mixed_mm"],
             "driven": found,
         }
 
 
 def worse(driven: dict[str, dict]) -> bool:
-    """Whether the script does worse with the amended model, beyond chance, without cameras."""
+    """Whether the scripted expert is significantly worse on the amended model, cameras off."""
     before, after = (driven[f"{key}/scripted/blind"] for key in ("before", "after"))
     return after["low"] > before["high"]
 
 
 def run(names: list[str], config: StudyConfig, folder: Path, report: Progress) -> list[Outcome]:
-    """The named effects one after the other; what the folder holds is not done again."""
+    """Run the named effects one after the other; existing results in the folder are reused."""
     for name in names:
         if name not in CASES:
             raise unknown_name("effect of this study", name, CASES)

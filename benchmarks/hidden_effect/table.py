@@ -1,4 +1,4 @@
-"""The loop closed, as tables and pictures."""
+"""Tables and pictures of the benchmark `hidden-effect`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ FORMS = {
 }
 """What is known of the two forms of an effect, the rig's and the model's."""
 COLOURS = {"before": RED, "after": GREEN, "oracle": BLUE}
-"""Of the three models, in every picture."""
+"""Colours of the three models, in every picture."""
 WORDS = {
     "blind": "without the cameras (`--no-cameras`): the model alone says where the body is",
     "cameras": "with the cameras: key points are measured and filtered",
 }
-"""What each sight means."""
+"""Meaning of each kind of sight."""
 
 
 def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
@@ -86,8 +86,8 @@ def _verdict(said: dict) -> str:
 
 
 def _said(outcomes: list[Outcome]) -> list[str]:
-    """What was said of each effect, in words."""
-    answer = []
+    """Verdict on each effect, in words."""
+    paragraphs = []
     for o in outcomes:
         lines = [f"**{o.case}**"]
         lines += [f"- diagnose: {said['verdict']['sentence']}" for said in o.verdicts[:1]]
@@ -107,12 +107,12 @@ def _said(outcomes: list[Outcome]) -> list[str]:
             unit = f" {p['unit']}" if p["unit"] else ""
             value = values_text(p["value"])
             lines.append(f"- {p['effect']} {p['name']}: {value}{unit} ({low} to {high})")
-        answer.append("\n".join([lines[0], "", *lines[1:]]))
-    return answer
+        paragraphs.append("\n".join([lines[0], "", *lines[1:]]))
+    return paragraphs
 
 
 def _driven(outcomes: list[Outcome], sight: str) -> str:
-    """Tracking errors of all drivers."""
+    """Tracking errors of all policies."""
     lines = [
         "| hidden | policy before | policy after | policy, oracle "
         "| scripted before | scripted after | scripted, oracle | random |",
@@ -155,8 +155,8 @@ def _brought(outcomes: list[Outcome]) -> list[str]:
 
 
 def _why(outcomes: list[Outcome]) -> list[str]:
-    """Where a driver got worse: whether the arm trails the models, by the rate of actuation."""
-    answer = []
+    """Where a policy got worse: whether the arm trails the models, by the rate of actuation."""
+    paragraphs = []
     for o in outcomes:
         if o.paced is None:
             continue
@@ -173,9 +173,9 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             ]
             span = f"{band['low']:g} to {band['high']:g}"
             lines.append(f"| {span} | {band['rows']} | " + " | ".join(cells) + " |")
-        answer.append("\n".join(lines))
+        paragraphs.append("\n".join(lines))
         if o.case in FORMS:
-            answer.append(FORMS[o.case])
+            paragraphs.append(FORMS[o.case])
         found = o.paced["driven"]
         cells = [
             f"{driver} {_interval(found[f'{driver}/{sight}'])} mm {word}"
@@ -187,13 +187,13 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             f"{p['name']} {values_text(p['value'])} {p['unit']}".strip()
             for p in o.paced["parameters"]
         )
-        answer.append(
+        paragraphs.append(
             "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
             f"slow circles instead: {o.paced['claim']} ({values}). On the mixed judging recording, "
             f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
             f"on it and script, on the rig: {'; '.join(cells)}."
         )
-    return answer
+    return paragraphs
 
 
 def _costs(outcomes: list[Outcome]) -> str:
@@ -207,7 +207,7 @@ def _costs(outcomes: list[Outcome]) -> str:
 
 
 def draw(outcomes: list[Outcome], folder: Path) -> list[Path]:
-    """Error bars of the models and of the policies as pictures; returns their paths."""
+    """Draw error bars of models and policies; returns the paths of the pictures."""
     folder.mkdir(parents=True, exist_ok=True)
     tracking = {
         sight: {key: [o.driven[f"{key}/learned/{sight}"] for o in outcomes] for key in MODELS}

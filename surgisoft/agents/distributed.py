@@ -59,9 +59,9 @@ class Processes:
         """What each process has, in the leader; None in the others."""
         if self.count == 1:
             return [value]
-        answer = [None] * self.count if self.leads else None
-        dist.gather_object(value, answer, dst=0)
-        return answer
+        gathered = [None] * self.count if self.leads else None
+        dist.gather_object(value, gathered, dst=0)
+        return gathered
 
     def wait(self) -> None:
         """Until every process has come here."""
@@ -76,12 +76,12 @@ def _device() -> torch.device:
 
 @contextlib.contextmanager
 def processes(device: str) -> Iterator[tuple[Processes, torch.device]]:
-    """This process among those that torchrun started, and its device."""
+    """Rank and device of this process among those that torchrun started."""
     if device.split(":")[0] not in ("cpu", "cuda"):
         raise InputError(f"--device '{device}': expected cpu or cuda")
     kind = torch.device(device)
     if kind.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"--device '{device}': PyTorch sees no GPU here; use --device cpu")
+        raise InputError(f"--device '{device}': PyTorch finds no GPU; use --device cpu")
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
         yield Processes(), kind

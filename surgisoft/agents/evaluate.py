@@ -31,7 +31,7 @@ SUMMARIES: dict[str, Callable[[Rollout, str], Tensor]] = {
     "collided": Rollout.largest,
     "clearance_mm": Rollout.smallest,
 }
-"""Measure -> number that stands for an episode; errors have four numbers, others the mean."""
+"""Measure -> how an episode is summarised; errors have four summaries, others the mean."""
 RATES = ("success", "collided", "failed")
 """Numbers of an episode that are 0 or 1: their mean is a rate."""
 
@@ -45,7 +45,7 @@ class Summary:
     low: float
     """Lower end of the 95 % interval of the mean."""
     high: float
-    """Upper end."""
+    """Upper end of the 95 % interval of the mean."""
     least: float
     """Smallest of all episodes."""
     most: float
@@ -63,20 +63,20 @@ class Evaluation:
     per_episode: dict[str, np.ndarray]
     """name with unit -> (N,); nan where it does not apply."""
     overall: dict[str, Summary]
-    """The same names."""
+    """name with unit -> summary over the N episodes."""
     checks: list[EpisodeCheck] | None
     """Exact collision checks of each episode; None where there were none."""
 
     def to_json(self) -> dict:
         """Numbers and lists for JSON; what does not apply is null."""
-        answer = {
+        document = {
             "overall": {name: json_safe(asdict(value)) for name, value in self.overall.items()},
             "per_episode": {
                 name: json_safe(value.tolist()) for name, value in self.per_episode.items()
             },
         }
         if self.checks is not None:
-            answer["referee"] = {
+            document["referee"] = {
                 "instants": sum(v.steps for v in self.checks),
                 "contact_differs": sum(v.contact_differs for v in self.checks),
                 "beam_differs": sum(v.beam_differs for v in self.checks),
@@ -84,7 +84,7 @@ class Evaluation:
                 "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.checks)),
                 "contacts": [_contact(v) for v in self.checks],
             }
-        return answer
+        return document
 
 
 def evaluate(

@@ -1,4 +1,4 @@
-"""Exact collision checks (FCL) of evaluated episodes, beside the batched geometry of the world.
+"""Exact collision checks (FCL) of evaluated episodes, to verify the batched geometry.
 
 Contact and the beam's end are computed exactly (`scene.collision`) at every step. Exact distances
 cost forty times as much, so they are computed only at those steps of each episode at which the
@@ -28,7 +28,7 @@ class Contact:
     """The first overlap that the exact checker found in an episode."""
 
     time_s: float
-    """When, s."""
+    """Time of the contact, s."""
     between: tuple[str, str]
     """The arm, and the body or arm that it met; twice the same for contact with itself."""
 
@@ -40,17 +40,18 @@ class EpisodeCheck:
     contact: Contact | None
     """The first overlap; None: nothing touched anything."""
     clearance_mm: float
-    """Least signed clearance to bodies and between arms, mm; nan where nothing is around."""
+    """Least signed clearance to bodies and between arms, mm; nan where there are none."""
     steps: int
     """Instants checked, the start among them."""
     contact_differs: int
-    """Instants at which only one of the two finds an overlap."""
+    """Instants at which only one of the two engines finds an overlap."""
     clearance_off_mm: float
     """Largest difference of clearances at the instants with exact ones, mm."""
     beam_differs: int
-    """Instants at which the beam hits another kind of thing (organ, arm, nothing) in each."""
+    """Instants at which the engines differ in what the beam hits (organ, arm, nothing)."""
     beam_off_mm: float
-    """Largest distance between both ends of the beam where it hits the same kind of thing, mm."""
+    """Largest distance between both ends of the beam where the engines agree in what it hits, mm.
+    """
 
 
 @dataclass
@@ -58,18 +59,20 @@ class _Notes:
     """Intermediate results of one episode while it runs."""
 
     contact: Contact | None = None
+    """See `EpisodeCheck`, as for the next four fields."""
     steps: int = 0
     contact_differs: int = 0
     beam_differs: int = 0
     beam_off_mm: float = 0.0
     closest: list[tuple[float, int, dict[str, ArmShape]]] = field(default_factory=list)
+    """(clearance in mm, step, arms) at the steps of least clearance by the batched geometry."""
 
 
 class ExactChecks:
     """Checks every instant of a rollout of a task in a scene; given as `rollout(watch=...)`."""
 
     def __init__(self, task: Task):
-        """task: one whose world has obstacles, see `has_obstacles`."""
+        """task: a task whose world has obstacles, see `has_obstacles`."""
         around = task.world.scene
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.checker = CollisionChecker(around.geometry.bodies)
@@ -84,7 +87,7 @@ class ExactChecks:
                 self._look(notes, now.state, row)
 
     def checks(self) -> list[EpisodeCheck]:
-        """One for each episode, in order; computes the exact clearances."""
+        """Result of each episode, in order; computes the exact clearances."""
         return [self._check(notes) for _, notes in sorted(self._notes.items())]
 
     def _look(self, notes: _Notes, state: TaskState, row: int) -> None:

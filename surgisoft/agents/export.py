@@ -20,7 +20,7 @@ from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
 
 TOLERANCE = 1e-5
-"""Largest difference of an exported policy's actions from the policy's own, kPa."""
+"""Largest accepted difference between actions of exported and original policy, kPa."""
 
 
 def export(policy: LearnedPolicy, folder: Path) -> list[Path]:

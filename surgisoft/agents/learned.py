@@ -1,4 +1,4 @@
-"""Trained policies: from a run's folder alone, or while they are being trained."""
+"""Trained policies, opened from a run's folder or taken from a running training."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class LearnedPolicy(ActorPolicy):
     """The policies in a training run's folder."""
 
     def __init__(self, folder: str | Path, task: Task | None = None, which: str | None = None):
-        """which: checkpoint `best` (by evaluation) or `last`; None: `best` if there is one yet.
+        """Open a checkpoint: which is `best` (by evaluation) or `last`; None: `best` if there is
+        one.
 
         task: where the policies will act; it must have the agents, observations and actions of the
         task that they were trained on.

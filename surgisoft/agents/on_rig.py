@@ -1,4 +1,4 @@
-"""Tasks with virtual rigs as the plants: every arm of every episode is a rig of its own.
+"""Tasks with virtual rigs as plants: every arm of every episode is a separate rig.
 
 Commands go to the rig's pumps, pressures and key points come from its sensors and cameras; goals,
 scene and scores of the task stay as they are. The true body, the beam and the errors are those of
@@ -32,24 +32,24 @@ from surgisoft.tasks.world.random_streams import Stream
 
 @dataclass(frozen=True)
 class RigConfig:
-    """Which virtual rig takes the place of each arm, and how its measurements are filtered."""
+    """Which virtual rig replaces each arm, and how its measurements are filtered."""
 
     seed: int = 0
     """Seed of the virtual robot; the default arm model was fitted to robot 0."""
     hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects by name and strength."""
+    """Hidden effects: (name, amplitude)."""
     noise: float = 1.0
     """Factor on all sensor and camera noise."""
     cameras: bool = True
     """Whether cameras measure the key points; else the model alone estimates them."""
     observer_gain: float = 0.3
-    """Share of the innovation (cameras minus estimate) that a step takes over, 0..1: the alpha of
-    an alpha-beta filter."""
+    """Share of the innovation (cameras minus estimate) that the estimate adopts in a step, 0..1:
+    the alpha of an alpha-beta filter."""
     drift_gain: float = 0.01
     """Share of the innovation that is added to the disturbance's rate, 0..1: the filter's beta."""
     pump_gain: float = 0.3
-    """Share of the difference between measured and expected pressure that a step takes over into
-    the estimated offset of the pumps, 0..1."""
+    """Share of the difference between measured and expected pressure that the estimated offset of
+    the pumps adopts in a step, 0..1."""
     settle_s: float = 4.0
     """Time at each pressure of the random history before an episode, s."""
 
@@ -99,11 +99,11 @@ class Reading:
 
 
 class RigArm:
-    """An arm of the world whose plant is a batch of rigs; see `Arm` for its attributes and methods.
+    """An arm of the world whose plant is a batch of virtual rigs; see the interface `Arm`.
 
     Predictions (`predict`, `settled`) and the range by which observations are scaled (`low`,
-    `high`) are those of the simulated arm, on which policies were trained; commands are held within
-    the rig's limits besides (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
+    `high`) are those of the simulated arm, on which policies were trained; commands are also held
+    within the rig's limits (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
     """
 
     def __init__(
@@ -138,8 +138,8 @@ class RigArm:
         trials = zip(stream.key.tolist(), stream.count.tolist(), strict=True)
         rigs = ObjectBatch(tuple(self._fresh(key, count) for key, count in trials))
         salt = zlib.crc32(f"history {self.name}".encode())
-        own = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
-        _, share = own.uniform(0.0, 1.0, self.vary.history, self.chambers)
+        salted = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
+        _, share = salted.uniform(0.0, 1.0, self.vary.history, self.chambers)
         stream, part = self.simulated.start(stream)
         first = torch.minimum(torch.maximum(part.pressure, self.lowest), self.highest)
         passed = (self.lowest + (self.highest - self.lowest) * share).unbind(1)
@@ -178,7 +178,7 @@ class RigArm:
         return self.simulated.predict(part, pressure, dt_s)
 
     def settled(self, pressure: Tensor) -> Tensor:
-        """The model's steady-state key points, see `Arm.settled`."""
+        """Steady-state key points of the arm model, see `Arm.settled`."""
         return self.simulated.settled(pressure)
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:

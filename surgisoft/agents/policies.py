@@ -1,4 +1,4 @@
-"""Policies: whatever chooses the actions of all agents of a task, and the untrained ones."""
+"""The interface of a policy, which chooses the actions of all agents, and untrained policies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Policy(Protocol):
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Actions: agent -> (B, m) changes of pressure, kPa; observations: agent -> (B, D)."""
+        """Actions, agent -> (B, m) changes of pressure, kPa; observations: agent -> (B, D)."""
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,19 @@ class Scripted:
 
 @dataclass(frozen=True)
 class Random:
-    """Changes of pressure drawn evenly from all that the pumps allow: the lower baseline."""
+    """Uniform random changes of pressure within the limits of the pumps: the lower baseline."""
 
     seed: int = 0
-    """Seed of the actions; the episodes have their own."""
+    """Seed of the actions, independent of that of the episodes."""
 
     def act(
         self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
         """Actions drawn from an episode's random number stream, its step and the seed."""
-        world, own = state.world, streams(self.seed, 1, device=state.world.steps.device)
+        world, seeded = state.world, streams(self.seed, 1, device=state.world.steps.device)
         arms = [task.world.arms[agent] for agent in task.agents]
         each = sum(arm.chambers for arm in arms)
-        _, draw = Stream(world.stream.key ^ own.key, world.steps * each).uniform(-1.0, 1.0, each)
+        _, draw = Stream(world.stream.key ^ seeded.key, world.steps * each).uniform(-1.0, 1.0, each)
         parts = draw.split([arm.chambers for arm in arms], 1)
         return {
             agent: arm.pneumatics.step_kPa * part
@@ -76,7 +76,7 @@ def open_policy(name: str, task: Task) -> Policy:
 
 
 def check_policy(name: str) -> None:
-    """Raise an InputError unless that is a policy's name or a path that exists."""
+    """Raise InputError unless the name is that of a policy or a path that exists."""
     if name in POLICIES or Path(name).exists():
         return
     if Path(name).name == name:

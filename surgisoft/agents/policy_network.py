@@ -40,9 +40,10 @@ class ScaledActor(nn.Module):
     """An actor with action scaling: (B, D) observations to (B, m) changes of pressure, kPa."""
 
     def __init__(self, actor: MLPModel, action_kPa: float, step_kPa: float):
-        """action_kPa: change for an output of 1; step_kPa: largest change that the pumps accept."""
+        """Scale an actor: action_kPa per output of 1, clipped to the pumps' limit step_kPa."""
         super().__init__()
         self.network, self.scale, self.limit = actor.as_jit(), action_kPa, step_kPa
 
     def forward(self, observation: Tensor) -> Tensor:
+        """Actions (B, m) kPa, within the limits of the pumps, from observations (B, D)."""
         return (self.scale * self.network(observation)).clamp(-self.limit, self.limit)

@@ -1,6 +1,6 @@
 """Independent PPO with centralised critics: one rsl-rl PPO for each agent of a shared world.
 
-Centralised training with decentralised execution (CTDE): an actor sees its own agent's observation,
+Centralised training with decentralised execution (CTDE): an actor sees its agent's observation,
 its critic the observations of all agents (`vec_env.STATE`), a privileged input that only training
 needs. Agents share neither networks nor rewards (independent learners; De Witt et al. 2020, IPPO;
 with the joint observation in the critic as in MAPPO, Yu et al. 2022).
@@ -62,8 +62,8 @@ def groups_of(agent: str, agents: Collection[str]) -> tuple[str, ...]:
 
 
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
-    """Agent -> its PPO: an actor of its own, a critic that sees the joint state."""
-    seen, answer, device = env.get_observations().clone(), {}, env.task.world.device
+    """One PPO for each agent: an actor on its observation, a critic on the joint state."""
+    seen, by_agent, device = env.get_observations().clone(), {}, env.task.world.device
     for agent in env.task.agents:
         view = SimpleNamespace(
             num_envs=env.num_envs, num_actions=env.task.world.arms[agent].chambers
@@ -80,8 +80,8 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
             # One call for all weights instead of a dozen small ones for each.
             group["fused"] = True
         ppo.train_mode()
-        answer[agent] = ppo
-    return answer
+        by_agent[agent] = ppo
+    return by_agent
 
 
 def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:

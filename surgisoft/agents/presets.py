@@ -39,10 +39,10 @@ class Preset:
     activation: str = "tanh"
     """Activation of the hidden layers, by rsl-rl's name."""
     normalise: bool = False
-    """Whether observations are normalised by their running mean and deviation. The tasks' own are
-    of the order of 1, and a moving normaliser changes the policy between two updates."""
+    """Whether observations are normalised by their running mean and deviation. Those of the tasks
+    are of the order of 1, and a moving normaliser changes the policy between two updates."""
     action_kPa: float = 1.0
-    """Change of pressure for an output of 1, kPa; the pumps' own limit holds besides."""
+    """Change of pressure for an output of 1, kPa; it is also clipped to the limit of the pumps."""
     noise: float = 0.5
     """First standard deviation of the actions, in outputs."""
     last_noise: float | None = 0.005
@@ -96,15 +96,15 @@ def preset_for(name: str, task: str, **changes) -> Preset:
     """
     if name not in PRESETS:
         raise unknown_name("preset", name, PRESETS)
-    own = spec_of(task).preset if name == "fast" else {}
+    of_task = spec_of(task).preset if name == "fast" else {}
     given = {key: value for key, value in changes.items() if value is not None}
-    return replace(PRESETS[name], **{**own, **given})
+    return replace(PRESETS[name], **{**of_task, **given})
 
 
 def steps_for(name: str, task: str) -> int:
     """Default number of steps that a preset trains a task."""
-    own = spec_of(task).training_steps if name == "fast" else None
-    return PAPER_STEPS if own is None else own
+    steps = spec_of(task).training_steps if name == "fast" else None
+    return PAPER_STEPS if steps is None else steps
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,11 @@ class Plan:
     task: str
     """Name of the task."""
     task_config: Any
-    """The task's own configuration."""
+    """Configuration of the task."""
     preset_name: str
     """Preset that the hyper-parameters come from."""
     preset: Preset
-    """Hyper-parameters."""
+    """Hyper-parameters of networks, rollouts and updates."""
     steps: int | None
     """Steps to train, over all episodes; None: until the time is out."""
     minutes: float | None = None

@@ -27,7 +27,7 @@ HOW = (
 def evaluation_page(
     task: str, on: str, results: Sequence[Evaluation], logs: Mapping[str, EpisodeLog], about: str
 ) -> Page:
-    """logs: policy -> its first episode."""
+    """HTML page of an evaluation; logs: policy -> its first episode."""
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
         (name, *(cell(result.overall.get(name), name in RATES) for result in results))

@@ -1,4 +1,4 @@
-"""Rollouts: whole episodes of a policy, many at once, with the task's measures and their logs."""
+"""Rollouts: whole episodes of a policy, in batches, with the task's measures and logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Instant:
     episodes: Tensor
     """(R,) int64: number of each episode."""
     state: TaskState
-    """The state reached. The next step overwrites its dose map: copy what is kept."""
+    """The state reached. The next step overwrites its dose map, so copy what you store."""
     actions: dict[str, Tensor] | None
     """agent -> (R, m) kPa that led here; None at the start."""
     outcome: Outcome | None
@@ -44,7 +44,7 @@ class Rollout:
     dt_s: float
     """Time of a step, s."""
     steps: Tensor
-    """(N,) int64: steps until each episode's end."""
+    """(N,) int64: number of steps until the end of each episode."""
     returns: dict[str, Tensor]
     """agent -> (N,): sum of its rewards."""
     terminated: Tensor
@@ -56,12 +56,12 @@ class Rollout:
 
     @property
     def episodes(self) -> int:
-        """N."""
+        """Number N of episodes."""
         return len(self.steps)
 
     @property
     def time_s(self) -> Tensor:
-        """(N,) s: how long each episode took."""
+        """(N,) s: duration of each episode."""
         return self.steps * self.dt_s
 
     def mean(self, name: str) -> Tensor:
@@ -69,7 +69,7 @@ class Rollout:
         return self.measures[name].nanmean(1)
 
     def rms(self, name: str) -> Tensor:
-        """(N,): root of the mean square."""
+        """(N,): root mean square of a measure over each episode."""
         return self.measures[name].square().nanmean(1).sqrt()
 
     def quantile(self, name: str, share: float) -> Tensor:
@@ -77,15 +77,15 @@ class Rollout:
         return self.measures[name].nanquantile(share, 1)
 
     def largest(self, name: str) -> Tensor:
-        """(N,): the largest value."""
+        """(N,): largest value of a measure in each episode."""
         return _extreme(self.measures[name], torch.amax, -torch.inf)
 
     def smallest(self, name: str) -> Tensor:
-        """(N,): the smallest value."""
+        """(N,): smallest value of a measure in each episode."""
         return _extreme(self.measures[name], torch.amin, torch.inf)
 
     def end(self, name: str) -> Tensor:
-        """(N,): the value at the episode's last step."""
+        """(N,) value of a measure at the last step of each episode."""
         last = (self.steps - 1).clamp(min=0)[:, None]
         return self.measures[name].gather(1, last)[:, 0]
 

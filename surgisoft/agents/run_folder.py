@@ -50,7 +50,8 @@ def check_free(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
     if (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: a run is already there; go on with --resume {folder} or choose another name"
+            f"{folder}: a run is already there; continue it with --resume {folder} or choose "
+            "another name"
         )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already there; choose another name")
@@ -90,7 +91,7 @@ def create_run(folder: Path, plan: Plan, task: Task, agents: dict, processes: in
 
 
 def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
-    """Copy the scene into the run's folder; its mounts name the run's own arm models."""
+    """Copy the scene into the run's folder; its mounts name the arm models of the run."""
     source = getattr(plan.task_config, "scene", None)
     if source is None:
         return None
@@ -134,7 +135,7 @@ class RunFolder:
         except (ValueError, KeyError, TypeError):
             known = False
         if not known:
-            raise InputError(f"{file}: no training run of format {FORMAT}; train it anew")
+            raise InputError(f"{file}: not a training run of format {FORMAT}; train it again")
 
     @property
     def agents(self) -> dict[str, dict]:
@@ -188,7 +189,7 @@ class RunFolder:
         file = self.checkpoint(which)
         if not file.is_file():
             raise InputError(
-                f"{file}: there is no such checkpoint yet; go on with 'surgisoft train --resume "
+                f"{file}: there is no such checkpoint yet; continue with 'surgisoft train --resume "
                 f"{self.path}'"
             )
         try:

@@ -1,4 +1,4 @@
-"""Checkpoint selection: which of the policies that training passes through is kept as `best`."""
+"""Checkpoint selection: which of the evaluated policies of a training is saved as `best`."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class TrainingRequest:
     preset: str = "fast"
     """`fast`, or `paper`: the hyper-parameters of Chen et al. 2025."""
     steps: int | None = None
-    """Steps over all episodes; None: the task's own, unless minutes are given."""
+    """Steps over all episodes; None: the number that the task names, unless minutes are given."""
     minutes: float | None = None
     """Time to train in place of steps, minutes."""
     envs: int | None = None
@@ -77,20 +77,20 @@ class TrainingRequest:
     """Configuration of the task, or a TOML file with fields of it."""
 
     def plan(self) -> Plan:
-        """The training run that this asks for."""
+        """Resolve the request to a `Plan`; raises InputError for contradicting options."""
         if self.steps is not None and self.minutes is not None:
             raise InputError(
-                f"--steps {self.steps} and --minutes {self.minutes:g}: give one of them, the "
+                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
                 "training ends by one or the other"
             )
-        own = task_config(self.task, self.config, self.arm, self.scene)
+        config = task_config(self.task, self.config, self.arm, self.scene)
         numbers = preset_for(self.preset, self.task, envs=self.envs)
         steps = self.steps
         if steps is None and self.minutes is None:
             steps = steps_for(self.preset, self.task)
         return Plan(
             self.task,
-            own,
+            config,
             self.preset,
             numbers,
             steps,
@@ -134,9 +134,7 @@ def train(
         names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
         if names:
             given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-            raise InputError(
-                f"--resume goes on with what the run was started with: leave {given} out"
-            )
+            raise InputError(f"--resume continues with the options of the run: leave out {given}")
         plan, folder = None, Path(resume_from)
     elif task is None:
         raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")
@@ -172,7 +170,7 @@ class EvaluationRequest:
     episodes: int = 20
     """Episodes of each policy."""
     seed: int = 0
-    """Seed of the episodes, the same for each policy."""
+    """Seed of the episodes, equal for each policy."""
     rig: RigConfig | None = None
     """The arms are on this virtual rig; None: in simulation."""
     referee: bool = True
@@ -188,11 +186,11 @@ class EvaluationRequest:
 
     @property
     def place(self) -> str:
-        """Where the episodes take place: `simulation` or `rig`."""
+        """Plant of the episodes: `simulation` or `rig`."""
         return "simulation" if self.rig is None else "rig"
 
     def resolved(self, on_warning: Callable[[str], None]) -> tuple[Task, Any]:
-        """The task and its configuration; a run brings its own."""
+        """The task and its configuration; a training run determines both."""
         if not self.policies:
             raise InputError("no policy is given; expected scripted, random or a run's folder")
         for name in self.policies:

@@ -140,8 +140,8 @@ class Training:
         device, random = self.task.world.device, {"cpu": torch.get_rng_state()}
         if device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(device)
-        own = {"world": parts, "random": random}
-        everyone = self.processes.gather(own)
+        local = {"world": parts, "random": random}
+        everyone = self.processes.gather(local)
         if everyone is None:
             return None
         agents = {
@@ -162,22 +162,22 @@ class Training:
         count, device = len(saved["processes"]), self.task.world.device
         if count != self.processes.count:
             raise InputError(
-                f"the run was trained by {count} processes, came {self.processes.count}; resume "
-                f"it with torchrun --nproc-per-node {count}"
+                f"the run was trained by {count} processes, now there are {self.processes.count}; "
+                f"resume it with torchrun --nproc-per-node {count}"
             )
         for agent, ppo in self.agents.items():
             content = dict(saved["agents"][agent])
             rate = content.pop("learning_rate")
             ppo.load(content, None, strict=True)
             ppo.learning_rate = rate
-        own = saved["processes"][self.processes.rank]
-        parts = iter(own["world"])
+        local = saved["processes"][self.processes.rank]
+        parts = iter(local["world"])
         with torch.inference_mode():
             self.env.state = tree_map(lambda _: next(parts).to(device).clone(), self.env.state)
         self.seen = self.env.get_observations()
-        torch.set_rng_state(own["random"]["cpu"].cpu())
+        torch.set_rng_state(local["random"]["cpu"].cpu())
         if device.type == "cuda":
-            torch.cuda.set_rng_state(own["random"]["cuda"].cpu(), device)
+            torch.cuda.set_rng_state(local["random"]["cuda"].cpu(), device)
         self.iteration, self.best = saved["iteration"], saved["best"]
         self.clock = Clock(saved["wall_s"], saved["cpu_s"])
         self.share = self._shared()

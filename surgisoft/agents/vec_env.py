@@ -1,7 +1,7 @@
-"""Episodes of a task in rsl-rl's terms; they translate and nothing else.
+"""rsl-rl adapters of a task's episodes; they translate and nothing else.
 
-`JointEnv` has all agents at once and is what training steps; `OneAgentEnv` is rsl-rl's own `VecEnv`
-for tasks of one agent, for rsl-rl's runners.
+`JointEnv` has all agents at once and is what training steps; `OneAgentEnv` is a `VecEnv` of
+rsl-rl for tasks of one agent, for rsl-rl's runners.
 """
 
 from __future__ import annotations
@@ -89,9 +89,11 @@ class OneAgentEnv(VecEnv):
         self.joint.state = replace(state, world=replace(state.world, steps=steps))
 
     def get_observations(self) -> TensorDict:
+        """Present observations, as rsl-rl expects them."""
         return self.joint.get_observations()
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """Advance one step: (observations, rewards (B,), dones (B,), extras)."""
         seen, rewards, dones, extras = self.joint.step({self.agent: actions})
         log = {f"/{name}": value.mean() for name, value in extras["terms"][self.agent].items()}
         return seen, rewards[self.agent], dones, {"time_outs": extras["time_outs"], "log": log}

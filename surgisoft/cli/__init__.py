@@ -1,4 +1,4 @@
-"""The command line: one thin function a command, one line for a bad input, exit code 2."""
+"""The command line: one thin function per command, one line for a bad input, exit code 2."""
 
 import os
 import sys
@@ -39,7 +39,7 @@ MANY = {
     *("--between", "--data", "--effect", "--effect-file", "--effects", "--hidden", "--policy"),
     *("--reference", "--strength", "--valid", "--without"),
 }
-"""Options that take one or more values: `--valid A B` reads as `--valid A --valid B`."""
+"""Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 
 OLD_NAMES = {
@@ -47,7 +47,7 @@ OLD_NAMES = {
     "--take": "--trial",
     "--trust": "--observer-gain",
 }
-"""Options that were renamed: the old name still works and is not shown."""
+"""Present names of renamed options; an old name still works and is not shown in the help."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -72,7 +72,7 @@ def _root(
 
 def spread(arguments: list[str]) -> list[str]:
     """Repeat each option of `MANY` before every value that follows it; rename old options."""
-    answer, option = [], None
+    repeated, option = [], None
     old = {} if arguments[:1] == ["benchmark"] else OLD_NAMES
     for given in arguments:
         name, equals, value = given.partition("=")
@@ -80,13 +80,13 @@ def spread(arguments: list[str]) -> list[str]:
         if argument.startswith("-") and not argument.lstrip("-").replace(".", "").isdigit():
             option = argument if argument in MANY else None
             first = option is not None
-            answer.append(argument)
+            repeated.append(argument)
             continue
         if option is not None and not first:
-            answer.append(option)
+            repeated.append(option)
         first = False
-        answer.append(argument)
-    return answer
+        repeated.append(argument)
+    return repeated
 
 
 def _fail(message: str) -> int:
@@ -102,7 +102,9 @@ def _usage(error: TyperException, many: list[str]) -> int:
     where = context.command_path if context else "surgisoft"
     message = error.format_message().rstrip(".")
     if message.startswith("Missing argument") and many:
-        message += f" ({', '.join(many)} took every value after it: put arguments before options)"
+        message += (
+            f" (values after {', '.join(many)} belong to that option: put arguments before options)"
+        )
     return _fail(f"{message}; see '{where} --help'")
 
 
@@ -114,7 +116,7 @@ def with_commands() -> typer.Typer:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run one command; the exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run one command and return the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
     arguments = spread(sys.argv[1:] if arguments is None else arguments)
     try:
         code = with_commands()(args=arguments, standalone_mode=False, prog_name="surgisoft")
@@ -136,5 +138,5 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def main() -> None:
-    """Console script."""
+    """Entry point of the console script `surgisoft`."""
     sys.exit(run())

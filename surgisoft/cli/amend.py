@@ -1,4 +1,4 @@
-"""`surgisoft amend`: a model with one physical effect more."""
+"""`surgisoft amend`: add physical effects to a model and validate the result."""
 
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +30,7 @@ def amend(
         typer.Option(
             "--effect",
             metavar="NAME|FILE.py...",
-            help="Effects to add, or to fit again where the model has them.",
+            help="Effects to add. An effect that the model has already is fitted again.",
         ),
     ],
     data: Annotated[
@@ -45,15 +45,15 @@ def amend(
     anyway: Annotated[
         bool,
         typer.Option(
-            "--anyway", help="Write NEW even where the error does not fall significantly."
+            "--anyway", help="Write NEW even if the held-out error does not fall significantly."
         ),
     ] = False,
     keep_network: Annotated[
         bool,
         typer.Option(
             "--keep-network",
-            help="Leave the network as it is; else its last layer is fitted again behind the "
-            "effects where that lowers the error on held-out data.",
+            help="Do not change the network. By default its last layer is fitted again with the "
+            "effects if that lowers the error on held-out data.",
         ),
     ] = False,
 ) -> None:
@@ -96,18 +96,18 @@ def amend(
         page = amend_page(result, title, result.model.summary())
         written.append(write_page(page, report / "report.html"))
     for name in result.refitted:
-        print(f"{name}: the model has it; its parameters were fitted anew")
+        print(f"{name}: the model had this effect already; its parameters were fitted again")
     show_parameters(result.parameters)
     if result.retuned:
-        print("the network's last layer was fitted again: that lowers the error on held-out data")
+        print("the network's last layer was fitted again, which lowers the error on held-out data")
     for path in written:
         print(f"wrote {path}")
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")
         following = f"surgisoft diagnose {output} {' '.join(map(str, data))}"
-        print(f"next, what is still missing: {with_effect_files(following)}")
+        print(f"next, find further effects: {with_effect_files(following)}")
     else:
-        print(f"{output} was not written; --anyway writes it", flush=True)
+        print(f"{output} was not written; --anyway writes it nevertheless", flush=True)
     if not result.claimed:
         raise typer.Exit(NOT_CLAIMED)

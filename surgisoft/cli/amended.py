@@ -1,15 +1,16 @@
-"""What `amend` and `improve` share: where the new model goes and what is said of it."""
+"""Parts that `amend` and `improve` share: the folder of the new model and what is printed."""
 
 from pathlib import Path
 
 from surgisoft.errors import InputError
 
 NOT_CLAIMED = 1
-"""Exit code where the error did not fall beyond chance."""
+"""Exit code where the held-out error did not fall significantly."""
 
 
 def claim_other_folder(output: Path, model: Path, force: bool) -> None:
-    """Raise unless a new model may be written there, which must not be the one that is read."""
+    """Raise InputError unless a new model may be written there; it must not be the one that is
+    read."""
     from surgisoft.surrogate.checkpoint import claim_folder
 
     if output.resolve() == model.resolve():
@@ -18,18 +19,18 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
 
 
 def save_amended(result, output: Path, model: Path, recordings, force: bool) -> None:
-    """Write the new model with the account of how it came about."""
+    """Write the new model with a record of how it was made."""
     from surgisoft.surrogate.checkpoint import save_model
 
-    account = result.to_json() | {
+    record = result.to_json() | {
         "amended_from": model.name,
         "recordings": [recording.name for recording in recordings],
     }
-    save_model(result.model, output, account, force)
+    save_model(result.model, output, record, force)
 
 
 def show_parameters(parameters) -> None:
-    """The fitted parameters, one a line, and which of them are implausible."""
+    """Print the fitted parameters, one per line, and which of them are implausible."""
     from surgisoft.diagnosis.estimation.intervals import values_text
 
     for each in parameters:

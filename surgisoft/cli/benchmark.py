@@ -1,6 +1,6 @@
 """`surgisoft benchmark`: the studies of the repository's `benchmarks` folder.
 
-They are no part of an installed package: from a wheel the command says where they are.
+They are not part of an installed package: from a wheel the command prints where they are.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""`surgisoft collect`: a recording from the virtual rig."""
+"""`surgisoft collect`: record a protocol on the virtual rig."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,7 @@ def _list_protocols(value: bool) -> None:
         for name, entry in PROTOCOLS.items():
             print(f"{name:12s}{entry.points:6d}  {entry.about}")
         print(
-            "SCHEDULE.csv        columns t_s, c1_kPa ... cm_kPa and maybe run; linear between rows"
+            "SCHEDULE.csv        columns t_s, c1_kPa ... cm_kPa, optional run; linear between rows"
         )
         raise typer.Exit
 
@@ -48,28 +48,34 @@ def collect(
             "--robot-seed",
             min=0,
             max=SEED_MAX,
-            help="Seed of the robot: another one is another arm of the same design.",
+            help="Seed of the robot; another seed is another arm of the same design.",
         ),
     ] = 0,
     trial: Annotated[
         int,
-        typer.Option("--trial", min=0, help="Another trial: same robot, other noise and schedule."),
+        typer.Option(
+            "--trial",
+            min=0,
+            help="Number of the trial: same robot, other noise and random schedule.",
+        ),
     ] = 0,
     points: Annotated[
         int | None,
-        typer.Option(help="Steady-state points, or frames at 20 Hz; default: the protocol's own."),
+        typer.Option(
+            help="Number of steady-state points, or of frames at 20 Hz; default: by the protocol."
+        ),
     ] = None,
     hidden: Hidden = None,
     strength: Annotated[
         list[float] | None,
-        typer.Option(metavar="X...", help="The strengths of the hidden effects in turn."),
+        typer.Option(metavar="X...", help="Amplitudes of the hidden effects, in the same order."),
     ] = None,
     payload_g: Annotated[
         float, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
     ] = 0.0,
     gravity: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Direction of weight in the arm base frame."),
+        typer.Option(metavar="X Y Z", help="Direction of gravity in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
         float,
@@ -78,7 +84,7 @@ def collect(
             min=-360,
             max=360,
             metavar="DEG",
-            help="Turn of the base about its axis, degrees.",
+            help="Rotation of the base about its axis, degrees.",
         ),
     ] = 0.0,
     noise_scale: Annotated[
@@ -126,13 +132,13 @@ def collect(
 
 
 def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
-    """Each hidden effect with its strength, 1 where none is given."""
+    """Hidden effects with their amplitudes; 1 where none is given."""
     if len(strengths) not in (0, len(given)):
         raise InputError(
-            f"{len(given)} --hidden and {len(strengths)} --strength, expected a strength for each"
+            f"{len(given)} --hidden and {len(strengths)} --strength, expected one for each"
         )
     if strengths and any(":" in text for text in given):
-        raise InputError("--hidden NAME:X and --strength both give strengths; expected one of them")
+        raise InputError("--hidden NAME:X and --strength both give amplitudes; use one of them")
     from surgisoft.rig.trial import hidden_effects
 
     pairs = hidden_effects(given)
@@ -142,7 +148,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
 
 
 def _check_output(path: Path, force: bool) -> None:
-    """Say before the work what would stop it after."""
+    """Raise InputError before the work starts, where its result could not be written."""
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")
     if path.exists() and not force:

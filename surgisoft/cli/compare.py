@@ -1,4 +1,4 @@
-"""`surgisoft compare`: a model against recordings."""
+"""`surgisoft compare`: compare a model with recordings."""
 
 import math
 

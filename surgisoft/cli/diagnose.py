@@ -1,4 +1,4 @@
-"""`surgisoft diagnose`: which physical effect is the model missing?"""
+"""`surgisoft diagnose`: find the physical effect that a model lacks."""
 
 from pathlib import Path
 from typing import Annotated
@@ -30,20 +30,21 @@ def diagnose(
         list[Path] | None,
         typer.Option(
             metavar="REC...",
-            help="Recordings from before something changed, to tell what has changed since from "
-            "what the network never learned; without them what the model keeps of its fit.",
+            help="Recordings from before a change. The diagnosis then separates what has changed "
+            "since from errors of the model; default: the training residuals in the model's "
+            "folder.",
         ),
     ] = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
             metavar="EFFECT...",
-            help="Effects that cannot be, because they were taken off the bench, such as contact.",
+            help="Effects to exclude, because the setup rules them out, such as contact.",
         ),
     ] = None,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Diagnose a model: name the physical effect that it is missing, or say why not.
+    """Diagnose a model: name the physical effect that it lacks, or report why none can be named.
 
     Uses the first three quarters of each recording; the last quarter is held out for `amend`.
     """
@@ -87,7 +88,7 @@ def diagnose(
 
 
 def _show(found) -> None:
-    """The verdict, the ranking and what to do next."""
+    """Print the verdict, the ranking and the proposed experiment."""
     verdict, error = found.verdict, found.error_mm
     print(f"{verdict.kind}: {verdict.sentence}")
     print(

@@ -1,4 +1,4 @@
-"""`surgisoft evaluate`: how well policies do a task, in simulation or on the virtual rig."""
+"""`surgisoft evaluate`: evaluate policies on a task, in simulation or on the virtual rig."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_json
 
 PLACES = ("simulation", "rig")
-"""Where episodes take place."""
+"""Plants: simulated arm models, or the virtual rig."""
 
 
 @app.command()
@@ -34,12 +34,12 @@ def evaluate(
         list[str],
         typer.Argument(
             metavar="POLICY",
-            help="scripted (inverse kinematics that knows the true state), random, or the folder "
-            "of a training run; several are evaluated on the same episodes.",
+            help="scripted (inverse kinematics with the true state), random, or the folder "
+            "of a training run. Several policies are evaluated on the same episodes.",
         ),
     ],
     task: Annotated[
-        str | None, typer.Option(metavar="TASK", help="Task; default: the run's own.")
+        str | None, typer.Option(metavar="TASK", help="Task; default: that of the training run.")
     ] = None,
     episodes: Annotated[
         int, typer.Option(min=1, max=100_000, help="Episodes of each policy.")
@@ -47,7 +47,9 @@ def evaluate(
     seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of the episodes.")] = 0,
     on: Annotated[
         str,
-        typer.Option(metavar="|".join(PLACES), help="rig: on the virtual rig, not on arm models."),
+        typer.Option(
+            metavar="|".join(PLACES), help="Plant: simulated arm models, or the virtual rig."
+        ),
     ] = PLACES[0],
     referee: Annotated[
         bool,
@@ -64,8 +66,8 @@ def evaluate(
     cameras: Annotated[
         bool,
         typer.Option(
-            help="On the rig: the policy sees measured key points; else those that the model "
-            "predicts."
+            help="On the rig: whether policies observe measured key points or those that the "
+            "model predicts."
         ),
     ] = True,
     observer_gain: Annotated[
@@ -73,8 +75,8 @@ def evaluate(
         typer.Option(
             min=0.0,
             max=1.0,
-            help="On the rig: gain of the observer that corrects the model's prediction by the "
-            "cameras; 1: the measurement as it is. Default 0.3.",
+            help="On the rig: observer gain from 0 to 1, the share of the difference between "
+            "cameras and model that the estimate adopts per step. Default 0.3.",
         ),
     ] = None,
     arm: Arm = None,
@@ -93,11 +95,11 @@ def evaluate(
 
     from surgisoft.agents.session import evaluate as evaluate_policies
 
-    with progress("evaluate") as told:
+    with progress("evaluate") as report_progress:
         found = evaluate_policies(
             policies,
             task,
-            progress=told,
+            progress=report_progress,
             on_warning=warn,
             episodes=episodes,
             seed=seed,
@@ -116,8 +118,8 @@ def evaluate(
     if replay:
         from surgisoft.replay.episode_view import write_replay
 
-        with progress("replay") as told:
-            written.append(write_replay(found.logs[policies[0]], replay, report=told))
+        with progress("replay") as report_progress:
+            written.append(write_replay(found.logs[policies[0]], replay, report=report_progress))
     if report:
         from surgisoft.agents.report import evaluation_page
         from surgisoft.report import write_page
@@ -143,14 +145,14 @@ def _rig_config(
     if on != "rig":
         if robot_seed is not None or observer_gain is not None or hidden or not cameras:
             raise InputError(
-                "--robot-seed, --hidden, --no-cameras and --observer-gain are for --on rig"
+                "--robot-seed, --hidden, --no-cameras and --observer-gain need --on rig"
             )
         return None
     from surgisoft.agents.on_rig import RigConfig
     from surgisoft.rig.trial import hidden_effects
 
-    own = RigConfig(seed=robot_seed or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
-    return own if observer_gain is None else replace(own, observer_gain=observer_gain)
+    rig = RigConfig(seed=robot_seed or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
+    return rig if observer_gain is None else replace(rig, observer_gain=observer_gain)
 
 
 def _show(results) -> None:

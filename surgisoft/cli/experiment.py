@@ -1,4 +1,4 @@
-"""`surgisoft experiment`: scripted experiments on a scene, from a TOML file to a report."""
+"""`surgisoft experiment`: run scripted experiments on a scene, from a TOML file to a report."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,19 +22,22 @@ def run(
     file: ExperimentFile,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Results; default: results/NAME."),
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="Folder of the results; default: results/NAME."
+        ),
     ] = None,
     processes: Annotated[
-        int, typer.Option(min=1, max=1024, help="Processes; the results do not depend on it.")
+        int, typer.Option(min=1, max=1024, help="Processes; the results do not depend on them.")
     ] = 1,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with results that are there.")
+        bool, typer.Option("--resume", help="Continue an interrupted run of the experiment.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Begin anew, older results go.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace older results.")] = False,
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="RUN...", help="Training runs' folders: play every scripted case as well."
+            metavar="RUN...",
+            help="Folders of training runs: each also runs every case of the scripted expert.",
         ),
     ] = None,
     repeats: Annotated[
@@ -45,7 +48,7 @@ def run(
     ] = True,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Play an experiment; write tables, logs, pictures, replays and one HTML report."""
+    """Run an experiment; write tables, logs, pictures, replays and one HTML report."""
     from surgisoft.experiments.page import markdown
     from surgisoft.experiments.session import finish_experiment, start_experiment
 
@@ -64,7 +67,7 @@ def check(
     file: ExperimentFile,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Say what an experiment would play; a bad file is one line with its line and field."""
+    """Check an experiment's file and list its phases and settings, without running it."""
     from surgisoft.experiments.plan import settings
     from surgisoft.experiments.run import check_playable
     from surgisoft.experiments.session import open_experiment

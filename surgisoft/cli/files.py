@@ -1,4 +1,4 @@
-"""What may be written where, before a command spends its time."""
+"""Checks of output paths, before a command spends its time."""
 
 import json
 import os
@@ -8,9 +8,9 @@ from surgisoft.errors import InputError
 
 
 def check_free(path: Path | None, field: str) -> None:
-    """Raise unless a JSON file may be written there: nothing yet, or an older one of its kind.
+    """Raise InputError unless a JSON file may be written: new, or an older result of its kind.
 
-    An older one has the named field.
+    An older result has the named field.
     """
     if path is None:
         return
@@ -23,11 +23,11 @@ def check_free(path: Path | None, field: str) -> None:
     except (OSError, ValueError):
         same = False
     if not same:
-        raise InputError(f"{path}: already there and no older result; choose another file")
+        raise InputError(f"{path}: already there and not an older result; choose another file")
 
 
 def check_folder(path: Path | None) -> None:
-    """Raise unless a folder is there or can be made."""
+    """Raise InputError unless a folder exists or can be made."""
     if path is None:
         return
     above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
@@ -36,7 +36,7 @@ def check_folder(path: Path | None) -> None:
 
 
 def check_replay(path: Path | None) -> None:
-    """Raise unless a replay may be written there; an older one is replaced."""
+    """Raise InputError unless a replay may be written there; an older one is replaced."""
     if path is None:
         return
     if path.suffix != ".rrd":

@@ -1,4 +1,4 @@
-"""`surgisoft fit`: an arm model from recordings."""
+"""`surgisoft fit`: fit an arm model to recordings."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,13 +21,13 @@ def fit(
         list[Path] | None,
         typer.Option(
             metavar="REC...",
-            help="Held-out recordings that choose the model; without them whole runs, or blocks "
-            "of time, of the training recordings are held out.",
+            help="Validation recordings that select the model; default: whole runs, or blocks of "
+            "time, of the training recordings are held out.",
         ),
     ] = None,
     inputs: Annotated[
         Literal["pressure", "pressure+direction"],
-        typer.Option(help="What the network sees of each chamber."),
+        typer.Option(help="Inputs of the network for each chamber."),
     ] = "pressure+direction",
     effects: Annotated[
         list[str] | None,
@@ -35,22 +35,28 @@ def fit(
             "--effects",
             metavar="NAME|FILE.py...",
             help="Physical effects of the line or the material to add, such as hysteresis, or "
-            "files with effects of your own (docs/effects.md).",
+            "files of user-defined effects (docs/effects.md).",
         ),
     ] = None,
     network: Annotated[
         Literal["haw_nn", "constant_curvature", "recurrent"],
-        typer.Option(help="HAW-NN, or a baseline."),
+        typer.Option(help="HAW-NN, or one of two baselines."),
     ] = "haw_nn",
     widths: Annotated[
         str, typer.Option(metavar="N,N...", help="Widths of HAW-NN's hidden layers.")
     ] = "128,128,128,128",
     actuation: Annotated[
-        Literal["measured", "commanded"], typer.Option(help="Which actuation the model takes.")
+        Literal["measured", "commanded"],
+        typer.Option(help="Which actuation is the model's input."),
     ] = "measured",
-    epochs: Annotated[int, typer.Option(min=1, help="Most epochs of a stage; at least 10.")] = 200,
+    epochs: Annotated[
+        int, typer.Option(min=1, help="Largest number of epochs of a stage; at least 10.")
+    ] = 200,
     seed: Annotated[
-        int, typer.Option(min=0, max=SEED_MAX, help="Seed of weights and order of rows.")
+        int,
+        typer.Option(
+            min=0, max=SEED_MAX, help="Seed of weights, order of rows and held-out blocks."
+        ),
     ] = 0,
     threads: Threads = 1,
     effect_files: EffectFiles = None,
@@ -58,8 +64,9 @@ def fit(
 ) -> None:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings.
 
-    Grows from pressure to effects to direction, keeps each only where held-out data rewards it,
-    and says which inputs the recordings cannot support.
+    Forward selection from pressure to effects to direction: an addition is accepted only if it
+    lowers the held-out error significantly. Inputs that the recordings cannot identify are left
+    out and reported.
     """
     train = read_recordings(recordings)
     held = read_recordings(valid) if valid else None

@@ -1,4 +1,4 @@
-"""`surgisoft import`: other people's files; `surgisoft recording`: what a recording holds."""
+"""`surgisoft import`: convert other files to recordings; `surgisoft recording`: summarise them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ def import_(
         list[Path], typer.Argument(metavar="RAW", help="Raw files, or folders of them.")
     ],
     map_name: Annotated[
-        str, typer.Option("--map", metavar="MAP.toml", help="Map file, or a ready map: motive.")
+        str, typer.Option("--map", metavar="MAP.toml", help="Map file, or the ready map motive.")
     ],
     output: Annotated[
         Path,
@@ -25,7 +25,7 @@ def import_(
             "-o",
             "--output",
             metavar="REC",
-            help="New recording (.csv or .parquet), or a folder: one recording a raw file.",
+            help="New recording (.csv or .parquet), or a folder with one recording per raw file.",
         ),
     ],
     force: Force = False,
@@ -33,7 +33,7 @@ def import_(
         bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
     ] = False,
 ) -> None:
-    """Import somebody else's files: columns, units and frames as a map says."""
+    """Import a laboratory's files as recordings; a map states columns, units and frames."""
     from surgisoft.measurement.importing import import_files, load_map
     from surgisoft.measurement.recordings import (
         check_writable,

@@ -1,4 +1,4 @@
-"""`surgisoft improve`: diagnose and amend, until no further effect is significant."""
+"""`surgisoft improve`: repeat diagnose and amend until no further effect is significant."""
 
 from pathlib import Path
 from typing import Annotated
@@ -28,7 +28,7 @@ def improve(
     recordings: Recordings,
     output: NewModel,
     most: Annotated[
-        int, typer.Option("--max-effects", min=1, help="Most effects that are added.")
+        int, typer.Option("--max-effects", min=1, help="Largest number of effects to add.")
     ] = 6,
     json_file: JsonFile = None,
     report: Report = None,
@@ -78,7 +78,7 @@ def improve(
 
 
 def _show(result) -> None:
-    """Each round, then the parameters and the errors on the held-out part."""
+    """Print each round, then the parameters and the errors on the held-out part."""
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
         rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""

@@ -1,4 +1,4 @@
-"""What commands read, with the warnings about it on standard error."""
+"""Inputs of commands, with warnings on standard error."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,12 +9,12 @@ from surgisoft.errors import InputError
 
 
 def warn(text: str) -> None:
-    """One line of warning on standard error."""
+    """Print one line of warning on standard error."""
     typer.echo(f"surgisoft: warning: {text}", err=True)
 
 
 def check_model(folder: Path) -> None:
-    """Raise where there is no model, before anything is loaded that takes seconds."""
+    """Raise InputError where there is no model, before anything is loaded that takes seconds."""
     if str(folder) != "default" and not (folder / "config.json").is_file():
         raise InputError(
             f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
@@ -23,18 +23,18 @@ def check_model(folder: Path) -> None:
 
 
 def read_recordings(paths: Iterable[Path]) -> list:
-    """The recordings in files and folders; what is odd but usable is warned of."""
+    """The recordings in files and folders; prints data-quality warnings."""
     from surgisoft.measurement.recordings import load_recordings
 
     return load_recordings(paths, on_warning=warn)
 
 
 def counted(number: int, thing: str) -> str:
-    """`1 episode`, `2,000 episodes`."""
+    """Number and noun: `1 episode`, `2,000 episodes`."""
     return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"
 
 
 def warn_all(notes: Iterable[str]) -> None:
-    """Each note of a result as a line of warning."""
+    """Print each note of a result as a line of warning."""
     for note in notes:
         warn(note)

@@ -13,7 +13,7 @@ from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
-"""Chambers and unit of the arm that the virtual rig has."""
+"""Number of chambers and unit of the arm on the virtual rig."""
 SHOWN_PAIRS = 10
 """Pairs of effects that are always printed (a count); a chance below `SURE` is always printed."""
 
@@ -23,7 +23,7 @@ def next_experiment(
     model: Model,
     recordings: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="REC", help="What was recorded so far; may be left out."),
+        typer.Argument(metavar="REC", help="Recordings so far; may be left out."),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="SCHEDULE.csv", help="New schedule file.")
@@ -32,12 +32,12 @@ def next_experiment(
         list[str] | None,
         typer.Option(
             metavar="NAME...",
-            help="The competing effects, with spaces or commas; default: those that explain "
-            "the recordings best, without recordings all known ones.",
+            help="Competing effects, separated by spaces or commas; default: those that explain "
+            "the recordings best, or all known effects if there are no recordings.",
         ),
     ] = None,
     minutes: Annotated[
-        float, typer.Option(metavar="MIN", help="Longest time on the bench, minutes.")
+        float, typer.Option(metavar="MIN", help="Longest duration of the experiment, minutes.")
     ] = 15.0,
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
@@ -49,7 +49,7 @@ def next_experiment(
     """Find the experiment that best distinguishes competing effects, ready for the rig."""
     if output.suffix != ".csv":
         raise InputError(
-            f"{output}: suffix '{output.suffix}', expected .csv, as `collect` reads it"
+            f"{output}: suffix '{output.suffix}', expected .csv, which `collect` can read"
         )
     if output.exists() and not force:
         raise InputError(f"{output}: exists already; choose another name or use --force")
@@ -65,33 +65,33 @@ def next_experiment(
     arm = load_model(model)
     competing = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
-    answer = find_experiment(arm, measured, competing, minutes, settings)
-    warn_all(answer.notes)
-    write_atomically(output, schedule_text(answer.protocol))
+    result = find_experiment(arm, measured, competing, minutes, settings)
+    warn_all(result.notes)
+    write_atomically(output, schedule_text(result.protocol))
     if json_file:
-        write_json(json_file, answer.to_json())
-    _show(answer, arm.spec, model, recordings or [], output)
+        write_json(json_file, result.to_json())
+    _show(result, arm.spec, model, recordings or [], output)
 
 
-def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> None:
+def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> None:
     from surgisoft.diagnosis.design.isolability import SURE
 
-    print(f"next experiment: {answer.name}, {answer.minutes:g} min on the bench")
-    print(f"why: {answer.why}")
-    for number, step in enumerate(answer.steps, 1):
+    print(f"next experiment: {result.name}, {result.minutes:g} min on the bench")
+    print(f"why: {result.why}")
+    for number, step in enumerate(result.steps, 1):
         print(f"  {number}. {step}")
     on_rig = (spec.chambers, spec.unit) == ON_RIG
-    if answer.by_hand and on_rig:
+    if result.by_hand and on_rig:
         print("  the virtual rig has no option for that change: --as-it-stands asks for none")
     elif on_rig:
-        options = f" {answer.options}" if answer.options else ""
+        options = f" {result.options}" if result.options else ""
         print(f"  on the virtual rig: surgisoft collect {output}{options} -o NEW.parquet")
-    # A change that takes something away speaks by the new recording alone.
-    old = "" if answer.by_hand else "".join(f" {path}" for path in recordings)
-    taken = f" --without {' '.join(answer.removes)}" if answer.by_hand else ""
+    # After a change that removes an effect, only the new recording counts.
+    old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
+    taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
     print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}")
-    pairs = sorted(answer.pairs, key=lambda pair: pair.after)
-    open_ = [pair for pair in pairs if pair.effects not in answer.separates]
+    pairs = sorted(result.pairs, key=lambda pair: pair.after)
+    open_ = [pair for pair in pairs if pair.effects not in result.separates]
     shown = max(SHOWN_PAIRS, len(open_))
     for pair in pairs[:shown]:
         a, b = pair.effects
@@ -103,5 +103,5 @@ def _show(answer, spec, model: Path, recordings: list[Path], output: Path) -> No
             f"  {len(pairs) - shown} further pairs: {pairs[shown].after:.2f} or more (see --json)"
         )
     if open_:
-        print(f"{len(open_)} of {len(answer.pairs)} pairs stay below {SURE:g} in this time")
-    print(f"wrote {output}: {len(answer.protocol.run_rows)} runs, {answer.protocol.unit}")
+        print(f"{len(open_)} of {len(result.pairs)} pairs stay below {SURE:g} in this time")
+    print(f"wrote {output}: {len(result.protocol.run_rows)} runs, {result.protocol.unit}")

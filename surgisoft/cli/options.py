@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take: one name, one metavar, one text for each."""
+"""Arguments and options that several commands share: one name, metavar and help text for each."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ from typer import Argument, Option
 from surgisoft.errors import InputError
 
 SEED_MAX = 2**31
-"""Largest seed."""
+"""Largest seed that commands accept."""
 
 Model = Annotated[
     Path,
@@ -27,7 +27,7 @@ def _register(paths: list[Path] | None) -> list[Path] | None:
     """Register the user-defined effects of files, before anything opens a model that holds them."""
     for path in paths or []:
         if not path.is_file():
-            raise InputError(f"{path}: no such file; expected a .py file with one Effect in it")
+            raise InputError(f"{path}: no such file; name a .py file that defines one Effect")
     if paths:
         from surgisoft.surrogate.effects import register_effect_files
 
@@ -41,17 +41,17 @@ EffectFiles = Annotated[
         "--effect-file",
         metavar="FILE.py...",
         callback=_register,
-        help="Files of user-defined effects (docs/effects.md) that a model holds or may lack. The "
-        "files are run: name only those that you trust.",
+        help="Files of user-defined effects (docs/effects.md): those in the model, and further "
+        "candidates. The files are run, so name only those that you trust.",
     ),
 ]
-"""Of every command that opens a model. The effects are registered when the command line is read."""
+"""Option of every command that opens a model. Reading the command line registers the effects."""
 
 
 def with_effect_files(command: str) -> str:
-    """A command to run next, with the files of user-defined effects that this one was given.
+    """A command to run next, with `--effect-file` and the files that this call was given.
 
-    Without them it would refuse to open the model.
+    Without them the command would refuse to open the model.
     """
     from surgisoft.surrogate.effects import registered_files
 
@@ -64,58 +64,64 @@ ExperimentFile = Annotated[
     Path,
     Argument(
         metavar="FILE.toml",
-        help="The experiment, or the name of one of the package: 'surgisoft experiment list'.",
+        help="Experiment's file, or the name of one in the package ('surgisoft experiment list').",
     ),
 ]
 
 JsonFile = Annotated[
-    Path | None, Option("--json", metavar="FILE.json", help="Write all numbers here.")
+    Path | None, Option("--json", metavar="FILE.json", help="Write all numbers to this file.")
 ]
 Report = Annotated[
     Path | None,
-    Option("--report", metavar="DIR", help="Write an HTML report with its pictures here."),
+    Option(
+        "--report", metavar="DIR", help="Write an HTML report with its pictures to this folder."
+    ),
 ]
 Replay = Annotated[
     Path | None,
-    Option("--replay", metavar="FILE.rrd", help="Write what `surgisoft replay` shows here."),
+    Option("--replay", metavar="FILE.rrd", help="Write a replay for `surgisoft replay`."),
 ]
-Force = Annotated[bool, Option("--force", help="Replace what an earlier call wrote there.")]
+Force = Annotated[bool, Option("--force", help="Replace the output of an earlier call.")]
 
 Hidden = Annotated[
     list[str] | None,
     Option(
         "--hidden",
         metavar="NAME[:X]...",
-        help="Effects that the rig has and a model lacks, each with its strength; default 1.",
+        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1.",
     ),
 ]
 Arm = Annotated[
     str | None,
-    Option("--arm", metavar="MODEL", help="Arm model of all arms; default: the task's own."),
+    Option("--arm", metavar="MODEL", help="Arm model of all arms; default: by the task."),
 ]
 SceneFolder = Annotated[
     Path | None,
     Option(
         "--scene",
         metavar="DIR",
-        help="Folder of a scene, or phantom_liver; default: the task's own.",
+        help="Folder of a scene, or phantom_liver; default: by the task.",
     ),
 ]
 TaskConfig = Annotated[
     Path | None,
-    Option("--config", metavar="FILE.toml", help="Fields of the task's configuration."),
+    Option("--config", metavar="FILE.toml", help="File with fields of the task's configuration."),
 ]
 Threads = Annotated[
     int,
-    Option("--threads", min=1, max=256, help="Threads; more than one only pays on idle cores."),
+    Option(
+        "--threads", min=1, max=256, help="Threads; more than one is faster on idle cores only."
+    ),
 ]
 
-Web = Annotated[bool, Option("--web", help="Serve it to a browser on this machine only.")]
+Web = Annotated[bool, Option("--web", help="Show it in a browser; served to this machine only.")]
 Screenshot = Annotated[
     Path | None,
-    Option("--screenshot", metavar="FILE.png", help="Write a picture without a display and exit."),
+    Option(
+        "--screenshot", metavar="FILE.png", help="Write a picture, without a display, and exit."
+    ),
 ]
 SaveReplay = Annotated[
     Path | None,
-    Option("--save", metavar="FILE.rrd", help="Write what the viewer would show and exit."),
+    Option("--save", metavar="FILE.rrd", help="Write the replay to a file and exit."),
 ]

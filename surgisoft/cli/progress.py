@@ -1,4 +1,4 @@
-"""Progress of long work on standard error: a bar in a terminal, now and then a line elsewhere."""
+"""Progress of long work on standard error: a bar in a terminal, occasional lines elsewhere."""
 
 import contextlib
 import sys
@@ -11,7 +11,7 @@ LINE_EVERY_S = 30.0
 
 @contextlib.contextmanager
 def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """A bar with the time left; the answer is called with (done, total, note)."""
+    """Show a progress bar with the time left; yields a function of (done, total, note)."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -40,20 +40,20 @@ def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
         def report(done: float, total: float, note: str = "") -> None:
             nonlocal last
             bar.update(task, completed=done, total=total, note=note)
-            foreseen = left(done, total)
+            remaining = left(done, total)
             if not console.is_terminal and time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
-                parts = ", ".join(part for part in (share, note, foreseen) if part)
+                parts = ", ".join(part for part in (share, note, remaining) if part)
                 print(f"surgisoft: {title}: {parts}", file=sys.stderr, flush=True)
 
         yield report
 
 
 class TimeLeft:
-    """How long work still takes at its mean pace since it was first heard of.
+    """Estimate of the remaining time of work, from its mean pace so far.
 
-    Begins anew where less is done than before: another part of the work.
+    Starts again where less is done than before, because another part of the work has begun.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
@@ -61,7 +61,7 @@ class TimeLeft:
         self._began, self._first, self._last = 0.0, 0.0, float("inf")
 
     def __call__(self, done: float, total: float) -> str:
-        """`3 min left`, or nothing where that cannot be told yet."""
+        """Text such as `3 min left`; empty where no estimate is possible yet."""
         if done < self._last:
             self._began, self._first = self._clock(), done
         self._last = done

@@ -1,4 +1,4 @@
-"""`surgisoft replay`: look at what was recorded, in a window, a browser or a picture."""
+"""`surgisoft replay`: view an episode in a window, a browser or a picture."""
 
 from pathlib import Path
 from typing import Annotated
@@ -26,15 +26,17 @@ def replay(
     ] = "1600x1000",
     time: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Moment of the picture, in s; default: two thirds through."),
+        typer.Option(
+            metavar="S", help="Time of the picture, in s; default: two thirds of the episode."
+        ),
     ] = None,
     view: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Only this view in the picture, such as Scene."),
+        typer.Option(metavar="NAME", help="The only view in the picture, such as Scene."),
     ] = None,
     save: SaveReplay = None,
 ) -> None:
-    """Look at an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events."""
+    """View an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events."""
     from surgisoft.replay.show import open_replay
 
     with progress("replay") as report:
@@ -47,7 +49,7 @@ def replay(
             time_s=time,
             view=view,
             progress=report,
-            on_address=lambda url: print(f"open {url} (Ctrl-C ends it)", flush=True),
+            on_address=lambda url: print(f"open {url} (stop with Ctrl-C)", flush=True),
         )
     if written is not None:
         print(written)

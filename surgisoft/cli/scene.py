@@ -10,7 +10,7 @@ from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, We
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
-commands = typer.Typer(help="Make, check and look at surgical scenes.", no_args_is_help=True)
+commands = typer.Typer(help="Make, check and view surgical scenes.", no_args_is_help=True)
 app.add_typer(commands, name="scene")
 
 Folder = Annotated[
@@ -26,14 +26,15 @@ def new(
         typer.Argument(
             metavar="MESH",
             help="Mesh files (stl, obj, ply, off, glb), the organ first. FILE:keep-out or "
-            "FILE:support gives a role; further files are keep-out by themselves.",
+            "FILE:support sets a role; the default role of further files is keep-out.",
         ),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="New scene folder.")
     ],
     unit: Annotated[
-        str | None, typer.Option(metavar="mm|cm|m", help="Unit of the files; default: recognised.")
+        str | None,
+        typer.Option(metavar="mm|cm|m", help="Unit of the files; default: inferred from the size."),
     ] = None,
     lesion: Annotated[
         Vector | None,
@@ -76,7 +77,7 @@ def new(
     for note in made.notes:
         print(note)
     _print_check(made.check)
-    print(f"wrote {output}: look at it with 'surgisoft scene show {output}'")
+    print(f"wrote {output}: view it with 'surgisoft scene show {output}'")
     return 0
 
 
@@ -85,7 +86,9 @@ def check(
     folder: Folder,
     picture: Annotated[
         Path | None,
-        typer.Option("--map", metavar="FILE.png", help="Write a picture of the reachability here."),
+        typer.Option(
+            "--map", metavar="FILE.png", help="Write a picture of the reach to this file."
+        ),
     ] = None,
     effect_files: EffectFiles = None,
 ) -> int:
@@ -117,7 +120,7 @@ def show(
     save: SaveReplay = None,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Look at a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
+    """View a scene in the Rerun viewer: organs, arms, ring, beam and the camera's cone."""
     from surgisoft.replay.scene_view import save_scene_view
     from surgisoft.replay.viewer import (
         open_viewer,
@@ -140,13 +143,13 @@ def show(
             take_screenshot(recording, screenshot, "Scene", ("ring_point", 0))
             print(f"wrote {screenshot}")
         elif web:
-            serve_viewer(recording, lambda url: print(f"open {url} (Ctrl-C ends it)", flush=True))
+            serve_viewer(recording, lambda url: print(f"open {url} (stop with Ctrl-C)", flush=True))
         else:
             open_viewer(recording)
 
 
 def _check_meshes(meshes: list[str]) -> None:
-    """Raise where a mesh file is missing, with or without a role behind its name."""
+    """Raise InputError where a mesh file is missing, with or without a role behind its name."""
     for text in meshes:
         path, _, _ = text.rpartition(":")
         if not Path(text).exists() and not (path and Path(path).exists()):
@@ -154,7 +157,7 @@ def _check_meshes(meshes: list[str]) -> None:
 
 
 def _request(meshes, unit, lesion, direction, diameter, clearance):
-    """The user's wish; contradictions are one line."""
+    """The request for a new scene; raises InputError for contradicting or invalid options."""
     import numpy as np
 
     from surgisoft.scene.author import Request

@@ -1,4 +1,4 @@
-"""`surgisoft train` and `surgisoft export`: policies from training runs."""
+"""`surgisoft train` and `surgisoft export`: train policies, and write them for other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,18 +27,18 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            metavar="fast|paper", help="fast (default), or paper: the paper's hyper-parameters."
+            metavar="fast|paper", help="Hyper-parameters: fast (default), or those of the paper."
         ),
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps over all episodes; default the task's own.")
+        int | None, typer.Option(min=1, help="Steps over all episodes; default: by the task.")
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="MIN", help="Time to train, minutes, in place of --steps."),
+        typer.Option(metavar="MIN", help="Duration of the training, minutes, instead of --steps."),
     ] = None,
     envs: Annotated[
-        int | None, typer.Option(min=1, help="Episodes that are simulated side by side.")
+        int | None, typer.Option(min=1, help="Number of episodes that are simulated in parallel.")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=SEED_MAX, help="Seed of weights, noise and episodes.")
@@ -46,29 +46,31 @@ def train(
     target_error: Annotated[
         float | None,
         typer.Option(
-            metavar="MM", help="End when evaluation finds no larger mean error, and full success."
+            metavar="MM", help="Stop when an evaluation has no larger mean error, and full success."
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="RUN", help="Folder; default runs/TASK-DATE-TIME."),
+        typer.Option(
+            "-o", "--output", metavar="RUN", help="New folder; default runs/TASK-DATE-TIME."
+        ),
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="Go on with an interrupted run.")
+        Path | None, typer.Option(metavar="RUN", help="Continue an interrupted run.")
     ] = None,
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,
     device: Annotated[
-        str, typer.Option(metavar="cpu|cuda", help="Where to simulate and to learn.")
+        str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training.")
     ] = "cpu",
     threads: Threads = 1,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Train the agents of a task with PPO; every agent learns at once.
+    """Train the agents of a task with PPO, all at the same time.
 
-    The folder of the run is written first and holds all that is needed to open it. After Ctrl-C,
-    --resume goes on with the same numbers as without a break. For several processes:
+    The folder of the run holds all that is needed to open it. After Ctrl-C,
+    --resume continues with the same numbers as an uninterrupted run. For several processes:
     torchrun --nproc-per-node N -m surgisoft train ...
     """
     from surgisoft.agents.session import train as train_agents
@@ -96,7 +98,7 @@ def train(
         return
     if not run.result.done:
         print(
-            f"stopped after {run.result.steps:,} steps; go on with: "
+            f"stopped after {run.result.steps:,} steps; continue with: "
             f"{with_effect_files(f'surgisoft train --resume {run.folder}')}"
         )
         raise typer.Exit(INTERRUPTED)
@@ -129,7 +131,7 @@ def export(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
     which: Annotated[str, typer.Option(metavar="best|last", help="Checkpoint.")] = "best",
 ) -> None:
-    """Write a run's policies as ONNX and TorchScript, one of each for an agent."""
+    """Write a run's policies as ONNX and TorchScript, one file of each for every agent."""
     from surgisoft.agents.export import export as export_policy
     from surgisoft.agents.learned import LearnedPolicy
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,12 +34,12 @@ class Schedule:
     """A controller that follows the pressures of a CSV file, from the phase's begin."""
 
     def __init__(self, path: Path, chambers: int):
-        """chambers: number m of chambers of the arm that it moves."""
+        """Read the CSV file; chambers: number m of chambers of the arm."""
         protocol = load_schedule(path)
         if protocol.unit != "kPa" or protocol.chambers != chambers:
             raise InputError(
-                f"{path}: {protocol.chambers} commands in {protocol.unit}; expected {chambers} in "
-                "kPa, as the arm has chambers"
+                f"{path}: {protocol.chambers} chambers in {protocol.unit}; expected {chambers} in "
+                "kPa, those of the arm"
             )
         if len(protocol.run_rows) > 1:
             raise InputError(f"{path}: {len(protocol.run_rows)} runs; expected one")
@@ -52,9 +52,9 @@ class Schedule:
 
 
 class Waypoints:
-    """A controller that turns the arm's axis through points in space, from the phase's begin."""
+    """A controller that points the arm's axis through points in space, from the phase's begin."""
 
-    def __init__(self, rows):
+    def __init__(self, rows: Sequence[Sequence[float]]):
         """rows (R, 4): s, then mm in the world frame."""
         table = torch.tensor(rows, dtype=torch.float64)
         self.times, self.values = _table(table[:, 0], table[:, 1:])
@@ -66,12 +66,12 @@ class Waypoints:
 
 
 class Nominal:
-    """The task's expert, which assumes that the arms are mounted exactly as the scene says."""
+    """Scripted expert that assumes the nominal mounts of the scene, not the true ones."""
 
     def act(
         self, task: PhasedTask, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """See `Policy.act`."""
+        """Actions of the expert on the state with nominal mounts, see `Policy.act`."""
         arms = {
             name: replace(part, mount=task.world.arms[name].pose.expand_as(part.mount))
             for name, part in state.world.arms.items()
@@ -80,25 +80,25 @@ class Nominal:
 
 
 class PhaseControllers:
-    """A `Policy`: in each episode and for each arm the controller that its phase names."""
+    """A `Policy` that runs, in each episode and for each arm, the controller of the phase."""
 
     def __init__(self, spec: Experiment, task: PhasedTask, policy: str):
-        """policy: acts in phases that say `policy`; a training run must fit the task."""
+        """policy: acts in phases whose controller is `policy`; a training run must fit the task."""
         self.policy: Policy = Nominal() if policy == NOMINAL else open_policy(policy, task.base)
         self.scripted = open_policy("scripted", task)
-        self.own: dict[tuple[str, str], Controller] = {}
+        self.defined: dict[tuple[str, str], Controller] = {}
         for agent in task.agents:
             chambers = task.world.arms[agent].chambers
             used = {getattr(phase, agent) for phase in spec.phases}
             for driver in spec.drivers:
                 if driver.name in used:
-                    self.own[agent, driver.name] = _own(driver, chambers)
+                    self.defined[agent, driver.name] = _defined(driver, chambers)
 
     @torch.inference_mode()
     def act(
         self, task: PhasedTask, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """See `Policy.act`."""
+        """Actions of the controllers of the present phases, see `Policy.act`."""
         known: dict[str, dict[str, Tensor]] = {}
         actions = {}
         for agent in task.agents:
@@ -115,16 +115,16 @@ class PhaseControllers:
     def _asked(self, name, agent, task, state, observations, known) -> Tensor:
         if name == "rest":
             return rest(task, agent, state)
-        if (agent, name) in self.own:
-            return self.own[agent, name](task, agent, state)
+        if (agent, name) in self.defined:
+            return self.defined[agent, name](task, agent, state)
         name = "scripted" if self.policy == self.scripted else name
         if name not in known:
-            driver = self.policy if name == "policy" else self.scripted
-            known[name] = driver.act(task, state, observations)
+            policy = self.policy if name == "policy" else self.scripted
+            known[name] = policy.act(task, state, observations)
         return known[name][agent]
 
 
-def _own(spec: ControllerSpec, chambers: int) -> Controller:
+def _defined(spec: ControllerSpec, chambers: int) -> Controller:
     if spec.schedule:
         return Schedule(Path(spec.schedule), chambers)
     return Waypoints(spec.waypoints)

@@ -26,7 +26,7 @@ HOW = (
 
 
 def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
-    """films: (setting's label, episode) -> film strip of the endoscope, for episodes to show."""
+    """HTML report of an experiment; films: (setting's label, episode) -> film strip to show."""
     sections = [_table(results), _outcomes(results)]
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))

@@ -38,15 +38,15 @@ class PhaseState:
     lost: Tensor
     """(B,) int64: steps in a row without the lesion in sight, in phases with the beam."""
     reason: Tensor
-    """(B,) int64: why it was aborted, see `REASONS`."""
+    """(B,) int64: reason of the abort, see `REASONS`."""
     where: Tensor
-    """(B,) int64: the phase in which it was aborted."""
+    """(B,) int64: phase of the abort."""
 
 
 class PhasedTask:
     """A `Task` in the phases of an experiment, with its interlock, limits and faults.
 
-    Observations, rewards and the expert are those of the task beneath, so that its policies fit.
+    Observations, rewards and expert are those of the underlying task, so that its policies fit.
     """
 
     def __init__(self, supervision: Supervision, spec: Experiment):
@@ -81,11 +81,11 @@ class PhasedTask:
                 )
 
     def plain(self, state: TaskState) -> TaskState:
-        """The state as the task beneath has it."""
+        """State of the underlying task, without phases."""
         return replace(state, goal=state.goal.goal)
 
     def goal(self, stream: Stream) -> tuple[Stream, PhaseState]:
-        """See `Task`."""
+        """Draw goals of the underlying task; every episode begins in phase 0."""
         stream, goal = self.base.goal(stream)
         zero = torch.zeros_like(stream.count)
         return stream, PhaseState(goal, zero, zero, zero, zero, zero, zero)
@@ -102,12 +102,12 @@ class PhasedTask:
         return supervision.in_sight(plain) & clear & ~state.world.failed
 
     def released(self, state: TaskState) -> Tensor:
-        """(B,) bool: phase and interlock permit the beam; it is never on without."""
+        """(B,) bool: phase and interlock permit the beam, which is never on otherwise."""
         goal = state.goal
         return self.beam[goal.phase] & (goal.reason == RUNNING) & self.safe(state)
 
     def advance(self, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
-        """See `Task`."""
+        """Advance one step with faults and interlock, then update phases and limits."""
         plain = self.plain(state)
         fired = self.supervision.fires(plain) & self.released(state)
         after = self.supervision.advance(plain, self._with_faults(state, actions), fired)
@@ -126,7 +126,7 @@ class PhasedTask:
         return done
 
     def progressed(self, old: PhaseState, after: TaskState) -> PhaseState:
-        """Phases and limits after a step that led to `after`, a state of the task beneath."""
+        """Phases and limits after a step that led to `after`, a state of the underlying task."""
         supervision = self.supervision
         holds = torch.zeros_like(after.world.failed)
         for number, phase in enumerate(self.phases):
@@ -191,11 +191,11 @@ class PhasedTask:
         }
 
     def trace(self, state: TaskState) -> tuple[Tensor, Tensor]:
-        """See `Task`."""
+        """Reference and actual points of the underlying task."""
         return self.base.trace(self.plain(state))
 
     def script(self, state: TaskState) -> dict[str, Tensor]:
-        """The expert of the task beneath, whatever the phase."""
+        """Action of the underlying task's expert, in any phase."""
         return self.base.script(self.plain(state))
 
 

@@ -19,7 +19,7 @@ GAP_PX = 6
 
 
 def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
-    """Film strip: the endoscope's pictures at `count` moments from the first beam to the end."""
+    """Film strip of the endoscope's pictures at `count` moments from the first beam to the end."""
     from PIL import Image
 
     from surgisoft.replay.endoscope import jpegs

@@ -32,13 +32,13 @@ class Setting:
     """One condition of the experiment, with `repeats` episodes."""
 
     number: int
-    """Its place among all."""
+    """Number of the setting in the experiment."""
     case: Case
     """Policy and plant."""
     lesion: Lesion | None
-    """Where is cut; None: the scene's own lesion."""
+    """Lesion to cut; None: that of the scene."""
     values: tuple[tuple[str, Value], ...]
-    """What varies: field and value."""
+    """Varied fields and their values."""
 
     @property
     def label(self) -> str:
@@ -49,7 +49,7 @@ class Setting:
 
     @property
     def words(self) -> str:
-        """The label in words."""
+        """Label of the setting in words."""
         parts = [self.case.name, *([self.lesion.name] if self.lesion else [])]
         return ", ".join([*parts, *(f"{f.split('.')[-1]} {v}" for f, v in self.values)])
 
@@ -96,7 +96,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
             )
         bad = [value for value in vary.values if isinstance(value, str) or value < 0]
         if bad:
-            raise (place / "values").error(f"got {bad[0]!r}", "strengths from 0")
+            raise (place / "values").error(f"got {bad[0]!r}", "amplitudes from 0")
     elif top == "fault" and name in ("chamber", "at_s") and spec.faults:
         kind = int if name == "chamber" else int | float
         bad = [v for v in vary.values if not isinstance(v, kind) or v < (name == "chamber")]
@@ -170,7 +170,7 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
 
 
 def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
-    """The phased task of a setting, its arms on the rig where the case says so."""
+    """The phased task of a setting, with its arms on the rig where the case has that plant."""
     config = _configured(spec, setting.values)
     arm = setting.case.arm or config.arm
     config = dataclasses.replace(config, arm=arm, scene=spec.scene)

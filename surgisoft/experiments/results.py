@@ -18,25 +18,25 @@ from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 
 TEXTS = ("setting", "case", "lesion", "outcome")
-"""Columns of a row that are words."""
+"""Columns of a row that hold text."""
 
 
 @dataclass(frozen=True, eq=False)
 class SettingResult:
-    """One setting's episodes."""
+    """Results of one setting: its episodes and their summary."""
 
     label: str
     """The setting's label, see `Setting.label`."""
     case: str
-    """Its case."""
+    """Name of the case."""
     values: dict[str, float | int | str]
-    """What varies, the lesion among it."""
+    """Varied fields and their values, the lesion among them."""
     rows: list[Row]
-    """Its episodes, in order."""
+    """Results of the episodes, in order."""
     overall: dict[str, Summary]
-    """Number of an episode -> its summary over all."""
+    """Name of a number of the episodes -> its summary over all of them."""
     outcomes: dict[str, int]
-    """How episodes ended -> how many, the most frequent first."""
+    """How episodes ended -> number of episodes, the most frequent first."""
 
     @property
     def worst(self) -> int:
@@ -49,15 +49,15 @@ class Results:
     """All results of an experiment."""
 
     experiment: Experiment
-    """The experiment."""
+    """The experiment as its file describes it."""
     folder: Path
-    """Its folder."""
+    """Folder of the results."""
     settings: list[SettingResult]
-    """Every setting, in order."""
+    """Results of every setting, in order."""
 
     @property
     def rows(self) -> list[Row]:
-        """Every episode."""
+        """Results of every episode of every setting."""
         return [row for setting in self.settings for row in setting.rows]
 
     @property
@@ -67,7 +67,7 @@ class Results:
         return row["setting"], row["episode"]
 
     def log(self, label: str, episode: int) -> EpisodeLog:
-        """The log of an episode that was kept: a setting's first and worst."""
+        """Log of a stored episode: the first and the worst of each setting."""
         return load_episode(log_file(self.folder, label, episode))
 
 
@@ -76,14 +76,15 @@ def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
     varied = ["lesion", *(vary.field for vary in spec.vary)]
     found = []
     for label in dict.fromkeys(row["setting"] for row in rows):
-        own = [row for row in rows if row["setting"] == label]
-        numbers = [n for n in own[0] if n not in (*TEXTS, *varied, "episode")]
+        episodes = [row for row in rows if row["setting"] == label]
+        numbers = [n for n in episodes[0] if n not in (*TEXTS, *varied, "episode")]
         overall = {
-            name: summary(_numbers([row[name] for row in own]), name in RATES) for name in numbers
+            name: summary(_numbers([row[name] for row in episodes]), name in RATES)
+            for name in numbers
         }
-        values = {name: own[0][name] for name in varied if name in own[0]}
-        outcomes = dict(Counter(row["outcome"] for row in own).most_common())
-        found.append(SettingResult(label, own[0]["case"], values, own, overall, outcomes))
+        values = {name: episodes[0][name] for name in varied if name in episodes[0]}
+        outcomes = dict(Counter(row["outcome"] for row in episodes).most_common())
+        found.append(SettingResult(label, episodes[0]["case"], values, episodes, overall, outcomes))
     return Results(spec, folder, found)
 
 

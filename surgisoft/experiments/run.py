@@ -50,7 +50,7 @@ class Block:
     """Results of episodes that ran side by side."""
 
     rows: list[Row]
-    """One for each, see `Results`."""
+    """Results of each episode, see `Results`."""
     logs: dict[int, EpisodeLog]
     """Episode's number -> log: number 0, and the worst of the block."""
 
@@ -60,15 +60,15 @@ class Job:
     """One block of episodes of one setting."""
 
     setting: Setting
-    """The setting."""
+    """Setting of all episodes of the block."""
     first: int
-    """Number of its first episode."""
+    """Number of the block's first episode."""
     count: int
-    """Episodes."""
+    """Number of episodes."""
 
 
 def jobs(spec: Experiment) -> list[Job]:
-    """Every block, those of a setting one after the other."""
+    """Every block of episodes, setting by setting."""
     return [
         Job(setting, first, min(spec.together, spec.repeats - first))
         for setting in settings(spec)
@@ -77,12 +77,12 @@ def jobs(spec: Experiment) -> list[Job]:
 
 
 def row_file(folder: Path, setting: Setting, episode: int) -> Path:
-    """Where an episode's numbers lie."""
+    """Path of an episode's numbers."""
     return folder / "rows" / f"{setting.label}-{episode:04d}.json"
 
 
 def log_file(folder: Path, setting: str, episode: int) -> Path:
-    """Where an episode's log lies, if it was kept."""
+    """Path of an episode's log, which exists for stored episodes only."""
     return folder / "logs" / f"{setting}-{episode:04d}.npz"
 
 
@@ -101,7 +101,8 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
             raise InputError(f"{folder}: already there and no results; choose another folder")
         if not force:
             raise InputError(
-                f"{folder}: results are already there; --resume goes on, --force begins anew"
+                f"{folder}: results are already there; --resume continues them, "
+                "--force replaces them"
             )
     check_playable(spec)
     if force and there:
@@ -185,7 +186,7 @@ def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: in
                 yield waiting[future]
     except BrokenProcessPool:
         raise InputError(
-            f"a process of {processes} was ended from outside, memory may be short; go on with "
+            f"one of {processes} processes was killed, perhaps for lack of memory; continue with "
             "--resume and fewer --processes"
         ) from None
 

@@ -67,7 +67,7 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     )
     names = [case.name for case in (*spec.cases, *twins)]
     if len(set(names)) < len(names):
-        raise InputError(f"{folder}: a case of that name is there already; rename the folder")
+        raise InputError(f"{folder}: there is a case of that name already; rename the folder")
     return replace(spec, cases=(*spec.cases, *twins))
 
 
@@ -80,13 +80,13 @@ def start_experiment(
     resume: bool = False,
     force: bool = False,
 ) -> tuple[Experiment, Path]:
-    """The experiment and its folder of results, made or found ready to be resumed.
+    """The experiment and its folder of results, new or ready to be resumed.
 
-    output: default `results/NAME`. policies: folders of training runs, each in a case of its own.
-    repeats: episodes of each setting. resume: go on with results that are there; force: begin anew.
+    output: default `results/NAME`. policies: folders of training runs, each added as a case.
+    repeats: episodes of each setting. resume: continue existing results; force: replace them.
     """
     if resume and force:
-        raise InputError("--resume goes on, --force begins anew: give one of them")
+        raise InputError("--resume continues results, --force replaces them: give one of the two")
     spec = open_experiment(name)
     for folder in policies:
         spec = with_policy(spec, folder)

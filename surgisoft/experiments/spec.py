@@ -24,11 +24,11 @@ FILE = "experiment.toml"
 EXPERIMENT_TASK = ABLATION
 """The task that experiments are made with."""
 TASK = EXPERIMENT_TASK.name
-"""Its name in the registry."""
+"""Name of that task in the registry."""
 CONTROLLERS = ("hold", "rest", "scripted", "policy")
-"""Controllers of an arm beside those that the file defines."""
+"""Built-in controllers of an arm; a file may define more."""
 PLANTS = ("simulation", "rig")
-"""What the arms are."""
+"""Plants: the arm models, or the virtual rig."""
 SCRIPTED, NOMINAL = "scripted", "nominal"
 """The task's expert, which knows the true state; the one that assumes the scene's mounts."""
 
@@ -65,13 +65,13 @@ class Phase:
     endoscope: Name = "hold"
     """Controller of the endoscope arm."""
     beam: bool = False
-    """Whether the beam may be on; the interlock holds besides."""
+    """Whether the phase permits the beam; the interlock must permit it, too."""
     until: Annotated[str, _one_of(EXPERIMENT_TASK.conditions)] = "never"
     """The condition to go on to the next phase."""
     within: Annotated[float, Rule("a number from -1 to 1000", lambda v: -1.0 <= v <= 1e3)] = -1.0
-    """The condition's number, in its own unit; -1: the one it has by itself."""
+    """Threshold of the condition, in the condition's unit; -1: its default."""
     hold_s: Duration = 0.0
-    """How long the condition has to hold without a break, s."""
+    """Time for which the condition has to hold without interruption, s."""
     on_timeout: Annotated[str, _one_of(("abort", "go on"))] = "abort"
     """What happens when the time of this phase is out."""
 
@@ -81,7 +81,7 @@ class ControllerSpec:
     """A user-defined controller of an arm: a pressure schedule or waypoints."""
 
     name: Name
-    """By which phases call it."""
+    """Name by which phases refer to the controller."""
     schedule: str = ""
     """CSV with t_s and c1_kPa ... cm_kPa, linear between rows, from the phase's begin."""
     waypoints: tuple[tuple[float, float, float, float], ...] = ()
@@ -96,11 +96,12 @@ class Case:
     name: Name
     """Its name, unique in the experiment."""
     plant: Annotated[str, _one_of(PLANTS)] = PLANTS[0]
-    """`simulation`: the arm models; `rig`: each arm on the virtual rig."""
+    """Plant: `simulation` for the arm models, `rig` for each arm on the virtual rig."""
     policy: str = SCRIPTED
-    """Policy of phases that say `policy`: scripted, nominal, or a training run's folder."""
+    """Policy of phases with the controller `policy`: scripted, nominal, or a training run's folder.
+    """
     hidden: tuple[str, ...] = ()
-    """On the rig: hidden effects, NAME or NAME:STRENGTH."""
+    """On the rig: hidden effects, NAME or NAME:AMPLITUDE."""
     specimen: Seed = 0
     """On the rig: seed of the virtual robot."""
     arm: str = ""
@@ -109,7 +110,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Lesion:
-    """A place to cut in place of the scene's own."""
+    """A lesion to cut instead of that of the scene."""
 
     name: Name
     """Its name, unique in the experiment."""
@@ -121,37 +122,38 @@ class Lesion:
 
 @dataclass(frozen=True)
 class Vary:
-    """One thing that takes several values; several of them make a grid."""
+    """A field that varies over several values; several such fields make a grid."""
 
     field: str
-    """`task.NAME` (dots go deeper), `hidden.EFFECT` (strength, on the rig), `rig.specimen`,
+    """`task.NAME` (dots go deeper), `hidden.EFFECT` (amplitude, on the rig), `rig.specimen`,
     `fault.chamber` or `fault.at_s`."""
     values: Annotated[
         tuple[int | float | str, ...], Rule("a list of at least one value", lambda v: len(v) > 0)
     ]
-    """Its values."""
+    """Values of the field."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something breaks in every episode."""
+    """A failure of a chamber in every episode."""
 
     arm: Annotated[str, _one_of(("laser", "endoscope"))]
-    """Whose chamber."""
+    """Arm of the chamber."""
     at_s: Duration
-    """When, s from the episode's begin."""
+    """Time of the failure, s from the episode's begin."""
     chamber: Count = 1
-    """Which chamber, from 1: its valve stays open, so that it goes to 0 kPa as fast as a pump."""
+    """Number of the chamber, from 1: its valve stays open, and it goes to 0 kPa as fast as a pump.
+    """
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What stops the beam, and what aborts."""
+    """Limits that switch the beam off or abort an episode."""
 
     time_s: Positive = 60.0
     """Longest time of an episode, s."""
     clearance_mm: AnyLength = 0.0
-    """The beam is off while any clearance is below this or below the scene's own limit, mm."""
+    """The beam is off while any clearance is below this or below the limit of the scene, mm."""
     abort_clearance_mm: AnyLength = 0.0
     """Aborts below this clearance, mm."""
     view_lost_s: Duration = 2.0
@@ -162,36 +164,36 @@ class Limits:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A whole experiment's file, its paths made absolute."""
+    """Content of an experiment's file, with absolute paths."""
 
     name: Name
-    """Its name."""
+    """Name of the experiment."""
     scene: str
     """Folder of the scene, relative to the file."""
     phases: tuple[Phase, ...]
-    """What happens, in order."""
+    """Phases of an episode, in order."""
     repeats: Count = 1
     """Episodes of each condition."""
     seed: Seed = 0
-    """Of all episodes; each condition has the same ones."""
+    """Seed of the episodes, which are equal in each condition."""
     together: Count = 8
     """Episodes that run side by side: the unit of parallel work and of resuming."""
     cases: tuple[Case, ...] = (Case(PLANTS[0]),)
-    """What is compared side by side."""
+    """Cases that are compared with each other."""
     lesions: tuple[Lesion, ...] = ()
-    """Where to cut; none: the scene's own lesion."""
+    """Lesions to cut; none: that of the scene."""
     vary: tuple[Vary, ...] = ()
-    """What takes several values."""
+    """Fields that vary."""
     drivers: tuple[ControllerSpec, ...] = ()
     """User-defined controllers that phases name."""
     faults: tuple[Fault, ...] = ()
-    """What breaks."""
+    """Failures that are injected."""
     limits: Limits = field(default_factory=Limits)
-    """Limits."""
+    """Limits that switch the beam off or abort an episode."""
     task: CircleAblationConfig = field(default_factory=CircleAblationConfig)
-    """The cut: fields of the task `circle_ablation`, without `scene` and `arm`."""
+    """Fields of the task `circle_ablation`, without `scene` and `arm`."""
     note: str = ""
-    """Free text."""
+    """Free text, for people."""
     format: Format = FORMAT
     """Version of this file format."""
 
@@ -200,16 +202,16 @@ def load_experiment(path: str | Path) -> Experiment:
     """Read an experiment's file; an InputError names file, line and field of what is wrong."""
     path = Path(path)
     table, where = read_toml(path)
-    own = table.pop("task", {})
-    if not isinstance(own, dict):
-        raise (where / "task").error(f"got '{own}'", "a table")
+    given = table.pop("task", {})
+    if not isinstance(given, dict):
+        raise (where / "task").error(f"got '{given}'", "a table")
     for name in ("scene", "arm"):
-        if name in own:
+        if name in given:
             raise (where / "task" / name).error(
                 "does not belong here", "the scene at the top, the arm in a case"
             )
     plain = to_table(CircleAblationConfig()) | {"scene": ""}
-    task = task_config(merged(plain, with_present_names(CircleAblationConfig(), own)), where)
+    task = task_config(merged(plain, with_present_names(CircleAblationConfig(), given)), where)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
     return _absolute(spec, where)
@@ -289,7 +291,7 @@ def _check_whole(spec: Experiment, where: Where) -> None:
     for name in ("phases", "cases"):
         if not getattr(spec, name):
             raise (where / name).error("none is given", "at least one")
-    own = [driver.name for driver in spec.drivers]
+    defined = [driver.name for driver in spec.drivers]
     for i, driver in enumerate(spec.drivers):
         place = where / "drivers" / i
         if driver.name in CONTROLLERS:
@@ -303,9 +305,9 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             raise (place / "waypoints").error(f"times {times}", "times that rise from 0 s")
     for i, phase in enumerate(spec.phases):
         for arm in ("laser", "endoscope"):
-            if getattr(phase, arm) not in (*CONTROLLERS, *own):
+            if getattr(phase, arm) not in (*CONTROLLERS, *defined):
                 raise (where / "phases" / i / arm).error(
-                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*CONTROLLERS, *own))}"
+                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*CONTROLLERS, *defined))}"
                 )
     known = [phase.name for phase in spec.phases]
     if spec.limits.retreat not in ("", *known):

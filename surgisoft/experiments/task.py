@@ -1,6 +1,6 @@
-"""What a task offers so that experiments can be made with it: phases, an interlock, its results.
+"""What a task must offer for experiments: phases, an interlock and results.
 
-`ExperimentTask` is the static part, one value for each task; `Supervision` is laid over a task that
+`ExperimentTask` is the static part, one value for each task; `Supervision` supplements a task that
 was built. `ablation.ABLATION` offers both for `circle_ablation`.
 """
 
@@ -24,15 +24,15 @@ class Condition:
     """A condition under which an episode goes on to its next phase."""
 
     about: str
-    """When it holds, with the unit of its number."""
+    """When the condition holds, with the unit of its threshold."""
     within: float
-    """The number where a phase gives none."""
+    """Default of the threshold."""
     holds: Callable[[Any, TaskState, float], Tensor]
     """(task, state, within) -> (B,) bool; the task as it was built, without phases."""
 
 
 class Supervision(Protocol):
-    """Access to a task that phases, limits and the interlock need; states are the task's own.
+    """Access to a task that phases, limits and the interlock need; states are those of the task.
 
     Tensors have the batch in front.
     """
@@ -40,7 +40,7 @@ class Supervision(Protocol):
     task: Task
     """The task, in simulation or on rigs."""
     clearance_limit_mm: float
-    """The scene's own limit of clearance, which no experiment can loosen, mm."""
+    """Limit of clearance of the scene, which no experiment can lower, mm."""
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the target is seen well enough to work on it."""
@@ -49,10 +49,10 @@ class Supervision(Protocol):
         """(B,) mm: least clearance to bodies and between arms."""
 
     def collides(self, state: TaskState) -> Tensor:
-        """(B,) bool: something touches."""
+        """(B,) bool: an arm touches a body, another arm or itself."""
 
     def fires(self, state: TaskState) -> Tensor:
-        """(B,) bool: the task by itself would switch its beam on."""
+        """(B,) bool: the task would switch its beam on."""
 
     def fired(self, state: TaskState) -> Tensor:
         """(B,) bool: the beam was on in the step that led here."""
@@ -61,7 +61,7 @@ class Supervision(Protocol):
         """Advance one step; the beam is on where `fired` (B,) bool is set."""
 
     def action_through(self, agent: str, state: TaskState, target_mm: Tensor) -> Tensor:
-        """(B, m) kPa: the action that turns an arm's axis through targets (B, 3) mm, world."""
+        """(B, m) kPa: the action that points an arm's axis through targets (B, 3) mm, world."""
 
 
 @dataclass(frozen=True)

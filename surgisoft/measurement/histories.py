@@ -26,7 +26,7 @@ SIZES = 20.0
 OUTSIDE_SHARE = 0.03
 """How far beyond the fitted range, as a share of it, an actuation may go without a note."""
 IDLE_SHARE = 0.02
-"""A chamber that moved no more than this share of the widest range stood still: it is ignored."""
+"""A chamber that moved no more than this share of the widest range is ignored as not moved."""
 
 
 def actuation_of(recording: Recording, actuation: str) -> np.ndarray:
@@ -75,7 +75,7 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
 def actuation_noise(recording: Recording, actuation: str = "measured") -> np.ndarray:
     """(m,) standard deviation of the actuation at rest, in the recording's unit.
 
-    From differences between neighbouring samples whose command did not change; without commands,
+    Estimated from differences between neighbouring samples of equal command; without commands,
     from those differences that are small beside the chamber's range. Robust by the median.
     """
     signal = actuation_of(recording, actuation)
@@ -177,7 +177,7 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
             if came != expected:
                 raise InputError(
                     f"{recording.label}: {what}: {came}, but the model has {expected}; "
-                    "use recordings of the model's own arm"
+                    "use recordings of the arm that the model was fitted to"
                 )
         extent = _extent_mm(recording.key_points_mm)
         if spec.length_mm and (extent > SIZES * spec.length_mm or extent < spec.length_mm / SIZES):

@@ -5,7 +5,7 @@ import numpy as np
 from surgisoft.measurement.recordings import Recording
 
 LEAST_HOLD_S = 1.0
-"""Shortest hold whose scatter is taken for noise, s."""
+"""Shortest hold whose scatter is used as noise, s."""
 LEAST_HOLD_ROWS = 8
 """Fewest rows of such a hold."""
 LEAST_HOLDS = 5

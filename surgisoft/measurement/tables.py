@@ -44,7 +44,7 @@ class Cells(Protocol):
         ...
 
     def place(self, row: int) -> str:
-        """Where a row, counted from 0, stands in the file, for messages."""
+        """File and place of a row, counted from 0, for messages."""
         ...
 
 
@@ -58,21 +58,23 @@ def label(names: Sequence[str], position: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ParquetTable:
-    """The columns of a Parquet file."""
+    """Columns of a Parquet file, read when asked for."""
 
     path: Path
+    """Path of the file."""
     names: list[str]
     """Names of the columns."""
 
     @classmethod
     def open(cls, path: Path) -> "ParquetTable":
-        """The file's table; its columns are not read yet."""
+        """Open a Parquet file without reading its columns; InputError if it is unreadable."""
         try:
             return cls(path, list(pq.read_schema(path).names))
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path}: not a readable Parquet file") from error
 
     def numbers(self, positions: Sequence[int]) -> np.ndarray:
+        """Cells (T, len(positions)) float64 of columns; raises InputError for other types."""
         columns = []
         for column, position in zip(self._read(positions), positions, strict=True):
             try:
@@ -88,10 +90,12 @@ class ParquetTable:
         return np.column_stack(columns).astype(np.float64, copy=False)
 
     def texts(self, position: int) -> list[str]:
+        """Cells (T,) of a column as text; empty where missing."""
         (column,) = self._read([position])
         return ["" if value is None else str(value) for value in column.to_pylist()]
 
     def place(self, row: int) -> str:
+        """File and row, counted from 1, of a row for messages."""
         return f"{self.path}, row {row + 1}"
 
     def _read(self, positions: Sequence[int]) -> list[pa.ChunkedArray]:
@@ -129,9 +133,10 @@ def read_text(path: Path) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class DelimitedText:
-    """The columns of a text file below its header."""
+    """Columns of a text file below its header, read when asked for."""
 
     path: Path
+    """Path of the file."""
     body: bytes
     """The lines below the header; blank ones do not count as rows."""
     first_line: int
@@ -139,11 +144,17 @@ class DelimitedText:
     names: list[str]
     """Names of the columns; "" where a column has none."""
     separator: str = ","
+    """Character between two cells."""
     decimal: str = "."
+    """Decimal point or comma."""
     missing: tuple[str, ...] = MISSING
     """Texts that mean a missing value."""
 
     def numbers(self, positions: Sequence[int]) -> np.ndarray:
+        """Cells (T, len(positions)) float64 of columns, NaN where missing.
+
+        Raises InputError with the line of a cell that is no number.
+        """
         try:
             columns = self._read(positions, pa.float64())
         except pa.ArrowInvalid:
@@ -153,6 +164,7 @@ class DelimitedText:
         return np.column_stack([c.to_numpy() for c in columns]).astype(np.float64, copy=False)
 
     def texts(self, position: int) -> list[str]:
+        """Cells (T,) of a column as text, without surrounding spaces."""
         try:
             (column,) = self._read([position], pa.string())
         except pa.ArrowInvalid:
@@ -160,6 +172,7 @@ class DelimitedText:
         return ["" if value is None else value.strip() for value in column.to_pylist()]
 
     def place(self, row: int) -> str:
+        """File and line of a row for messages."""
         for index, (line, _) in enumerate(self._lines()):
             if index == row:
                 return f"{self.path}, line {line}"

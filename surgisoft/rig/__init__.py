@@ -1,6 +1,6 @@
-"""Rigs: what a bench with a soft arm is to the program, and a virtual one that simulates it.
+"""Rigs: the interface of a test bench with a soft arm, and a simulated test bench.
 
-`interface` says what a rig offers, real or virtual; `collect` drives any of them through a protocol
+`interface` defines a rig, real or virtual; `collect` drives any of them through a protocol
 into a recording. `virtual` is the simulated rig: `arm` (with `rod`, `wall`, `friction`),
 `pneumatics`, `motion_capture` and the hidden `effects`, stepped together in `bench`. It shares no
 code and no formula with the arm models and imports neither them nor torch.

@@ -60,7 +60,7 @@ class ArmDesign:
     friction_lines: int = 6
     """Fibres of the wall that carry fibre friction."""
     slip_strain: float = 0.012
-    """Strain over which fibres come loose after a reversal [-]."""
+    """Strain over which fibres detach after a reversal [-]."""
     largest_gap: float = 0.034
     """Largest up/down gap of the tip over the length [-] (Chen et al. 2025, sec. III)."""
     low_kPa: float = -15.0
@@ -95,7 +95,7 @@ class Robot(NamedTuple):
     """One fabricated arm."""
 
     rod: Rod
-    """Statics."""
+    """Statics of the arm as a rod."""
     friction: Friction
     """Memory of the wall."""
 
@@ -114,16 +114,17 @@ class Memory(NamedTuple):
 
 
 def new_memory(lines: int) -> Memory:
-    """A rested wall."""
+    """Memory of a wall without history."""
     return Memory(np.zeros(3), *rested(lines))
 
 
 @compiled
-def remember(robot, pressures, thrusts, memory):
-    """Take the wall's fibres to the strains of a free section under the chamber pressures.
+def remember(robot: Robot, pressures: np.ndarray, thrusts: np.ndarray, memory: Memory) -> bool:
+    """Move the strains of the wall's fibres to those of a free section under chamber pressures.
 
     pressures: (m,) [kPa]; thrusts: (m,) scratch. The free section (no weight) mixes the chambers
-    in every line; between two calls the strains must have moved monotonically. False: no strain.
+    in every line; between two calls the strains must have moved monotonically. Returns False where
+    the section has no equilibrium.
     """
     wall = robot.rod.wall
     for i in range(pressures.shape[0]):
@@ -137,7 +138,7 @@ def remember(robot, pressures, thrusts, memory):
 
 
 @compiled
-def friction_forces(friction, memory, forces):
+def friction_forces(friction: Friction, memory: Memory, forces: np.ndarray) -> None:
     """(J,) friction force of each line [N], into `forces`; positive while its strain rises."""
     for j in range(forces.shape[0]):
         forces[j] = friction.force[j] * lag(
@@ -147,8 +148,8 @@ def friction_forces(friction, memory, forces):
 
 
 @compiled
-def add_line_forces(friction, forces, active):
-    """Put the lines' tension (J,) [N] into what the wall makes by itself (K, 4) [N, N mm].
+def add_line_forces(friction: Friction, forces: np.ndarray, active: np.ndarray) -> None:
+    """Add the lines' tension (J,) [N] to the internal loads (K, 4) [N, N mm] of the wall.
 
     A line under tension pulls the section together: it counts against the thrust.
     """
@@ -161,7 +162,7 @@ def add_line_forces(friction, forces, active):
 
 
 @compiled
-def chamber_thrusts(rod, pressures, thrusts):
+def chamber_thrusts(rod: Rod, pressures: np.ndarray, thrusts: np.ndarray) -> None:
     """(K, m) thrust p_i A_i [N] of each chamber at each station, from (m,) pressures [kPa]."""
     for k in range(thrusts.shape[0]):
         for i in range(pressures.shape[0]):
@@ -169,7 +170,9 @@ def chamber_thrusts(rod, pressures, thrusts):
 
 
 @compiled
-def settle_path(robot, loads, path, memory, shape, tips):
+def settle_path(
+    robot: Robot, loads: Loads, path: np.ndarray, memory: Memory, shape: Shape, tips: np.ndarray
+) -> bool:
     """Quasi-static tips (T, 3) [mm] along chamber pressures (T, m) [kPa]; False: failed."""
     forces = np.empty(robot.friction.force.shape[0])
     scratch = np.empty(path.shape[1])
@@ -254,7 +257,7 @@ def calibrated(robot: Robot, design: ArmDesign, gravity: np.ndarray) -> Robot:
 
 
 def fabricate(design: ArmDesign, seed: int, gravity: np.ndarray) -> Robot:
-    """Fabricate one robot; its seed draws everything in which hand-cast arms differ.
+    """Fabricate one robot; its seed draws the tolerances in which cast arms differ.
 
     gravity: (3,) unit vector of weight in the base frame, under which the friction is calibrated.
     """

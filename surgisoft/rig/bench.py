@@ -67,13 +67,13 @@ class Plant(NamedTuple):
     """All parameters of a virtual rig; constant."""
 
     robot: Robot
-    """The arm."""
+    """Parameters of the arm."""
     loads: Loads
     """External loads on the arm."""
     pumps: Pumps
-    """The pneumatics."""
+    """Parameters of the pneumatics."""
     cameras: Cameras
-    """The motion capture."""
+    """Parameters of the motion capture."""
     effects: Effects
     """Amplitudes of the hidden effects."""
 
@@ -84,7 +84,7 @@ class State(NamedTuple):
     steps: np.ndarray
     """(1,) int64 controller periods since the rig was switched on."""
     gas: np.ndarray
-    """(m, COLUMNS) pumps."""
+    """(m, COLUMNS) state of the pumps, see `pneumatics`."""
     target: np.ndarray
     """(m,) commanded pressures [kPa]."""
     chamber: np.ndarray
@@ -100,7 +100,7 @@ class State(NamedTuple):
     shape: Shape
     """The rod's last equilibrium."""
     tracking: Tracking
-    """The cameras."""
+    """State of the cameras' tracking."""
     forces: np.ndarray
     """(J,) friction of the wall's fibres [N]."""
     thrusts: np.ndarray
@@ -166,20 +166,20 @@ def steps_in(plant: Plant, seconds: float) -> int:
 
 
 def tape_of_pause(plant: Plant, steps: int) -> int:
-    """Normal numbers that a pause of so many controller periods takes."""
+    """Number of standard normals that a pause of so many controller periods consumes."""
     if steps == 0:
         return 0
     return steps * len(plant.pumps.tube) + normals_per_pause(plant.cameras)
 
 
 def tape_of_sample(plant: Plant) -> int:
-    """Normal numbers that one sample takes."""
+    """Number of standard normals that one sample consumes."""
     m = len(plant.pumps.tube)
     return (steps_in(plant, plant.cameras.period) + 1) * m + normals_per_frame(plant.cameras)
 
 
 def rest(plant: Plant, state: State) -> None:
-    """Vent the arm and let it forget."""
+    """Vent the arm and reset its memory, so that it has no history."""
     vent(plant.pumps, state.gas)
     forget(state.history)
     for memory in (state.target, state.chamber, state.effective, *state.memory[:3]):
@@ -189,8 +189,11 @@ def rest(plant: Plant, state: State) -> None:
 
 
 @compiled
-def advance(plant, state, steps, tape, at):
-    """Pumps and wall over `steps` controller periods; the tape's next index, -1 on failure."""
+def advance(plant: Plant, state: State, steps: int, tape: np.ndarray, at: int) -> int:
+    """Advance pumps and wall by `steps` controller periods.
+
+    Returns the next index of the tape of standard normals, or -1 on failure.
+    """
     pumps, effects = plant.pumps, plant.effects
     wall = plant.robot.rod.wall
     for _ in range(steps):
@@ -224,8 +227,8 @@ def advance(plant, state, steps, tape, at):
 
 
 @compiled
-def take_shape(plant, state):
-    """The arm's equilibrium under the present pressures and memory; False where none was found."""
+def take_shape(plant: Plant, state: State) -> bool:
+    """Solve the arm's equilibrium under the present pressures and memory; False on failure."""
     robot, effects, active = plant.robot, plant.effects, state.shape.active
     friction_forces(robot.friction, state.memory, state.forces)
     add_effect_forces(effects, state.memory.last, state.history, state.forces)
@@ -240,8 +243,10 @@ def take_shape(plant, state):
 
 
 @compiled
-def look_at(plant, state, tape, at, frames, index):
-    """What sensors and cameras show of the present state, into frames[index]; next tape index."""
+def look_at(
+    plant: Plant, state: State, tape: np.ndarray, at: int, frames: Frames, index: int
+) -> int:
+    """Write the readings of sensors and cameras into frames[index]; returns the next tape index."""
     effects, shape, tracking = plant.effects, state.shape, state.tracking
     time = state.steps[0] * plant.pumps.step
     for i in range(state.gas.shape[0]):
@@ -264,7 +269,16 @@ def look_at(plant, state, tape, at, frames, index):
 
 
 @compiled
-def run_commands(plant, state, commands, pause, steps, count, tape, frames):
+def run_commands(
+    plant: Plant,
+    state: State,
+    commands: np.ndarray,
+    pause: int,
+    steps: int,
+    count: int,
+    tape: np.ndarray,
+    frames: Frames,
+) -> bool:
     """After each row of commands (P, m) [kPa] a pause, then `count` samples; False on failure.
 
     pause: controller periods without samples (0: none); steps: controller periods from sample to

@@ -91,7 +91,7 @@ def average(frames: np.ndarray) -> np.ndarray:
 
 
 def mean_sample(samples: list[Sample]) -> Sample:
-    """The average of the samples of one settled point."""
+    """Average of the samples of one steady-state point."""
 
     def mean(values: list) -> np.ndarray:
         return average(np.array(values)[None])[0]

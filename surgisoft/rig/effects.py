@@ -1,4 +1,4 @@
-"""Hidden effects in compiled code: what a bench does beyond the plain arm, each in its own form.
+"""Hidden effects in compiled code: deviations of the virtual rig from the nominal arm.
 
 Every amplitude is zero where the effect is off, and then nothing of it is computed. The forms are
 those of the mechanics literature where there is one, and none is the formula of an arm model.
@@ -12,9 +12,9 @@ import numpy as np
 from surgisoft.compiled import compiled
 
 CREEP_TIMES = np.array([0.6, 2.4, 9.6, 38.4, 153.6])
-"""Retardation times [s] whose sum stands for a power law over three decades (Findley 1976)."""
+"""Retardation times [s] whose sum approximates a power law over three decades (Findley 1976)."""
 SLIP_S = 150.0
-"""Time that a loose marker takes to slip, while the arm is bent [s]."""
+"""Time constant with which a loose marker slips while the arm is bent [s]."""
 REFERENCE_KPA = 54.0
 """Pressure by which amplitudes are scaled [kPa]."""
 BREATH_POWER = 6
@@ -34,7 +34,7 @@ class Effects(NamedTuple):
     leak: np.ndarray
     """(m,) pressure lost over the tube at 54 kPa [kPa]."""
     dead_zone: float
-    """Pressure taken up before a chamber pushes [kPa]."""
+    """Pressure below which a chamber does not push [kPa]."""
     gain: np.ndarray
     """(m,) relative change of a chamber's push at low pressure [-]."""
     coupling: np.ndarray
@@ -91,7 +91,7 @@ class History(NamedTuple):
 
 
 def no_effects(chambers: int, line_stiffness: float) -> Effects:
-    """Everything off. line_stiffness: modulus times area of one wall fibre [N]."""
+    """Amplitudes with every effect off; line_stiffness: modulus times area of one fibre [N]."""
     return Effects(
         friction=0.0,
         line=np.zeros(2),
@@ -121,7 +121,7 @@ def no_effects(chambers: int, line_stiffness: float) -> Effects:
 
 
 def new_history(chambers: int, lines: int) -> History:
-    """No past."""
+    """History of effects on an arm that never moved."""
     return History(
         creep=np.zeros((chambers, len(CREEP_TIMES))),
         followed=np.zeros(lines),
@@ -131,8 +131,8 @@ def new_history(chambers: int, lines: int) -> History:
     )
 
 
-def forget(history):
-    """What venting and resting undo."""
+def forget(history: History) -> None:
+    """Reset the history that venting and resting undo."""
     history.creep[:] = 0.0
     history.followed[:] = 0.0
     history.stuck[:] = 0.0
@@ -140,16 +140,23 @@ def forget(history):
 
 
 @compiled
-def shown_pressure(effects, gas, column, i):
+def shown_pressure(effects: Effects, gas: np.ndarray, column: int, i: int) -> float:
     """Pressure [kPa] at sensor i; a multiplexer that settles slowly mixes in the channel before."""
-    own = gas[i, column]
+    pressure = gas[i, column]
     if effects.crosstalk == 0.0:
-        return own
-    return own + effects.crosstalk * (gas[i - 1, column] - own)
+        return pressure
+    return pressure + effects.crosstalk * (gas[i - 1, column] - pressure)
 
 
 @compiled
-def effective_pressures(effects, time, step, chamber, history, effective):
+def effective_pressures(
+    effects: Effects,
+    time: float,
+    step: float,
+    chamber: np.ndarray,
+    history: History,
+    effective: np.ndarray,
+) -> None:
     """Pressures (m,) [kPa] that push on the wall, from those in the chambers (m,) [kPa].
 
     time, step: [s]. Leak: a crack that opens above 5 kPa, so that the flow along the tube takes
@@ -185,11 +192,11 @@ def effective_pressures(effects, time, step, chamber, history, effective):
 
 
 @compiled
-def follow_lines(effects, step, strains, history):
+def follow_lines(effects: Effects, step: float, strains: np.ndarray, history: History) -> None:
     """Let the lines' memories follow their strains (J,) over one period [s].
 
-    Rate: the wall beside a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d = e - y what the
-    strain y lacks of the strain e that the wall would take by itself. While e stands still,
+    Rate: the wall parallel to a shear-thinning fluid, E d = c sqrt(y' / 0.1), with d = e - y what
+    the strain y lacks of the strain e that the wall would take by itself. While e stands still,
     d(t) = d / (1 + 0.1 (E / c)^2 |d| t).
     """
     for j in range(strains.shape[0]):
@@ -205,7 +212,9 @@ def follow_lines(effects, step, strains, history):
 
 
 @compiled
-def add_effect_forces(effects, strains, history, forces):
+def add_effect_forces(
+    effects: Effects, strains: np.ndarray, history: History, forces: np.ndarray
+) -> None:
     """Add the effects' tension of each line [N] to forces (J,); strains: (J,) [-].
 
     Rate: what the fluid of `follow_lines` carries. Stick-slip: springs that let go all at once.
@@ -230,7 +239,7 @@ def add_effect_forces(effects, strains, history, forces):
 
 
 @compiled
-def add_twist(effects, effective, active):
+def add_twist(effects: Effects, effective: np.ndarray, active: np.ndarray) -> None:
     """Torque of fibres wound unequally, growing faster than pressure, into active (K, 4) [N mm]."""
     torque = 0.0
     for i in range(effective.shape[0]):
@@ -241,7 +250,7 @@ def add_twist(effects, effective, active):
 
 
 @compiled
-def room_temperature(effects, time):
+def room_temperature(effects: Effects, time: float) -> float:
     """Temperature [degrees Celsius] at a time [s]: the bench warms up, the heating cycles."""
     if effects.warmth == 0.0:
         return 22.0
@@ -250,7 +259,7 @@ def room_temperature(effects, time):
 
 
 @compiled
-def drifted_base(effects, time, base, out):
+def drifted_base(effects: Effects, time: float, base: np.ndarray, out: np.ndarray) -> None:
     """Base quaternion (4,) at a time [s]: the bracket yields like a saturating power law, and is
     knocked aside at one moment."""
     out[:] = base
@@ -273,7 +282,7 @@ def drifted_base(effects, time, base, out):
 
 
 @compiled
-def valve_shut(effects, time, i):
+def valve_shut(effects: Effects, time: float, i: int):
     """Whether the valve of chamber i is stuck shut at a time [s]."""
     if i != effects.jammed:
         return False
@@ -282,8 +291,8 @@ def valve_shut(effects, time, i):
 
 
 @compiled
-def carry_mount(effects, time, points):
-    """Shift points (n, k, 3) [mm] with a mount that lies on a breathing body; in place. time: [s].
+def carry_mount(effects: Effects, time: float, points: np.ndarray) -> None:
+    """Shift points (n, k, 3) [mm] in place with a mount that lies on a breathing body. time: [s].
 
     The waveform of organ motion of Lujan et al. (1999); zero is the end of exhaling.
     """
@@ -296,7 +305,9 @@ def carry_mount(effects, time, points):
 
 
 @compiled
-def slip_marker(effects, time, frames, history, markers):
+def slip_marker(
+    effects: Effects, time: float, frames: np.ndarray, history: History, markers: np.ndarray
+) -> None:
     """Shift the loose marker of (n, k, 3) [mm] along the arm: it creeps on while the arm is bent.
 
     time: [s]; frames: (n, 3, 3) rotations of the key planes; what the arm does between two frames
@@ -316,7 +327,7 @@ def slip_marker(effects, time, frames, history, markers):
 
 
 @compiled
-def misalign(effects, points):
+def misalign(effects: Effects, points: np.ndarray) -> None:
     """Points (n, k, 3) [mm] as cameras with a wrong calibration place them; in place.
 
     Rodrigues' rotation, a shift, and a radial warp about the arm's middle.

@@ -35,7 +35,7 @@ def _weighted_powers(width, slip):
 
 
 @compiled
-def everett(upper, lower, slip, slope, bow):
+def everett(upper: float, lower: float, slip: float, slope: float, bow: float) -> float:
     """Everett (1955) integral: the density over the triangle lower <= b <= a <= upper.
 
     upper, lower: strains [-]; slip: s [-]; slope: r1 [-]; bow: r2 [-].
@@ -46,7 +46,7 @@ def everett(upper, lower, slip, slope, bow):
 
 
 @compiled
-def virgin(strain, slip, slope, bow):
+def virgin(strain: float, slip: float, slope: float, bow: float) -> float:
     """Output on the first loading of a rested wall, whose relays are up where c < 0.
 
     strain: [-]; the relays between c = 0 and the strain have switched, each by 2.
@@ -58,8 +58,8 @@ def virgin(strain, slip, slope, bow):
 
 
 @compiled
-def move(line, strain, last, depth, stack):
-    """Take the strain of one fibre to a new value: turning points are added and wiped out.
+def move(line: int, strain: float, last: np.ndarray, depth: np.ndarray, stack: np.ndarray) -> None:
+    """Move the strain of one fibre to a new value: reversal points are added and wiped out.
 
     last: (J,) strain before; depth: (J,) number of turning points; stack: (J, DEPTH) turning
     points, oldest first; all three are updated. Between two calls the strain moved monotonically.
@@ -94,7 +94,15 @@ def _wipe_out(line, strain, count, stack):
 
 
 @compiled
-def lag(line, last, depth, stack, slip, slope, bow):
+def lag(
+    line: int,
+    last: np.ndarray,
+    depth: np.ndarray,
+    stack: np.ndarray,
+    slip: float,
+    slope: float,
+    bow: float,
+) -> float:
     """How far the output of one line lags behind its frictionless value [-]: the friction.
 
     Positive while the strain rises. last, depth, stack as in `move`; slip, slope, bow: density.

@@ -1,4 +1,4 @@
-"""Hidden effects of the virtual rig by name: what `--hidden NAME --strength X` switches on.
+"""Hidden effects of the virtual rig by name, as `--hidden NAME --strength X` switches them on.
 
 At strength 1 an effect moves the tip by about a millimetre (root mean square over the `mixed`
 protocol); benchmarks/collect.py measures it. Signs and places vary with the robot's seed.
@@ -24,12 +24,12 @@ intact arm, and well within the shortest protocol (150 s)."""
 
 @dataclass
 class Setup:
-    """The parts of a rig that a hidden effect may change, and what it needs to know of the rest."""
+    """The parameters of a rig that a hidden effect may change."""
 
     effects: Effects
-    """Amplitudes."""
+    """Amplitudes of the effects."""
     loads: Loads
-    """Outside loads."""
+    """External loads."""
     rod: Rod
     """The arm's statics."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
@@ -43,9 +43,9 @@ class Hidden:
     place: str
     """Where in the chain it acts: line, material, body or sensor."""
     about: str
-    """One line."""
+    """Description in one line."""
     switch_on: Callable[[Setup, float, np.random.Generator], None]
-    """Changes the setup by a strength, with random numbers of the robot's seed."""
+    """Switches the effect on: (setup, amplitude, random numbers of the robot's seed)."""
 
 
 def _set(setup: Setup, **amplitudes) -> None:
@@ -261,7 +261,7 @@ HIDDEN: dict[str, Hidden] = {
 
 
 def switch_on(setup: Setup, names: Iterable[tuple[str, float]], seed: int) -> Setup:
-    """The setup with the named effects, each with its strength (0: off)."""
+    """Apply the named effects to the setup, each with its amplitude (0: off)."""
     seen: set[str] = set()
     for name, strength in names:
         if name not in HIDDEN:

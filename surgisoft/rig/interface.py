@@ -25,7 +25,7 @@ class Sample:
     key_points_mm: np.ndarray
     """(n, 3) centres of the key planes, arm base frame [mm]; NaN where the cameras lost one."""
     temp_C: float | None = None
-    """Temperature beside the arm [degrees Celsius], where there is a thermometer."""
+    """Temperature near the arm [degrees Celsius], where there is a thermometer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Truth:
 
 
 class Rig(Protocol):
-    """A bench with one arm of m chambers whose cameras track n key planes."""
+    """Interface of a test bench with one arm of m chambers whose cameras track n key planes."""
 
     chambers: int
     """Number m of chambers, or of other actuators."""

@@ -1,4 +1,4 @@
-"""Motion capture: markers on the key planes, what the cameras see of them, and circle fits.
+"""Motion capture: markers on the key planes, their camera images with noise, and circle fits.
 
 At least three markers a plane sit between the chambers (Chen et al. 2025, sec. III-B), where the
 chambers' bulging moves them least. Camera noise has a white part and a slow part (an AR(1) process,
@@ -109,20 +109,20 @@ def new_tracking(cameras: Cameras) -> Tracking:
 
 
 def normals_per_frame(cameras: Cameras) -> int:
-    """Standard normal numbers that one frame takes."""
+    """Number of standard normals that one frame consumes."""
     planes, k, _ = cameras.at.shape
     return planes * k * 7
 
 
 def normals_per_pause(cameras: Cameras) -> int:
-    """Standard normal numbers that a pause without frames takes."""
+    """Number of standard normals that a pause without frames consumes."""
     planes, k, _ = cameras.at.shape
     return planes * k * 3
 
 
 @compiled
-def wander(cameras, tracking, time, tape, at):
-    """The slow noise after a time [s] without frames (exact for the AR(1) process).
+def wander(cameras: Cameras, tracking: Tracking, time: float, tape: np.ndarray, at: int) -> int:
+    """Advance the slow noise by a time [s] without frames (exact for the AR(1) process).
 
     tape: standard normals, read from index `at`; returns the next index.
     """
@@ -143,8 +143,14 @@ def _upper_tail(z):
 
 
 @compiled
-def mark(cameras, tracking, centres, frames, pressures):
-    """Where the markers are, into tracking.clean.
+def mark(
+    cameras: Cameras,
+    tracking: Tracking,
+    centres: np.ndarray,
+    frames: np.ndarray,
+    pressures: np.ndarray,
+) -> None:
+    """Compute the true marker positions, into tracking.clean.
 
     centres: (n, 3) [mm]; frames: (n, 3, 3) plane axes in columns, arm base frame; pressures: (m,)
     chamber pressures [kPa].
@@ -162,10 +168,10 @@ def mark(cameras, tracking, centres, frames, pressures):
 
 
 @compiled
-def look(cameras, tracking, tape, at):
-    """One frame: tracking.clean with noise and losses, into tracking.seen; the tape's next index.
+def look(cameras: Cameras, tracking: Tracking, tape: np.ndarray, at: int) -> int:
+    """Record one camera frame: tracking.clean with noise and losses, into tracking.seen.
 
-    tape: standard normals, read from index `at`.
+    tape: standard normals, read from index `at`; returns the next index.
     """
     at = wander(cameras, tracking, cameras.period, tape, at)
     for p in range(tracking.seen.shape[0]):
@@ -185,7 +191,7 @@ def look(cameras, tracking, tape, at):
 
 
 @compiled
-def circle_centre(points, out):
+def circle_centre(points: np.ndarray, out: np.ndarray) -> None:
     """Centre (3,) [mm] of the circle through markers (k, 3) [mm] on one plane, into `out`.
 
     The plane is the least-squares one (normal of least spread); in it the circle is the algebraic

@@ -1,4 +1,4 @@
-"""Pneumatics: one syringe pump on a lead screw, pressure sensor and PID controller a chamber.
+"""Pneumatics: one syringe pump on a lead screw, sensor and PID controller per chamber.
 
 As in Chen et al. (2025, sec. III-B and IV-B): syringe, tube and chamber form a closed air circuit;
 the controller's output is the motor's speed; pulling the piston back gives pressures below
@@ -26,7 +26,7 @@ COLUMNS = 9
 
 @dataclass(frozen=True)
 class PumpDesign:
-    """The bench's pumps and controllers."""
+    """Design of the pumps and their controllers."""
 
     step_s: float = 0.01
     """Period of the controller [s]."""
@@ -66,7 +66,7 @@ class Pumps(NamedTuple):
     bore: float
     """Piston area [mm^2]."""
     stroke: float
-    """Travel [mm]."""
+    """Travel of the piston [mm]."""
     rest: float
     """Vented free length [mm]."""
     tube: np.ndarray
@@ -118,7 +118,7 @@ def vented(pumps: Pumps) -> np.ndarray:
     return state
 
 
-def vent(pumps, state):
+def vent(pumps: Pumps, state: np.ndarray) -> None:
     """Open every circuit to the room with the pistons at rest, and close it again."""
     state[:] = 0.0
     for i in range(state.shape[0]):
@@ -128,7 +128,7 @@ def vent(pumps, state):
 
 
 @compiled
-def read_sensor(pumps, pressure, normal):
+def read_sensor(pumps: Pumps, pressure: float, normal: float) -> float:
     """One reading [kPa] of a gauge pressure [kPa]; normal: a standard normal number."""
     reading = pressure + pumps.noise * normal
     if pumps.resolution > 0.0:
@@ -137,7 +137,7 @@ def read_sensor(pumps, pressure, normal):
 
 
 @compiled
-def drive_piston(pumps, row, target, reading):
+def drive_piston(pumps: Pumps, row: np.ndarray, target: float, reading: float) -> None:
     """PID and motor for one controller period: row (COLUMNS,) of one pump, updated in place.
 
     target, reading: [kPa]. Positive speed pushes. The integral waits while the speed is limited.
@@ -162,7 +162,7 @@ def drive_piston(pumps, row, target, reading):
 
 
 @compiled
-def pressure_of(air, volume, bulge):
+def pressure_of(air: float, volume: float, bulge: float) -> float:
     """Gauge pressure [kPa] of an amount of air [kPa mm^3] in a space that yields to it.
 
     Boyle: (p + p_ambient) (volume + bulge p) = air, solved for p. volume: [mm^3]; bulge:
@@ -176,7 +176,7 @@ def pressure_of(air, volume, bulge):
 
 
 @compiled
-def fill(pumps, row, i, stretch):
+def fill(pumps: Pumps, row: np.ndarray, i: int, stretch: float) -> None:
     """Pressures of circuit i after its piston moved; stretch: axial strain of the chamber [-]."""
     volume = row[X] * pumps.bore + pumps.tube[i] + pumps.chamber[i] * (1.0 + stretch)
     row[PRESSURE] = pressure_of(row[AIR] + row[FAR_AIR], volume, pumps.bulge)
@@ -184,8 +184,8 @@ def fill(pumps, row, i, stretch):
 
 
 @compiled
-def fill_through_valve(pumps, row, i, stretch, shut):
-    """The same with a valve at the arm: where it is shut, chamber and pump keep their own air."""
+def fill_through_valve(pumps: Pumps, row: np.ndarray, i: int, stretch: float, shut: bool) -> None:
+    """Fill a chamber behind a valve: where it is shut, chamber and pump keep separate air."""
     near = row[X] * pumps.bore + pumps.tube[i]
     if shut:
         row[PRESSURE] = pressure_of(row[AIR], near, 0.0)
@@ -198,8 +198,10 @@ def fill_through_valve(pumps, row, i, stretch, shut):
 
 
 @compiled
-def fill_through_line(pumps, row, i, stretch, filling, emptying):
-    """The same with a long thin tube between the sensor and the chamber, over one period.
+def fill_through_line(
+    pumps: Pumps, row: np.ndarray, i: int, stretch: float, filling: float, emptying: float
+) -> None:
+    """Fill a chamber through a long thin tube behind the sensor, over one period.
 
     Flow through a rough narrow tube goes with the root of the difference of squared pressures
     (Darcy & Weisbach for a gas: p1^2 - p2^2 ~ q |q|), and a soft tube that is filled is wider than

@@ -29,7 +29,7 @@ class Rod(NamedTuple):
     """The arm along its length, at K = 2 N + 1 stations of N integration steps of the soft part."""
 
     wall: Wall
-    """Section law."""
+    """Law of the wall's section."""
     steps: np.ndarray
     """(N,) step lengths [mm]."""
     stiffness: np.ndarray
@@ -37,11 +37,11 @@ class Rod(NamedTuple):
     taper: np.ndarray
     """(K, m) factor on each chamber's area [-]."""
     rest: np.ndarray
-    """(K, 2) curvature u_x, u_y of the arm as cast [1/mm]."""
+    """(K, 2) initial curvature u_x, u_y from casting [1/mm]."""
     beyond: np.ndarray
     """(K,) weight beyond the station, tip cap included [N]."""
     planes: np.ndarray
-    """(n,) int64: key plane lies after this many steps; -1 base bracket, N + 1 tip plane."""
+    """(n,) int64: number of steps before each key plane; -1 base bracket, N + 1 tip plane."""
     base_cap: float
     """Length of the base cap [mm]."""
     tip_cap: float
@@ -163,7 +163,16 @@ def _keep_plane(shape, plane, y):
 
 
 @compiled
-def shoot(rod, loads, softness, thrusts, base, unknown, shape, residual):
+def shoot(
+    rod: Rod,
+    loads: Loads,
+    softness: float,
+    thrusts: np.ndarray,
+    base: np.ndarray,
+    unknown: np.ndarray,
+    shape: Shape,
+    residual: np.ndarray,
+):
     """Integrate from the base with guessed unknowns (Runge-Kutta 4); the residual at the tip.
 
     rod, loads: Rod, Loads; softness: factor on every stiffness [-]; thrusts: (K, m) [N]; base: (4,)
@@ -288,7 +297,9 @@ def _error(residual):
 
 
 @compiled
-def balance(rod, loads, softness, thrusts, base, shape):
+def balance(
+    rod: Rod, loads: Loads, softness: float, thrusts: np.ndarray, base: np.ndarray, shape: Shape
+) -> bool:
     """Solve for the equilibrium; False where none was found. shape.status reports the residual.
 
     Broyden's (1965) rank-one update of the inverse Jacobian carries over from solve to solve; a
@@ -347,7 +358,7 @@ def balance(rod, loads, softness, thrusts, base, shape):
 
 @compiled
 def _broyden(shape, step, scale, residual, after, size):
-    """Broyden (1965): inverse += (dx - B dF) dx^T B / (dx^T B dF)."""
+    """Broyden's (1965) update of the inverse Jacobian: += (dx - B dF) dx^T B / (dx^T B dF)."""
     product = np.zeros(4)
     row_vector = np.zeros(4)
     for row in range(size):

@@ -1,4 +1,4 @@
-"""A recording from a rig by the name of a protocol; without a rig from the virtual one."""
+"""`collect`: record a protocol on a rig, by default on the virtual one."""
 
 import zlib
 from collections.abc import Iterable
@@ -20,7 +20,10 @@ TRIAL_STEP = 1_000_003
 def hidden_effects(
     given: Iterable[str | tuple[str, float]] | None,
 ) -> list[tuple[str, float]]:
-    """`creep:0.5` as name and strength; without a number 1."""
+    """Hidden effects as (name, amplitude), from text such as `creep:0.5`; default amplitude 1.
+
+    Raises InputError for an amplitude that is no number.
+    """
     found = []
     for item in given or ():
         if not isinstance(item, str):
@@ -49,10 +52,10 @@ def collect(
 
     rig: the rig to record on (`surgisoft.rig.interface.Rig`). Without it the virtual rig, which
     these options describe:
-    seed: seed of the robot. trial: another one has other noise and another random schedule on the
-    same robot. hidden: effects that the rig hides, by name or (name, strength). mount: `gravity`,
+    seed: seed of the robot. trial: number of the trial, with other noise and random schedule on the
+    same robot. hidden: hidden effects, by name or (name, amplitude). mount: `gravity`,
     `roll_deg`, `payload_g` and `noise` of `VirtualRig`.
-    points: steady-state points, or frames; default: the protocol's own.
+    points: number of steady-state points, or of frames; default: by the protocol.
     """
     virtual = rig is None
     if virtual:

@@ -1,4 +1,4 @@
-"""The virtual rig: a simulation of the whole bench, sensors and cameras included.
+"""The virtual rig: a simulation of the test bench with sensors and cameras.
 
 It is the independent plant on which arm models are evaluated, so it shares nothing with them: no
 code, no formulas.
@@ -40,7 +40,7 @@ from surgisoft.rig.pneumatics import PumpDesign, build_pumps
 MOUNT = (0.42, 0.0, math.sqrt(1.0 - 0.42**2))
 """Default unit vector of weight in the arm base frame: hanging, tilted by 25 degrees."""
 REST_S = 30.0
-"""Time that a reset takes: venting and resting [s]."""
+"""Duration of a reset: venting and resting [s]."""
 HEAVIEST_G = 20.0
 """Largest payload that is accepted [g]; a hanging arm carries it, an upright one buckles."""
 CHUNK = 64
@@ -56,7 +56,7 @@ class VirtualRigConfig:
     gravity: tuple[float, float, float] = MOUNT
     """Direction of weight, arm base frame before the roll; any length but zero."""
     roll_deg: float = 0.0
-    """Turn of the base about its z axis [deg]."""
+    """Rotation of the base about its z axis [deg]."""
     payload_g: float = 0.0
     """Known mass at the tip [g]."""
     noise: float = 1.0
@@ -64,7 +64,7 @@ class VirtualRigConfig:
     take: int = 0
     """Number of the trial: another one has other noise on the same robot."""
     hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects by name (see hidden.py) and strength."""
+    """Hidden effects: (name, amplitude), see hidden.py."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
     """Window of time since switching on in which hidden events that occur once fall [s]."""
     design: ArmDesign = field(default_factory=ArmDesign)
@@ -113,7 +113,7 @@ class VirtualRig:
     unit = "kPa"
 
     def __init__(self, config: VirtualRigConfig | int = 0, **fields) -> None:
-        """config: the configuration, or the robot's seed; fields: others of `VirtualRigConfig`."""
+        """Build a rig from a configuration or a robot's seed; fields: of `VirtualRigConfig`."""
         plain = config if isinstance(config, VirtualRigConfig) else VirtualRigConfig(config)
         config = self.config = replace(plain, **fields)
         design, seed, noise = config.design, config.seed, config.noise
@@ -204,7 +204,7 @@ class VirtualRig:
         return sample, Truth(frame.centres, frame.clean, frame.chamber)
 
     def record(self, protocol: Protocol, progress: Progress = silent) -> tuple[Recording, Truth]:
-        """Take a recording in compiled code, sample by sample equal to what `collect` takes.
+        """Record a protocol in compiled code, sample by sample equal to `collect`.
 
         progress: called with the number of samples done and to do.
         """

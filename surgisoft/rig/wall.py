@@ -32,19 +32,19 @@ class Wall(NamedTuple):
     """The wall at stiffness factor 1; mm, N, kPa."""
 
     modulus: float
-    """E [N/mm^2]."""
+    """Young's modulus E [N/mm^2]."""
     even: float
-    """b [-]."""
+    """Coefficient b of the even term of the stress [-]."""
     odd: float
-    """a [-]."""
+    """Coefficient a of the odd term of the stress [-]."""
     area: float
-    """A [mm^2]."""
+    """Area A of the section [mm^2]."""
     second: np.ndarray
     """(3,) I_xx, I_yy, I_xy of the linear term [mm^4]."""
     mean_second: float
-    """I of the nonlinear terms [mm^4]."""
+    """Second moment I of the nonlinear terms [mm^4]."""
     fourth: float
-    """J [mm^6]."""
+    """Fourth moment J [mm^6]."""
     torsion: float
     """G times polar moment [N mm^2]."""
     shear: float
@@ -58,7 +58,15 @@ class Wall(NamedTuple):
 
 
 @compiled
-def strain_under(wall, factor, thrusts, force, moment_x, moment_y, strain):
+def strain_under(
+    wall: Wall,
+    factor: float,
+    thrusts: np.ndarray,
+    force: float,
+    moment_x: float,
+    moment_y: float,
+    strain: np.ndarray,
+) -> int:
     """Strains of a section that carries a load; Newton's method from the values in `strain`.
 
     wall: Wall; factor: stiffness factor [-]; thrusts: (m,) p_i A_i [N]; force: axial force of the
@@ -127,6 +135,6 @@ def strain_under(wall, factor, thrusts, force, moment_x, moment_y, strain):
 
 
 @compiled
-def line_strain(strain, x, y):
+def line_strain(strain: np.ndarray, x: float, y: float) -> float:
     """Strain [-] of the wall at (x, y) [mm] in a section with strains (3,) eps, u_x, u_y."""
     return strain[0] + strain[1] * y - strain[2] * x

@@ -27,7 +27,7 @@ class ArmSpec:
     band: tuple[float, ...] = ()
     """Half width of the dead band of the direction of change in each chamber, in `unit`."""
     idle: tuple[float | None, ...] = ()
-    """Actuation at which a chamber stood still while the data was recorded, in `unit`: the model
+    """Constant actuation of a chamber that did not move in the training data, in `unit`: the model
     ignores such a chamber. None for each chamber that moved."""
     length_mm: float | None = None
     """Length at rest, mm."""

@@ -42,7 +42,7 @@ class Backbone:
             torch.tensor(spline.derivative()(where), dtype=torch.float32),
         )
 
-    def to(self, device) -> "Backbone":
+    def to(self, device: str | torch.device) -> "Backbone":
         """Copy of the backbone on another device."""
         return Backbone(self.position.to(device), self.derivative.to(device))
 

@@ -16,7 +16,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
-from surgisoft.surrogate.effects.own import check_files, files_of
+from surgisoft.surrogate.effects.user_defined import check_files, files_of
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
@@ -75,7 +75,7 @@ def claim_folder(folder: str | Path, force: bool = False) -> Path:
     folder = Path(folder)
     above = next(parent for parent in folder.absolute().parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise InputError(f"{folder}: cannot be written because {above} is not a writable folder")
+        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
         raise InputError(f"{folder}: already there; choose another name or pass --force")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():

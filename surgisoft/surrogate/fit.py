@@ -276,7 +276,11 @@ Progress = Callable[[str, int, int, float], None]
 
 
 def fit(
-    train: History, valid: History | None, spec: ArmSpec, config: FitConfig, progress=None
+    train: History,
+    valid: History | None,
+    spec: ArmSpec,
+    config: FitConfig,
+    progress: Progress | None = None,
 ) -> FitResult:
     """Fit a model to `train`; select stages by `valid`, or by held-out rows of `train` without it.
 

@@ -25,8 +25,8 @@ class History:
     temperature_C: Tensor | None = None
     """(R, T) float32 temperature of the room, degrees Celsius; NaN where missing."""
     stood: Tensor | None = None
-    """(R, m) float32 measured actuation at which the arm stood when each run's recording began, in
-    the arm's unit; NaN, or None for all, where runs begin at rest."""
+    """(R, m) float32 measured actuation at the begin of each run's recording, in the arm's unit;
+    NaN, or None for all, where runs begin at rest."""
     noise_mm: float | None = None
     """Standard deviation of one coordinate of the key points, mm, where it is known."""
 
@@ -71,7 +71,7 @@ class History:
             self.noise_mm,
         )
 
-    def to(self, device) -> "History":
+    def to(self, device: str | torch.device) -> "History":
         """Copy of the history on another device."""
         return History(
             self.t_s.to(device),

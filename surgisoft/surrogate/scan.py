@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from surgisoft.compiled import compiled
 
 
 @compiled
-def clamp_loop(low, high, start, out):
+def clamp_loop(low: np.ndarray, high: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
     """y[r, t, c] = clamp(y[r, t - 1, c], low, high) into out; start (R, C), the rest (R, T, C).
 
     A bound that is not a number makes the result not a number.
@@ -32,7 +33,7 @@ def clamp_loop(low, high, start, out):
 
 
 @compiled
-def linear_loop(factor, addend, start, out):
+def linear_loop(factor: np.ndarray, addend: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
     """y[r, t, c] = factor y[r, t - 1, c] + addend into out; start (R, C), the rest (R, T, C)."""
     for r in range(out.shape[0]):
         for t in range(out.shape[1]):

@@ -87,9 +87,9 @@ class CircleAblationWeights:
     """Weights of the reward terms of both agents."""
 
     laser: LaserWeights = field(default_factory=LaserWeights)
-    """The laser's."""
+    """Weights of the laser's reward terms."""
     endoscope: EndoscopeWeights = field(default_factory=EndoscopeWeights)
-    """The endoscope's."""
+    """Weights of the endoscope's reward terms."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,7 @@ class CircleAblation:
         return {name: Pointing(arm, self.dt_s) for name, arm in self.world.arms.items()}
 
     def goal(self, stream: Stream) -> tuple[Stream, RingCut]:
+        """Draw start and direction of the cut for each random number stream."""
         return draw_cut(stream)
 
     def target_mm(self, state: TaskState[RingCut], ahead: int = 0) -> Tensor:
@@ -187,14 +188,14 @@ class CircleAblation:
         return TaskState(world, state.goal.after(fired))
 
     def blocks(self, state: TaskState[RingCut]) -> dict[str, ObservationBlocks]:
-        """Each arm's own shape and pressures and its pointing error; what both arms share."""
+        """Observation blocks: body and pointing error of each arm, and the state of the cut."""
         arms, scene, cut = state.world.arms, state.world.scene, state.goal
         laser, eye, pointing = arms["laser"], arms["endoscope"], self.pointing
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
         offsets = [pointing["laser"].offset_mm(laser.seen_mm, target) for target in ahead]
         look = pointing["endoscope"].offset_mm(eye.seen_mm, self.centre_mm(state))
         angle = 2.0 * math.pi * cut.share(self.round)[:, None]
-        own = {
+        of_arm = {
             "laser": {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),
                 RING_PLACE: torch.cat((angle.sin(), angle.cos()), 1),
@@ -209,15 +210,16 @@ class CircleAblation:
             APART: (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0,
         }
         return {
-            name: {**body_blocks(self.world.arms[name], arms[name]), **own[name], **shared}
+            name: {**body_blocks(self.world.arms[name], arms[name]), **of_arm[name], **shared}
             for name in self.agents
         }
 
     def observe(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
+        """Concatenated observation blocks, agent -> (B, D)."""
         return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     def rewards(self, state: TaskState[RingCut]) -> dict[str, dict[str, Tensor]]:
-        """See `LaserWeights` and `EndoscopeWeights`."""
+        """Weighted reward terms, see `LaserWeights` and `EndoscopeWeights`."""
         error, scene = self.beam_error_mm(state), state.world.scene
         shared = {
             "cut": state.goal.fired.float(),
@@ -243,6 +245,7 @@ class CircleAblation:
         return done | state.world.scene.clearance.collides
 
     def measures(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
+        """Beam error, progress of the cut, healthy tissue burnt, view, clearance, success."""
         scene = state.world.scene
         ring, hit = self.scene.ablation.report(scene.dose), scene.clearance.collides
         return {
@@ -257,7 +260,7 @@ class CircleAblation:
         }
 
     def trace(self, state: TaskState[RingCut]) -> tuple[Tensor, Tensor]:
-        """The reference point on the ring, and where the beam ends."""
+        """Reference point on the ring and end of the beam, each (B, 1, 3) mm."""
         return self.target_mm(state)[:, None], state.world.scene.hit.point_mm[:, None]
 
     def script(self, state: TaskState[RingCut]) -> dict[str, Tensor]:

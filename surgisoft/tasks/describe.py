@@ -84,7 +84,7 @@ class Setting:
     name: str
     """Name of the field, with dots for parts of the config."""
     value: Any
-    """Its value."""
+    """Value of the field."""
     meaning: str
     """The docstring under the field, with its unit."""
 
@@ -106,7 +106,7 @@ class TaskDescription:
     ends: str
     """When the task terminates an episode before that."""
     settings: tuple[Setting, ...]
-    """The task's own fields of its config: without reward weights and `world`."""
+    """Fields of the task's config, without reward weights and `world`."""
     randomisation: tuple[Setting, ...]
     """Domain randomization: fields of `config.world.randomisation`."""
 

@@ -109,6 +109,7 @@ class Keyhole:
         return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, WaypointSequence]:
+        """Draw the sequence of targets for each random number stream."""
         return draw_sequence(stream, self.routes, self.config.visits)
 
     def route_mm(self, state: TaskState[WaypointSequence]) -> Tensor:
@@ -122,14 +123,14 @@ class Keyhole:
     def advance(
         self, state: TaskState[WaypointSequence], actions: Mapping[str, Tensor]
     ) -> TaskState[WaypointSequence]:
-        """Advance the arm; when the tip reaches a target, the next one takes its place."""
+        """Advance the arm; when the tip reaches a target, the next one becomes active."""
         state = replace(state, world=self.world.step(state.world, actions))
         near = (self.error_mm(state) <= self.config.reach_mm) & ~self.ended(state)
         reached = (state.goal.reached + near).clamp(max=self.config.visits)
         return replace(state, goal=replace(state.goal, reached=reached))
 
     def blocks(self, state: TaskState[WaypointSequence]) -> dict[str, ObservationBlocks]:
-        """The arm's shape and pressures, the target, the next stride, clearance, visits, time."""
+        """Observation blocks: body, target, next stride, clearance, visits and time."""
         part, route = state.world.arms["arm"], self.route_mm(state)
         tip = part.seen_mm[:, -1]
         onward = point_at(route, progress(route, tip).along_mm + self._stride_mm)
@@ -145,10 +146,11 @@ class Keyhole:
         }
 
     def observe(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
+        """Concatenated observation blocks, agent -> (B, D)."""
         return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     def rewards(self, state: TaskState[WaypointSequence]) -> dict[str, dict[str, Tensor]]:
-        """See `KeyholeWeights`."""
+        """Weighted reward terms, see `KeyholeWeights`."""
         clear, tip = state.world.scene.clearance.least_mm, state.world.arms["arm"].tip_mm
         left = progress(self.route_mm(state), tip).remaining_mm
         terms = {
@@ -164,6 +166,7 @@ class Keyhole:
         return state.world.scene.clearance.collides
 
     def measures(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
+        """Remaining route, share of visits, clearance, collision and success."""
         clearance, goal = state.world.scene.clearance, state.goal
         done, hit = goal.reached >= self.config.visits, clearance.collides
         route = progress(self.route_mm(state), state.world.arms["arm"].tip_mm)
@@ -176,6 +179,7 @@ class Keyhole:
         }
 
     def trace(self, state: TaskState[WaypointSequence]) -> tuple[Tensor, Tensor]:
+        """The target and the true tip, each (B, 1, 3) mm."""
         return self.route_mm(state)[:, -1:], state.world.arms["arm"].tip_mm[:, None]
 
     def script(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:

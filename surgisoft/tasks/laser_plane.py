@@ -15,7 +15,7 @@ from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.world import WorldConfig
 
 LEAST_SLOPE = 0.1
-"""Sine of the smallest angle (6 degrees) at which a beam is taken to meet the plane."""
+"""Sine of the smallest angle (6 degrees) at which a beam counts as meeting the plane."""
 
 
 @dataclass(frozen=True)

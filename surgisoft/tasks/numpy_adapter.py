@@ -50,7 +50,7 @@ class NumpyAdapter:
 
     @torch.inference_mode()
     def restart(self, state: TaskState, mask: torch.Tensor | None = None) -> TaskState:
-        """Start new episodes where mask (B,) is set (None: everywhere), from their own streams."""
+        """Start new episodes where mask (B,) is set (None: everywhere), from their streams."""
         mask = torch.ones_like(state.world.failed) if mask is None else mask
         return self.episodes.reset(state, mask)
 
@@ -73,5 +73,5 @@ class NumpyAdapter:
 
     @torch.inference_mode()
     def observations(self, state: TaskState) -> dict[str, np.ndarray]:
-        """agent -> (B, D) float32, arrays of their own."""
+        """Observations, agent -> (B, D) float32, as arrays that the caller may change."""
         return {agent: seen.cpu().numpy() for agent, seen in self.episodes.observe(state).items()}

@@ -39,7 +39,7 @@ def joined(blocks: ObservationBlocks) -> Tensor:
 
 
 def numbered(block: Block, values: Iterable[Tensor], unit: str = "step") -> ObservationBlocks:
-    """Values (B, k) of the same kind now, 1 step ahead, 2 steps ahead, ... as blocks of their own.
+    """One block for each of the values (B, k) of one kind: now, 1 step ahead, 2 steps ahead, ...
 
     unit: what `ahead` counts.
     """
@@ -69,7 +69,7 @@ TIME = Block("time", "elapsed share of the episode", "-", "x")
 
 
 def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
-    """What an arm knows of itself: its measured shape and its pressures."""
+    """Observation blocks of an arm's body: measured key points and pressures."""
     shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
     return {SHAPE: shape, **pressure_blocks(arm, part)}
 

@@ -36,13 +36,18 @@ class SurgicalEnv(ParallelEnv):
         self.state_space = Box(low, -low)
 
     def observation_space(self, agent: str) -> Box:
+        """The Box of an agent's observation (D,)."""
         return self._observed[agent]
 
     def action_space(self, agent: str) -> Box:
+        """The Box of an agent's action (m,), changes of pressure in kPa."""
         return self._acted[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None):
-        """Start an episode; without a seed the random number stream of the last one continues."""
+        """Start an episode; returns observations and empty infos.
+
+        Without a seed the random number stream of the last episode continues.
+        """
         if seed is None and self._state is not None:
             self._state = self._adapter.restart(self._state)
         else:
@@ -51,6 +56,10 @@ class SurgicalEnv(ParallelEnv):
         return self._observations(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict):
+        """Advance one step: (observations, rewards, terminations, truncations, infos) by agent.
+
+        Raises InputError before the first reset, or if a live agent has no action.
+        """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
         if not self.agents:
@@ -77,15 +86,15 @@ class SurgicalEnv(ParallelEnv):
         return observations, rewards, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
-        """(sum of D,) the observations of all agents, one after the other, for central critics."""
+        """(sum of D,) the concatenated observations of all agents, for centralised critics."""
         seen = self._adapter.observations(self._state)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
     def render(self) -> None:
-        """Nothing is drawn here: `surgisoft.replay` draws."""
+        """Do nothing: `surgisoft.replay` draws episodes."""
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: the environment holds no resources."""
 
     def _observations(self) -> dict[str, np.ndarray]:
         seen = self._adapter.observations(self._state)

@@ -58,10 +58,11 @@ TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1")
 
 @dataclass(frozen=True, eq=False)
 class ObservationHistory:
-    """What the last R steps of B episodes did, newest first; zero before an episode began.
+    """Pressure changes and motions of the last R steps of B episodes, newest first.
 
-    An arm with hysteresis responds more or less to a change of pressure, depending on its past. The
-    effect of the last steps tells a policy how the arm responds now.
+    Zero before an episode began. An arm with hysteresis responds more or less to a change of
+    pressure, depending on its past. The effect of the last steps informs a policy of the present
+    response.
     """
 
     kPa: Tensor
@@ -167,10 +168,11 @@ class Follow:
         centre_mm: Tensor,
         directions: int,
     ):
-        """marker: key points (B, n, 3) mm to the point (B, 3) mm that follows, world frame.
+        """Build the task for a level path with its centre at centre_mm, (3,) mm.
 
-        The path is level, its centre at centre_mm (3,). The expert controls the first `directions`
-        coordinates of the point: 2 where the third is constant.
+        marker: function from key points (B, n, 3) mm to the point (B, 3) mm that follows, world
+        frame. The expert controls the first `directions` coordinates of that point: 2 where the
+        third is constant.
         """
         self.name, self.world, self.config = name, world, config
         self.marker, self.centre = marker, centre_mm
@@ -188,6 +190,7 @@ class Follow:
         return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, FollowGoal]:
+        """Draw start and direction on the path for each random number stream; empty history."""
         stream, traversal = draw_traversal(stream, self.config.any_start)
         size = len(stream.key), self.config.history_steps, self.arm.chambers
         return stream, FollowGoal(traversal, ObservationHistory.empty(*size, self.world.device))
@@ -216,7 +219,7 @@ class Follow:
         return TaskState(world, replace(state.goal, history=history))
 
     def blocks(self, state: TaskState[FollowGoal]) -> dict[str, ObservationBlocks]:
-        """The arm's shape and pressures, errors now and ahead, the last steps, the time.
+        """Observation blocks: body, errors now and ahead, history of steps and time.
 
         Errors are scaled by asinh: linear within the length named, logarithmic beyond. The first
         two and the predicted one are also scaled with `fine_mm`.
@@ -239,6 +242,7 @@ class Follow:
         return {"arm": blocks}
 
     def observe(self, state: TaskState[FollowGoal]) -> dict[str, Tensor]:
+        """Concatenated observation blocks, agent -> (B, D)."""
         return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     def _held(self, part: ArmPart) -> Tensor:
@@ -252,7 +256,7 @@ class Follow:
         return part.seen_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
 
     def rewards(self, state: TaskState[FollowGoal]) -> dict[str, dict[str, Tensor]]:
-        """See `FollowWeights`."""
+        """Weighted reward terms, see `FollowWeights`."""
         error = self.error_mm(state)
         terms = {"track": (-error).exp(), "fine": (-error / self.config.fine_mm).exp()}
         return {"arm": weighted(terms, self.config.weights)}
@@ -270,6 +274,7 @@ class Follow:
         }
 
     def trace(self, state: TaskState[FollowGoal]) -> tuple[Tensor, Tensor]:
+        """The target and the true point, each (B, 1, 3) mm."""
         point = self.marker(state.world.arms["arm"].points_mm)
         return self.target_mm(state)[:, None], point[:, None]
 

@@ -75,10 +75,10 @@ def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
 
     Names that a field had in earlier versions are accepted, see `with_present_names`.
     """
-    own = config_of(task)
-    whole = merged(to_table(own), with_present_names(own, table))
+    default = config_of(task)
+    whole = merged(to_table(default), with_present_names(default, table))
     try:
-        return from_table(type(own), whole, Where(file, text))
+        return from_table(type(default), whole, Where(file, text))
     except InputError as error:
         raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
 

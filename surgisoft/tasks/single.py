@@ -66,13 +66,18 @@ class SingleEnv(gymnasium.Env):
         self.action_space = Box(*self._adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start an episode; returns (observation, empty info)."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**63))
         self._state = self._adapter.seeded([seed])
         return self._adapter.observations(self._state)[self._agent][0], {}
 
-    def step(self, action):
+    def step(self, action: np.ndarray):
+        """Advance one step: (observation, reward, terminated, truncated, info).
+
+        Raises InputError before the first reset.
+        """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
         self._state, outcome = self._adapter.step(
@@ -115,7 +120,7 @@ class BatchedEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start episodes; environment i has seed + i, as in `SingleEnv`.
+        """Start episodes; environment i has seed + i, and equals a `SingleEnv` of that seed.
 
         Without a seed the random number streams of the last episodes continue.
         """
@@ -126,7 +131,11 @@ class BatchedEnv(VectorEnv):
             self._state = self._adapter.seeded(range(first, first + self.num_envs))
         return self._adapter.observations(self._state)[self._agent], {}
 
-    def step(self, actions):
+    def step(self, actions: np.ndarray):
+        """Advance all environments: (observations, rewards, terminated, truncated, infos).
+
+        Finished environments are reset; `final_obs` in the infos holds their last observations.
+        """
         if self._state is None:
             raise InputError("step before reset: call reset() first")
         self._state, outcome = self._adapter.step(self._state, {self._agent: np.asarray(actions)})

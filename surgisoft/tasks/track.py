@@ -56,7 +56,9 @@ def _track(name: str, config: TrackConfig, device) -> Follow:
     return Follow(name, world, config.follow, tip, centre, directions=3)
 
 
-def level_world(config: WorldConfig, mean_kPa: float, arm: str | Path, device) -> World:
+def level_world(
+    config: WorldConfig, mean_kPa: float, arm: str | Path, device: str | torch.device
+) -> World:
     """A world of the named arm model alone, which starts with mean_kPa in every chamber."""
     model = named_arm(arm, device)
     return single_arm_world(config, model, (mean_kPa,) * model.spec.chambers, device)

@@ -109,13 +109,14 @@ class TrackBody:
         return self.world.arms["arm"]
 
     def goal(self, stream: Stream) -> tuple[Stream, Waves]:
+        """Draw the phases of the reference pressures for each random number stream."""
         stream, phase = stream.uniform(0.0, 1.0, 2, self.arm.chambers)
         return stream, Waves(phase)
 
     def target_mm(self, state: TaskState[Waves], ahead: int = 0) -> Tensor:
         """(B, n, 3) mm, world frame: reference key points `ahead` steps from now.
 
-        The steady-state shape of the arm model at the reference pressures.
+        They are the steady-state key points of the arm model at the reference pressures.
         """
         moved = (state.world.steps + ahead - self.approach).clamp(min=0).float() * self.dt_s
         turn = 2.0 * math.pi * (self._pace * moved[:, None, None] + state.goal.phase)
@@ -127,10 +128,11 @@ class TrackBody:
         return (state.world.arms["arm"].points_mm - self.target_mm(state)).norm(dim=2)[:, 1:]
 
     def advance(self, state: TaskState[Waves], actions: Mapping[str, Tensor]) -> TaskState[Waves]:
+        """Advance the arm one step."""
         return replace(state, world=self.world.step(state.world, actions))
 
     def blocks(self, state: TaskState[Waves]) -> dict[str, ObservationBlocks]:
-        """The arm's shape and pressures, errors of all key points now and ahead, the time."""
+        """Observation blocks: body, errors of all key points now and ahead, and time."""
         part = state.world.arms["arm"]
         ahead = [self.target_mm(state, k) for k in range(self.config.preview + 1)]
         errors = [(target - part.seen_mm)[:, 1:].flatten(1).asinh() for target in ahead]
@@ -144,10 +146,11 @@ class TrackBody:
         }
 
     def observe(self, state: TaskState[Waves]) -> dict[str, Tensor]:
+        """Concatenated observation blocks, agent -> (B, D)."""
         return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     def rewards(self, state: TaskState[Waves]) -> dict[str, dict[str, Tensor]]:
-        """See `TrackBodyWeights`."""
+        """Weighted reward terms, see `TrackBodyWeights`."""
         error = self.errors_mm(state).mean(1)
         terms = {"body": (-error).exp(), "fine": (-error / self.config.fine_mm).exp()}
         return {"arm": weighted(terms, self.config.weights)}
@@ -165,6 +168,7 @@ class TrackBody:
         }
 
     def trace(self, state: TaskState[Waves]) -> tuple[Tensor, Tensor]:
+        """Reference and true key points, each (B, n, 3) mm."""
         return self.target_mm(state), state.world.arms["arm"].points_mm
 
     def script(self, state: TaskState[Waves]) -> dict[str, Tensor]:

@@ -51,7 +51,7 @@ def ablation_rollout(**measures):
     return Rollout("circle_ablation", 0.1, steps, {}, over, ~over & over, table)
 
 
-def test_each_measure_is_summed_up_in_its_own_way():
+def test_each_measure_has_its_summary():
     task = CircleAblation()
     need = task.spec.limits.view_fraction
     played = ablation_rollout(
@@ -101,7 +101,7 @@ def short(tmp_path_factory):
     return str(file)
 
 
-def test_command_puts_drivers_side_by_side_and_writes_all_numbers(tmp_path, capsys, short):
+def test_command_compares_policies_and_writes_all_numbers(tmp_path, capsys, short):
     file = tmp_path / "out" / "numbers.json"
     command = ["evaluate", "scripted", "random", "--task", "track_circle", "--config", short]
     assert run([*command, "--episodes", "3", "--seed", "4", "--json", str(file)]) == 0

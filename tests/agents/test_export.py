@@ -63,7 +63,7 @@ def test_other_programs_get_the_same_actions(policy, tmp_path):
         export(policy, tmp_path / "out")
 
 
-def test_command_tells_what_is_no_run(tmp_path, capsys):
+def test_command_refuses_a_folder_without_a_run(tmp_path, capsys):
     assert surgisoft(["export", str(tmp_path), "-o", str(tmp_path / "y")]) == 2
     assert "no training run" in capsys.readouterr().err
     assert not (tmp_path / "y").exists()

@@ -145,7 +145,7 @@ def test_the_same_seed_is_the_same_episode_in_any_batch(task):
     assert (other.mean("error_mm") - whole.mean("error_mm")).abs().min() > 0.01
 
 
-def test_each_arm_of_a_task_is_on_a_rig_of_its_own():
+def test_each_arm_of_a_task_has_a_separate_rig():
     task = CircleAblation()
     moved = on_rig(task, RigConfig(settle_s=0.2))
     state = Episodes(moved).seeded(0, 1)

@@ -23,7 +23,7 @@ def test_random_actions_do_not_depend_on_the_rest_of_the_batch(task):
         assert torch.equal(driver.act(task, one, {})["arm"][0], together[i])
 
 
-def test_scripted_is_the_tasks_own_solver(task):
+def test_scripted_is_the_expert_of_the_task(task):
     play = Episodes(task)
     state = play.seeded(5, 4)
     action = open_policy("scripted", task).act(task, state, play.observe(state))

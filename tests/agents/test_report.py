@@ -26,7 +26,7 @@ def test_lines_break_where_the_target_jumps():
     assert len(broken) == 5
 
 
-def test_evaluate_writes_one_page_that_stands_alone(tmp_path, capsys):
+def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
     arguments = ["evaluate", "scripted", "random", "--task", "track_circle", "--episodes", "2"]
     assert run([*arguments, "--report", str(tmp_path / "r")]) == 0
     assert "report.html" in capsys.readouterr().out

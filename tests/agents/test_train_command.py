@@ -17,7 +17,7 @@ from surgisoft.tasks.episodes.file import load_episode
 SMALL = ["--task", "track_circle", "--envs", "16", "--steps", "400"]
 
 
-def test_trains_and_says_what_stands(tmp_path, capsys):
+def test_trains_and_prints_the_result(tmp_path, capsys):
     folder, file = tmp_path / "run", tmp_path / "task.toml"
     file.write_text("[follow]\nsize_mm = 12.0\n[world.randomisation]\nstart_kPa = 1.0\n")
     code = surgisoft(["train", *SMALL, "--seed", "7", "--config", str(file), "-o", str(folder)])
@@ -53,7 +53,7 @@ def test_trains_and_says_what_stands(tmp_path, capsys):
         ([*SMALL, "--device", "abacus"], "abacus"),
         ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
         (["--resume", "nowhere"], "no training run there"),
-        (["--resume", "nowhere", "--seed", "1"], "leave --seed out"),
+        (["--resume", "nowhere", "--seed", "1"], "leave out --seed"),
         (["--task", "track_circle", "--envs", "0"], "--envs"),
     ],
 )
@@ -66,7 +66,7 @@ def test_wrong_turns_are_one_line_and_leave_nothing(arguments, said, tmp_path, c
     assert not list(tmp_path.iterdir())
 
 
-def test_a_bad_field_is_told_with_its_line(tmp_path, capsys):
+def test_a_bad_field_is_reported_with_its_line(tmp_path, capsys):
     file = tmp_path / "task.toml"
     file.write_text("[follow]\nsize = 12.0\n")
     code = surgisoft(["train", *SMALL, "--config", str(file), "-o", str(tmp_path / "run")])

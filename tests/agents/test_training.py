@@ -213,7 +213,7 @@ def test_paper_preset_is_the_papers():
     assert paper.hidden == (64, 64)
 
 
-def test_bad_folders_and_policies_are_told(run, ablation, tmp_path):
+def test_bad_folders_and_policies_are_refused(run, ablation, tmp_path):
     with pytest.raises(InputError, match="already there"):
         train_new(run.path, plan_of(), Processes(), CPU)
     with pytest.raises(InputError, match="no training run"):

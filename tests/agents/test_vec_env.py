@@ -24,7 +24,7 @@ def task():
     return make_task("track_circle", SHORT)
 
 
-def test_rsl_rls_own_runner_trains_it(task):
+def test_the_runner_of_rsl_rl_trains_it(task):
     env = OneAgentEnv(task, 4)
     config = algorithm_config("arm", Preset(envs=4, rollout=8), Processes())
     config = {**copy.deepcopy(config), "save_interval": 100, "run_name": "x"}
@@ -82,6 +82,6 @@ def test_stored_observations_are_those_before_the_step(task):
         torch.testing.assert_close(stored.returns[step], advantage + stored.values[step])
 
 
-def test_two_agents_are_told_to_take_the_joint_one():
+def test_two_agents_are_referred_to_the_joint_environment():
     with pytest.raises(InputError, match="use JointEnv"):
         OneAgentEnv(make_task("circle_ablation"), 2)

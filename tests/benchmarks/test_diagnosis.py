@@ -53,7 +53,7 @@ def folder(tmp_path_factory):
         ),
     ],
 )
-def test_robots_of_known_truth(folder, case, kind, effects):
+def test_robots_with_known_hidden_effects(folder, case, kind, effects):
     said = run_case(case, folder, amending=bool(case.hidden))
     assert said.kind == kind
     if case.hidden:
@@ -223,7 +223,7 @@ def test_table_counts():
     assert calibration_error(outcomes[:2]) == pytest.approx((0.01 + 0.6) / 2)
 
 
-def test_what_comes_after_the_first_answer_is_counted():
+def test_experiments_and_amendments_are_counted():
     """Three ambiguous robots: settled rightly, wrongly, and one whose effect is no rival."""
     twist, lag, drift = (
         replace(CLEAN, hidden=((name, 1.0),)) for name in ("twist", "line_lag", "thermal_drift")

@@ -140,7 +140,7 @@ def test_circles_go_round_at_the_pace_of_the_task():
     assert np.abs(np.diff(p[:, late], axis=1)).max() / 0.5 < 6.0  # kPa/s: slow motion
 
 
-def test_a_trailing_arm_is_told_from_one_that_runs_ahead():
+def test_a_trailing_arm_is_distinguished_from_one_that_runs_ahead():
     t = np.linspace(0.0, 6.0, 600)
     points = np.stack([np.sin(t), np.cos(t), 0 * t], 1)[:, None]
     velocity = np.stack([np.cos(t), -np.sin(t), 0 * t], 1)[:, None]

@@ -75,18 +75,21 @@ def test_a_folder_holds_config_weights_and_report(lab):
         (["compare", "{lab}/arm", "{lab}/arm/config.json"], "config.json"),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/test.parquet"],
-            "no older result",
+            "not an older result",
         ),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--json", "{lab}/arm/config.json"],
-            "no older result",
+            "not an older result",
         ),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--report", "{lab}/test.parquet/x"],
             "no writable folder",
         ),
         (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "no writable folder"),
-        (["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"], "took every"),
+        (
+            ["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"],
+            "belong to that option",
+        ),
         (["collect", "dance", "-o", "{lab}/x.parquet"], "dance"),
         (["collect", "walk", "-o", "{lab}/x.parquet", "--hidden", "ghost"], "ghost"),
         (["fti"], "No such command"),
@@ -151,7 +154,7 @@ def test_one_name_means_one_thing_in_every_command():
             assert told.setdefault(name, kind) == kind, f"{name} of {command}"
 
 
-def test_every_option_of_many_values_says_so():
+def test_every_option_of_many_values_shows_it_in_the_help():
     several = [(command, option) for command, option in _options() if option.multiple]
     assert {name for _, option in several for name in option.opts} == MANY
     for command, option in several:
@@ -196,7 +199,7 @@ def test_old_names_of_options_still_work_and_are_not_shown(tmp_path, capsys):
         "scene new nope.stl -o new",
     ],
 )
-def test_a_missing_file_is_told_before_pytorch_is_loaded(command, tmp_path):
+def test_a_missing_file_is_reported_before_pytorch_is_loaded(command, tmp_path):
     code = (
         "import sys; from surgisoft.cli import run;"
         "code = run(sys.argv[1:]); print(code, 'torch' in sys.modules)"
@@ -221,7 +224,7 @@ def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypat
     assert all(path.exists() for path in files)
 
 
-def test_compare_says_the_next_command(lab, tmp_path, capsys):
+def test_compare_prints_the_next_command(lab, tmp_path, capsys):
     file = tmp_path / "c.json"
     arguments = ["compare", str(lab / "arm"), str(lab / "test.parquet"), "--json", str(file)]
     assert run(arguments) == 0

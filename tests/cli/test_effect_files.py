@@ -13,9 +13,9 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
-from surgisoft.surrogate.effects import make_effect, own, register_effect_file
+from surgisoft.surrogate.effects import make_effect, register_effect_file, user_defined
 from surgisoft.surrogate.model import ArmModel
-from tests.surrogate.effects.test_own import EXAMPLE
+from tests.surrogate.effects.test_user_defined import EXAMPLE
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -81,7 +81,7 @@ def lab(tmp_path_factory):
     effects = {**dict(arm.effects), "slack": effect}
     with_slack = ArmModel(arm.spec, arm.network, effects, arm.rest_mm, arm.validation)
     save_model(with_slack, folder / "arm")
-    own.FILES.clear()
+    user_defined.FILES.clear()
     rig = VirtualRig(0, take=7)
     recording = rig.record(make_protocol("mixed", rig.limits, 1200, seed=2))[0]
     save_recording(recording, folder / "bench.parquet")
@@ -94,7 +94,7 @@ def lab(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _in_the_lab_without_files(lab, monkeypatch):
-    monkeypatch.setattr(own, "FILES", {})
+    monkeypatch.setattr(user_defined, "FILES", {})
     monkeypatch.chdir(lab)
 
 
@@ -126,7 +126,7 @@ def test_a_command_opens_the_model_only_with_its_file(name, capsys):
     error = capsys.readouterr().err
     assert "its effect 'slack' is code in" in error
     assert "--effect-file" in error
-    assert not own.FILES
+    assert not user_defined.FILES
     code = run([*arguments, "--effect-file", "slack.py"])
     refused = {"amend": (0, 1), "improve": (0, 1), "scene check": (0, 1)}
     printed = capsys.readouterr()
@@ -141,13 +141,13 @@ def test_a_command_opens_the_model_only_with_its_file(name, capsys):
 def test_amend_takes_the_file_as_the_effect_that_the_model_has(capsys):
     command = "amend arm --effect slack.py --data bench.parquet -o anew --anyway"
     assert run(command.split()) in (0, 1)
-    assert "slack: the model has it" in capsys.readouterr().out
+    assert "slack: the model had this effect already" in capsys.readouterr().out
 
 
 def test_fit_takes_the_file_in_both_ways():
     rest = "--epochs 2 --widths 8,8 --inputs pressure"
     assert run(f"fit bench.parquet -o one --effects slack.py {rest}".split()) == 0
-    own.FILES.clear()
+    user_defined.FILES.clear()
     more = f"fit bench.parquet -o other --effects slack --effect-file slack.py {rest}"
     assert run(more.split()) == 0
 
@@ -164,7 +164,7 @@ def test_a_run_keeps_an_arm_that_needs_the_file(tmp_path, capsys):
     train = f"train --task track_circle --arm arm --envs 8 --steps 64 -o {tmp_path / 'run'}"
     assert run([*train.split(), "--effect-file", "slack.py"]) == 0
     evaluate = f"evaluate {tmp_path / 'run'} --episodes 1".split()
-    own.FILES.clear()
+    user_defined.FILES.clear()
     assert run(evaluate) == 2
     assert "--effect-file" in capsys.readouterr().err
     assert run([*evaluate, "--effect-file", "slack.py"]) == 0

@@ -45,7 +45,7 @@ def test_the_next_part_of_the_work_has_its_own_pace():
     assert left(2, 10) == "16 s left"
 
 
-def test_without_a_terminal_now_and_then_a_line_says_what_is_left(capsys, monkeypatch):
+def test_without_a_terminal_occasional_lines_state_the_time_left(capsys, monkeypatch):
     monkeypatch.setattr(under_test, "LINE_EVERY_S", 0.0)
     with progress("evaluate scripted") as report:
         for done in range(4):

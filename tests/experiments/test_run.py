@@ -72,7 +72,7 @@ def test_results_are_not_overwritten(whole, tmp_path, capsys):
     file, folder = whole
     before = _rows(folder)
     assert run(["experiment", "run", str(file), "-o", str(folder)]) == 2
-    assert "--resume goes on, --force begins anew" in capsys.readouterr().err
+    assert "--resume continues them, --force replaces them" in capsys.readouterr().err
     other = write(tmp_path, TINY.replace("seed = 3", "seed = 4"))
     with pytest.raises(InputError, match="holds another experiment"):
         open_results(load_experiment(other), folder, resume=True)
@@ -83,7 +83,7 @@ def test_results_are_not_overwritten(whole, tmp_path, capsys):
     assert _rows(folder) == before
 
 
-def test_the_report_stands_alone_and_fits_a_telephone(whole, tmp_path):
+def test_the_report_is_self_contained_and_fits_a_telephone(whole, tmp_path):
     _, folder = whole
     text = (folder / "report.html").read_text()
     assert "success 0 of 3" in text

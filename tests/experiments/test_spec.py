@@ -24,7 +24,7 @@ def test_shipped_experiments_load_and_their_exact_configuration_is_the_same(path
     assert load_experiment(tmp_path / "experiment.toml") == spec
 
 
-def test_the_paper_s_experiment_is_what_it_says():
+def test_the_experiment_of_the_paper_has_its_values():
     spec = load_experiment(PHANTOM / "experiments" / "liver.toml")
     assert spec.limits.time_s == 60.0
     assert [case.plant for case in spec.cases] == ["simulation", "rig"]

@@ -221,7 +221,7 @@ def test_missing_cells_are_missing(tmp_path):
     np.testing.assert_array_equal(lost, [False, True, True, True])
 
 
-def test_rows_without_actuation_are_left_out_and_said(tmp_path):
+def test_rows_without_actuation_are_left_out_with_a_note(tmp_path):
     values = table(4)
     values[2, 2] = np.nan
     path = written(tmp_path / "a.csv", text(values))
@@ -230,7 +230,7 @@ def test_rows_without_actuation_are_left_out_and_said(tmp_path):
     assert notes[1:] == [f"{path}, line 4: actuation missing here, 1 such rows left out"]
 
 
-def test_line_torn_off_at_the_end_is_left_out_and_said(tmp_path):
+def test_incomplete_last_line_is_left_out_with_a_note(tmp_path):
     values = table(6)
     path = written(tmp_path / "a.csv", text(values)[:-60])
     recording, notes = imported(tmp_path, path)

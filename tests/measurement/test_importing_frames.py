@@ -108,7 +108,7 @@ def test_frame_from_the_arm_at_rest(tmp_path_factory, seed):
     )
 
 
-def test_arm_that_does_not_point_along_z_is_said(tmp_path):
+def test_arm_that_does_not_point_along_z_is_noted(tmp_path):
     t, points, _, _, _ = arm_in_a_room(0)
     path = posed(tmp_path / "a.csv", t, points[..., [2, 0, 1]], np.zeros((len(t), 7)))
     _, notes = imported(tmp_path, path, POSED)

@@ -132,7 +132,7 @@ def test_number_of_files_must_fit(tmp_path):
         run(tmp_path, [tmp_path / "none.csv"], content)
 
 
-def test_raw_folder_stands_for_its_files(tmp_path):
+def test_a_folder_means_all_raw_files_in_it(tmp_path):
     folder = tmp_path / "raw"
     folder.mkdir()
     pair(folder, 5, 5)
@@ -214,7 +214,7 @@ def test_stale_positions_are_missing_when_asked(tmp_path):
     assert "k0 3, k1 3 of 7 rows" in part.notes[0]
 
 
-def test_settled_points_are_the_means_of_their_rows(tmp_path):
+def test_steady_state_samples_are_the_means_of_their_rows(tmp_path):
     path = log(
         tmp_path,
         np.arange(8.0),

@@ -274,7 +274,7 @@ def test_markers_on_a_line_are_an_error_that_names_the_plane(tmp_path):
         imported(files)
 
 
-def test_take_and_log_are_told_apart_by_content(tmp_path):
+def test_take_and_log_are_distinguished_by_content(tmp_path):
     log = write_log(tmp_path / "a_log.csv", np.arange(0, 4.2, 0.05))
     assert imported([log, take(tmp_path / "z_take.csv")])[0].key_points == PLANES
     with pytest.raises(InputError, match=r"no file for \[file.log\]"):

@@ -266,7 +266,7 @@ def test_spreadsheets_spellings_of_the_same_table(tmp_path, text):
     np.testing.assert_array_equal(read.key_points_mm, [[[2, 3, 4]], [[3, 4, 5]]])
 
 
-def test_rows_without_actuation_are_left_out_and_said(tmp_path):
+def test_rows_without_actuation_are_left_out_with_a_note(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(
         "t_s,p1_V,k0_x_mm,k0_y_mm,k0_z_mm\n0,1,2,3,4\n1,,3,4,5\n\n2,NaN,3,4,5\n3,4,5,6,7\n"
@@ -279,7 +279,7 @@ def test_rows_without_actuation_are_left_out_and_said(tmp_path):
     ]
 
 
-def test_column_outside_of_the_format_is_said(tmp_path):
+def test_column_outside_of_the_format_is_noted(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t_s,p1_V,k0_x_mm,k0_y_mm,k0_z_mm,humidity\n0,1,2,3,4,wet\n")
     said = []
@@ -289,7 +289,7 @@ def test_column_outside_of_the_format_is_said(tmp_path):
         load_recording(path)
 
 
-def test_summary_says_what_is_in_the_recording():
+def test_summary_describes_the_recording():
     points = np.ones((6, 2, 3))
     points[:3, 1] = np.nan
     lines = "\n".join(summary(small(key_points_mm=points, run=[0, 0, 0, 1, 1, 1])))

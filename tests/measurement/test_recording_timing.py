@@ -103,7 +103,7 @@ def test_a_periodic_motion_shows_no_lead():
         assert body_lead(recorded(p, bent(p), rng, late_rows=rows)) is None
 
 
-def test_what_is_settled_or_short_or_still_is_not_judged():
+def test_steady_state_short_or_still_recordings_have_no_timing():
     rng = np.random.default_rng(0)
     p = wander(rng, 60)
     late = recorded(p, bent(p), rng, late_rows=5)

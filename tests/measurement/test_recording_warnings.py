@@ -164,7 +164,7 @@ def test_spike_is_marked_row_by_row(seed, row, length, size):
 
 
 @given(seed=st.integers(0, 2**32), row=st.integers(0, 599))
-def test_jump_of_a_settled_point_is_found(seed, row):
+def test_jump_of_a_steady_state_sample_is_found(seed, row):
     clean = settled(seed)
     points = clean.key_points_mm.copy()
     points[row, 2] += [0, 45, 0]

@@ -116,7 +116,7 @@ def test_other_chambers_move_the_memory(arms):
     assert np.linalg.norm(tips[1] - tips[0]) > 0.3
 
 
-def test_specimens_differ_and_repeat(arms):
+def test_robots_differ_by_seed_and_repeat(arms):
     tips = [key_planes(arm, [40, 10, 0])[0][-1] for arm in arms]
     for a in range(4):
         for b in range(a):

@@ -8,7 +8,7 @@ from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig.hidden import HIDDEN
 
 
-def test_collects_writes_and_says_one_line(tmp_path, capsys):
+def test_collects_writes_and_prints_one_line(tmp_path, capsys):
     out = tmp_path / "r.csv"
     args = ["collect", "mixed", "-o", str(out), "--points", "200", "--seed", "3"]
     args += ["--hidden", "creep", "--strength", "0.5", "--hidden", "thermal_drift"]
@@ -37,7 +37,7 @@ def test_same_seed_same_file_other_take_other_data(tmp_path):
     assert (one.key_points_mm != other.key_points_mm).all()
 
 
-def test_a_schedule_of_ones_own(tmp_path):
+def test_a_user_defined_schedule(tmp_path):
     plan, out = tmp_path / "plan.csv", tmp_path / "r.parquet"
     plan.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,9,0,0\n2,9,3,0\n")
     assert run(["collect", str(plan), "-o", str(out)]) == 0

@@ -26,7 +26,7 @@ def mixed():
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_strength_zero_is_none(name, mixed):
+def test_amplitude_zero_changes_nothing(name, mixed):
     short = make_protocol("mixed", VirtualRig(1).limits, 300, seed=1)
     off, none = truth_of(short, hidden=[(name, 0.0)]), truth_of(short)
     np.testing.assert_array_equal(off.noise_free_mm, none.noise_free_mm)
@@ -34,7 +34,7 @@ def test_strength_zero_is_none(name, mixed):
 
 
 @pytest.mark.parametrize("name", HIDDEN)
-def test_strength_one_is_clearly_visible_but_no_other_arm(name, mixed):
+def test_amplitude_one_is_visible_but_smaller_than_another_robot(name, mixed):
     """The tip moves by 0.25 to 2 mm (root mean square), half the strength by less."""
     protocol, none = mixed
     shifts = []

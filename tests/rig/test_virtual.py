@@ -82,7 +82,7 @@ def test_truth_stays_out_of_the_measurement():
     assert np.abs(truth.pressures_kPa - recording.measured).max() < 0.03
 
 
-def test_settled_points_are_settled():
+def test_steady_state_samples_are_at_rest():
     """After 3 s the averaged reading is the command, within the pumps' reach."""
     rig = VirtualRig(2)
     recording, _ = rig.record(make_protocol("grid", rig.limits, 343))

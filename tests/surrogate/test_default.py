@@ -14,7 +14,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, load_training_residuals
 
 
-def test_it_tells_a_walk_on_the_rig_that_it_has_never_seen():
+def test_it_predicts_an_unseen_random_walk_on_the_rig():
     """Root mean square over 80 settled points and all key points; one point moves by 30 mm."""
     rig = VirtualRig(0)
     recording, _ = rig.record(make_protocol("walk", rig.limits, 80, seed=5))
@@ -29,7 +29,7 @@ def test_it_tells_a_walk_on_the_rig_that_it_has_never_seen():
     assert error < 0.4
 
 
-def test_its_folder_says_how_well_it_was_validated():
+def test_its_folder_states_its_validation():
     folder = files("surgisoft") / "assets" / "default_arm"
     report = json.loads((folder / "report.json").read_text())
     kept = [stage["valid_rmse_mm"] for stage in report["stages"] if stage["kept"]]

@@ -73,7 +73,7 @@ def test_a_plain_traverse_supports_neither_direction_nor_memory():
     assert rmse(guarded.model, test) <= 1.1 * rmse(plain.model, test)
 
 
-def test_excitation_tells_a_walk_from_a_traverse():
+def test_excitation_distinguishes_a_random_walk_from_a_traverse():
     low, high, band = (torch.tensor(x) for x in (SPEC.low, SPEC.high, SPEC.band))
     rng = np.random.default_rng(0)
     for chamber in excitation(history([walk(1500, rng)]), low, high, band):

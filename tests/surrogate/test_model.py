@@ -184,14 +184,14 @@ def test_saving_never_half_writes_nor_overwrites(tmp_path):
     assert (tmp_path / "arm" / "NOTES.md").read_text() == "mine"
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("keep me")
-    with pytest.raises(InputError, match="no model"):
+    with pytest.raises(InputError, match="not a model"):
         save_model(arm, tmp_path / "letters", force=True)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda d: (d / "config.json").unlink(), "config.json missing"),
+        (lambda d: (d / "config.json").unlink(), "config.json is missing"),
         (lambda d: (d / "config.json").write_text("{"), "damaged model"),
         (lambda d: (d / "weights.safetensors").write_bytes(b"123"), "damaged model"),
         (lambda d: (d / "config.json").write_text('{"format": 99}'), "format 99"),

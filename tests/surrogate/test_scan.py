@@ -30,7 +30,7 @@ def test_clamp_scan_is_the_loop_to_the_bit(steps, seed, radius):
 
 
 @given(st.integers(2, 50), st.integers(0, 10_000))
-def test_gradient_of_plays_is_that_of_the_loop(steps, seed):
+def test_gradient_of_play_operators_is_that_of_the_loop(steps, seed):
     radius = torch.tensor([0.1, 0.7, 2.0], dtype=torch.float64)
     signal = walk(steps, seed).double().unsqueeze(-1).expand(-1, -1, -1, 3)
     weight = torch.randn(signal.shape, generator=torch.Generator().manual_seed(1))

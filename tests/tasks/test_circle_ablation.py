@@ -170,7 +170,7 @@ def test_lesions_differ_in_place_and_size_and_lie_on_the_organ(varied):
     assert torch.bincount(drawn, minlength=3).min() > 70
 
 
-def test_each_episodes_own_ring_is_cut_and_judged(varied):
+def test_each_episode_is_scored_on_its_ring(varied):
     """Scripted to the end; each environment's burnt samples lie on its own path and no other."""
     episodes, steps = Episodes(varied), 260
     state = episodes.seeded(1, 3)

@@ -250,10 +250,10 @@ def test_what_is_no_episode_is_one_line(tmp_path):
     with pytest.raises(InputError, match="expected an episode"):
         load_episode(path)
     np.savez(path, a=np.arange(3))
-    with pytest.raises(InputError, match="no whole episode"):
+    with pytest.raises(InputError, match="not a complete episode"):
         load_episode(path)
     np.savez(path, table=np.array([{"format": 1}], dtype=object))
-    with pytest.raises(InputError, match="no whole episode"):  # nothing is unpickled
+    with pytest.raises(InputError, match="not a complete episode"):  # nothing is unpickled
         load_episode(path)
     save_episode(log, path)
     whole = path.read_bytes()
@@ -264,7 +264,7 @@ def test_what_is_no_episode_is_one_line(tmp_path):
     with zipfile.ZipFile(path) as file, zipfile.ZipFile(tmp_path / "less.npz", "w") as less:
         for name in file.namelist()[1:]:
             less.writestr(name, file.read(name))
-    with pytest.raises(InputError, match="no whole episode"):
+    with pytest.raises(InputError, match="not a complete episode"):
         load_episode(tmp_path / "less.npz")
 
 

@@ -48,7 +48,7 @@ def test_the_script_visits_every_slot_without_contact(done):
     assert not torch.stack([outcome.terminated for outcome in outcomes]).any()
 
 
-def test_fcl_says_so_too(task, done):
+def test_fcl_agrees(task, done):
     """The referee on every fifth body of the episodes: no contact, the same clearances."""
     referee = CollisionChecker(task.world.scene.geometry.bodies)
     for state in done[0][::5]:

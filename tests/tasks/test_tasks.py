@@ -257,7 +257,7 @@ def test_the_beam_meets_the_plane_by_hand():
     torch.testing.assert_close(spot[1], torch.tensor([1.0, -398.0, 70.0]))
 
 
-def test_the_plane_is_where_the_config_says():
+def test_the_plane_is_where_the_config_states():
     near, far = (laser_plane(LaserPlaneConfig(distance_mm=d)) for d in (30.0, 55.0))
     assert (far.centre - near.centre)[2].item() == pytest.approx(25.0, abs=1e-4)
 

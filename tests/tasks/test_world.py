@@ -272,7 +272,7 @@ def test_a_donated_dose_map_is_overwritten_and_gives_the_same_dose(theatre):
 def test_an_arm_that_is_not_driven_in_kpa_is_refused():
     spec = ArmSpec(1, 2, (0.0,), (90.0,), unit="deg")
     network = HawNN(torch.tensor([0.0]), torch.tensor([90.0]), 2, (4,))
-    with pytest.raises(InputError, match="driven in deg, expected a model in kPa"):
+    with pytest.raises(InputError, match="unit deg, expected kPa"):
         World({"arm": Mounted(ArmModel(spec, network), torch.eye(4))})
 
 

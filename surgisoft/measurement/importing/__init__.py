@@ -1,4 +1,4 @@
-"""Import of a laboratory's own files as recordings, by a map file (docs/recordings.md)."""
+"""Import of a laboratory's files as recordings, by a map file (docs/recordings.md)."""
 
 from surgisoft.measurement.importing.convert import Imported, import_files
 from surgisoft.measurement.importing.raw import RawTable, Reader

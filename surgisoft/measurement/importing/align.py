@@ -14,7 +14,7 @@ from surgisoft.measurement.importing.units import SECONDS_PER
 SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""
 LARGEST_GAP_S = 1.0
-"""A late log is not read inside a longer gap of its own [s]."""
+"""Longest gap of a late log within which it is still read [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +33,16 @@ class Between:
     """(T,) bool: not before the first row nor after the last."""
 
     @classmethod
-    def of(cls, own: np.ndarray, t_s: np.ndarray) -> "Between":
-        """Times t_s (T,) among a log's own increasing times (R,) [s]."""
-        before = np.searchsorted(own, t_s + SAME_TIME_S, side="right") - 1
-        before = np.clip(before, 0, max(len(own) - 2, 0))
-        after = np.minimum(before + 1, len(own) - 1)
-        gap = own[after] - own[before]
-        share = np.clip((t_s - own[before]) / np.where(gap > 0, gap, 1.0), 0, 1)
-        share[np.abs(t_s - own[before]) <= SAME_TIME_S] = 0
-        share[np.abs(t_s - own[after]) <= SAME_TIME_S] = 1
-        inside = (t_s >= own[0] - SAME_TIME_S) & (t_s <= own[-1] + SAME_TIME_S)
+    def of(cls, log_s: np.ndarray, t_s: np.ndarray) -> "Between":
+        """Places of times t_s (T,) among a log's increasing times (R,) [s]."""
+        before = np.searchsorted(log_s, t_s + SAME_TIME_S, side="right") - 1
+        before = np.clip(before, 0, max(len(log_s) - 2, 0))
+        after = np.minimum(before + 1, len(log_s) - 1)
+        gap = log_s[after] - log_s[before]
+        share = np.clip((t_s - log_s[before]) / np.where(gap > 0, gap, 1.0), 0, 1)
+        share[np.abs(t_s - log_s[before]) <= SAME_TIME_S] = 0
+        share[np.abs(t_s - log_s[after]) <= SAME_TIME_S] = 1
+        inside = (t_s >= log_s[0] - SAME_TIME_S) & (t_s <= log_s[-1] + SAME_TIME_S)
         return cls(before, after, share, np.where((share == 0) | (share == 1), 0.0, gap), inside)
 
     def linear(self, values: np.ndarray) -> np.ndarray:
@@ -86,14 +86,14 @@ def without_holds(t_s: np.ndarray, values: np.ndarray, period_s: float) -> np.nd
     long = t_s[end] - t_s[start] > 1.5 * period_s
     times.append(t_s[end[long]] - period_s)
     known.append(values[start[long]])
-    own, rows = np.concatenate(times), np.concatenate(known)
-    order = np.argsort(own, kind="stable")
-    return Between.of(own[order], np.minimum(t_s, own.max())).linear(rows[order])
+    log_s, rows = np.concatenate(times), np.concatenate(known)
+    order = np.argsort(log_s, kind="stable")
+    return Between.of(log_s[order], np.minimum(t_s, log_s.max())).linear(rows[order])
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """The raw columns of one set of files, one row a sample."""
+    """Raw columns of one set of files, joined to one row per sample."""
 
     main: RawTable
     """The main file, whose rows are the samples."""
@@ -211,8 +211,8 @@ def _by_time(
     A held column keeps the value of the row before (or at) each time; a quaternion turns at a
     constant rate, and the others are linear between the two rows around it.
     """
-    own = times(table, role.time, role.time_unit) + role.clock_offset_s
-    back = np.flatnonzero(~(np.diff(own) > 0))
+    log_s = times(table, role.time, role.time_unit) + role.clock_offset_s
+    back = np.flatnonzero(~(np.diff(log_s) > 0))
     if len(back):
         place = table.cells.place(int(back[0]) + 1)
         raise InputError(
@@ -220,8 +220,8 @@ def _by_time(
             "match the files by"
         )
     if role.clock == "from_start":
-        own, t_s = own - own[0], t_s - t_s[0]
-    at = Between.of(own, t_s)
+        log_s, t_s = log_s - log_s[0], t_s - t_s[0]
+    at = Between.of(log_s, t_s)
     use_held = np.array(held) | (role.interpolate == "previous")
     found = at.linear(values)
     for turn in turns:

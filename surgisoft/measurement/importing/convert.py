@@ -1,4 +1,4 @@
-"""Turns a laboratory's own files into recordings, as a map says.
+"""Conversion of a laboratory's files to recordings, as a map describes it.
 
 The steps: every file gets its role, files that belong together form a set, a set's files are joined
 to one row a sample, positions are brought into the arm's base frame, rows are tidied, and the sets
@@ -138,7 +138,7 @@ def _patterns(spec: ImportMap) -> str:
 
 
 def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
-    """One set of files as a recording on the main file's own clock."""
+    """One set of files as a recording on the clock of the main file."""
     tables = {name: open_raw(path, spec.file[name]) for name, path in files.items()}
     measured = _with_columns(spec.measured, tables, "p")
     commanded = _with_columns(spec.commanded, tables, "c") if spec.commanded else None
@@ -165,7 +165,7 @@ def _import_set(files: dict[str, Path], spec: ImportMap) -> Imported:
     unit_mm = spec.key_points.unit or tables[spec.key_points.file].unit
     if not unit_mm:
         raise InputError(
-            f"{tables[spec.key_points.file].path}: does not say the positions' unit, "
+            f"{tables[spec.key_points.file].path}: does not state the unit of the positions, "
             "expected unit in [key_points] of the map"
         )
     placed = read_points(joined, spec.key_points, points, spec.frame, unit_mm)
@@ -242,7 +242,7 @@ def _actuation(joined: Joined, spec: ActuationMap) -> np.ndarray:
 
 
 def _context(joined: Joined, spec: ImportMap, main: str) -> np.ndarray:
-    """(T, 2) temperature and payload, NaN where the map says nothing."""
+    """(T, 2) temperature and payload, NaN where the map states nothing."""
     values = np.full((len(joined.t_s), 2), np.nan)
     for i, name in enumerate(("temp_C", "payload_g")):
         source = getattr(spec.context, name)
@@ -352,7 +352,7 @@ def _as_runs(parts: list[Imported], spec: ImportMap, name: str) -> Imported:
 
 
 def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
-    """(3,) mean direction of the files' directions; each file has its own rest pose."""
+    """(3,) mean of the files' directions, which differ because each file has another rest frame."""
     if recordings[0].gravity is None:
         return None
     mean = np.mean([recording.gravity for recording in recordings], axis=0)

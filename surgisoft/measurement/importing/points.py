@@ -125,7 +125,7 @@ class KeyPoint:
     quaternion: Quaternion | None = None
     """Orientation of the body that the key point is fixed to, where it has an offset."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Key point in the body's own axes, relative to its position [unit of the positions]."""
+    """Key point in the axes of the body, relative to its position [unit of the positions]."""
 
 
 def key_points_of(spec: KeyPointsMap, table: RawTable) -> tuple[KeyPoint, ...]:

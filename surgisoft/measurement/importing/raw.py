@@ -1,4 +1,4 @@
-"""Raw tables: columns of a laboratory's own file by name or number, and the readers' interface."""
+"""Raw tables: columns of a laboratory's file by name or number, and the interface of readers."""
 
 import difflib
 from collections.abc import Callable, Sequence
@@ -28,7 +28,8 @@ TIME_UNIT = one_of((*SECONDS_PER, "iso"))
 
 @dataclass(frozen=True)
 class FileRole:
-    """[file.NAME]: a kind of raw file, how it is written and how its rows join the main file's."""
+    """Table [file.NAME] of a map: a kind of raw file, its format, and how its rows join the main
+    file's."""
 
     match: str = "*"
     """Pattern of the file names that have this role."""
@@ -45,7 +46,7 @@ class FileRole:
     comment: str = ""
     """Lines that start with this are passed over."""
     missing: tuple[str, ...] = ()
-    """Texts that mean a missing value, besides the empty cell and NaN."""
+    """Texts that mean a missing value, in addition to the empty cell and NaN."""
     join: Annotated[str, one_of(("rows", "time"))] = "rows"
     """"rows": row by row with the main file; "time": matched by time."""
     offset_rows: int = 0
@@ -71,10 +72,11 @@ class RawTable:
     """Columns of one raw file, read when asked for."""
 
     path: Path
+    """Path of the file."""
     names: list[str]
     """Names of the columns; "" where a column has none."""
     cells: Cells
-    """Reads the columns."""
+    """Access to the columns' cells."""
     unit: str = ""
     """Unit of positions, where the file states it."""
     bodies: tuple[str, ...] = ()
@@ -82,7 +84,7 @@ class RawTable:
     markers: tuple[str, ...] = ()
     """Markers of a motion capture file; marker M has columns M.x M.y M.z."""
     notes: tuple[str, ...] = ()
-    """What was left out while reading, in words."""
+    """Notes about what was left out while reading."""
 
     def position(self, column: Column) -> int:
         """Position, counted from 0, of a column by its name or its number from 1."""
@@ -145,9 +147,9 @@ class Reader:
     """A reader of one raw format; a new one is a file with a `READER` and an entry in READERS."""
 
     about: str
-    """What its files are, for messages: "a Motive CSV export"."""
+    """Kind of file, for messages: "a Motive CSV export"."""
     read: Callable[[Path, FileRole], RawTable]
-    """Opens a file; the role says how a text file is written. Raises InputError on bad content."""
+    """Opens a file, whose role describes its format. Raises InputError on bad content."""
     suffixes: tuple[str, ...] = ()
     """Endings by which format = "auto" chooses this reader."""
     fits: Callable[[Path], bool] = _any_file

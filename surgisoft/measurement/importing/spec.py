@@ -1,6 +1,6 @@
-"""What a map file can say, as frozen dataclasses; docs/recordings.md describes every field.
+"""The map file of an import as frozen dataclasses; docs/recordings.md describes every field.
 
-A map says how a laboratory's own files become recordings: which files, columns, units and frame.
+A map describes how a laboratory's files become recordings: which files, columns, units and frame.
 `load_map` reads one; surgisoft/config.py gives every bad field its line.
 """
 
@@ -78,7 +78,7 @@ UNIT_VECTOR = Rule(
 
 @dataclass(frozen=True)
 class TimeMap:
-    """[time]: where the time comes from."""
+    """Table [time] of a map: source of the time."""
 
     column: Column | None = None
     """Column of the main file."""
@@ -90,7 +90,7 @@ class TimeMap:
     """"file": each file starts at 0; "recording": the first one does; "none": as it is."""
 
     def checked(self, where: Where) -> "TimeMap":
-        """Needs a column or a rate."""
+        """The table itself; raises InputError unless it has a column or a rate."""
         if self.column is None and self.rate_hz is None:
             raise where.error("neither column nor rate_hz", "a column, a rate, or both")
         return self
@@ -98,7 +98,7 @@ class TimeMap:
 
 @dataclass(frozen=True)
 class ActuationMap:
-    """[measured] or [commanded]: columns of the actuation."""
+    """Table [measured] or [commanded] of a map: columns of the actuation."""
 
     file: str = ""
     """Role of the file; empty: the main file."""
@@ -111,15 +111,16 @@ class ActuationMap:
     scale: PerChannel | None = None
     """Value = scale * cell + offset, one for all channels or one each."""
     offset: PerChannel | None = None
+    """See `scale`."""
     delay_s: float = 0.0
-    """By how much this log is late: what stands at t was true at t - delay_s [s]. Positive where
-    the body seems to move before its actuation."""
+    """Delay of this log: the value logged at t was true at t - delay_s [s]. Positive where the
+    body seems to move before its actuation."""
     repeated: Annotated[str, one_of(("keep", "interpolate"))] = "keep"
     """Readings of a sensor that is slower than the log: "keep" them held until the next one, or
     "interpolate" between readings."""
 
     def checked(self, where: Where) -> "ActuationMap":
-        """Columns need a unit; the other numbers must fit the columns."""
+        """The table itself; raises InputError for missing units or numbers that do not fit."""
         if self.columns and not self.unit:
             raise (where / "unit").error("missing", 'the columns\' unit such as "kPa"')
         if self.to and self.unit:
@@ -140,17 +141,17 @@ class ActuationMap:
 
 @dataclass(frozen=True)
 class PointMap:
-    """[[key_points.point]]: one key point fixed to a rigid body."""
+    """Table [[key_points.point]] of a map: one key point fixed to a rigid body."""
 
     position: Position
     """Position of the body, or of the key point itself."""
     quaternion: Quaternion | None = None
     """Orientation of the body, where `offset` is used."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Key point in the body's own axes, relative to its position [unit of the positions]."""
+    """Key point in the axes of the body, relative to its position [unit of the positions]."""
 
     def checked(self, where: Where) -> "PointMap":
-        """An offset needs an orientation."""
+        """The table itself; raises InputError for an offset without an orientation."""
         if any(self.offset) and self.quaternion is None:
             raise (where / "quaternion").error(
                 "missing", "the body's orientation, since there is an offset"
@@ -160,7 +161,7 @@ class PointMap:
 
 @dataclass(frozen=True)
 class KeyPointsMap:
-    """[key_points]: the key points, base to tip."""
+    """Table [key_points] of a map: the key points, base to tip."""
 
     file: str = ""
     """Role of the file; empty: the main file."""
@@ -173,9 +174,9 @@ class KeyPointsMap:
     auto: Annotated[str, one_of(("planes", "bodies"))] | None = None
     """"planes" (circle fit of each group of markers) or "bodies": all that the file has."""
     pattern: Expression = r"(.+):"
-    """For auto: the first group of this expression, in a marker's name, is its plane."""
+    """For `auto`: the first group of this expression, in a marker's name, names its plane."""
     unit: Annotated[str, one_of(MM_PER)] | None = None
-    """Unit of the positions; none: as the file says."""
+    """Unit of the positions; none: as the file states."""
     quaternion_order: Annotated[str, one_of(("xyzw", "wxyz"))] = "xyzw"
     """Order of quaternions' columns: "xyzw" or "wxyz"."""
     repeated: Annotated[str, one_of(("keep", "missing"))] = "keep"
@@ -186,7 +187,7 @@ class KeyPointsMap:
     """A circle that misses its markers by more (rms) is a missing key point [mm]."""
 
     def checked(self, where: Where) -> "KeyPointsMap":
-        """The key points are given in one way."""
+        """The table itself; raises InputError unless the key points have exactly one source."""
         names = ("positions", "markers", "point", "auto")
         given = [name for name in names if getattr(self, name)]
         if len(given) != 1:
@@ -198,19 +199,25 @@ class KeyPointsMap:
 
 @dataclass(frozen=True)
 class BaseMap:
-    """[frame.base]: a body fixed to the arm's base, whose pose sets the frame."""
+    """Table [frame.base] of a map: a body fixed to the arm's base, which determines the frame."""
 
     position: Position
+    """Position of the body."""
     quaternion: Quaternion
+    """Orientation of the body."""
     mode: Annotated[str, one_of(("fixed", "rest", "moving"))] = "fixed"
     """"fixed": average over the file; "rest": over its first rows; "moving": row by row."""
 
 
 @dataclass(frozen=True)
 class FrameMap:
-    """[frame]: from raw positions to the arm's base frame: base, origin, rotation, then align_z."""
+    """Table [frame] of a map: from raw positions to the arm base frame.
+
+    Applied in the order base, origin, rotation, align_z.
+    """
 
     base: BaseMap | None = None
+    """Body at the arm's base, if one is tracked."""
     origin: Annotated[
         tuple[float, float, float] | str,
         Rule('three numbers or "k0"', lambda value: value == "k0" or not isinstance(value, str)),
@@ -221,31 +228,31 @@ class FrameMap:
     mirror: bool = False
     """Whether the raw frame is left-handed, so that `rotation` must swap handedness."""
     align_z: Annotated[str, one_of(("rest",))] | None = None
-    """"rest": turn once more so that the arm at rest points along z."""
+    """"rest": finally rotate so that the arm at rest points along z."""
     gravity: Annotated[tuple[float, float, float], UNIT_VECTOR] | None = None
     """(3,) direction of the weight in the raw frame."""
     rest_rows: Annotated[int, at_least(1)] = 20
     """The arm is at rest during this many first rows."""
 
     def checked(self, where: Where) -> "FrameMap":
-        """The rotation must be one."""
+        """The table itself; raises InputError for an invalid rotation."""
         parse_rotation(self.rotation, where / "rotation", self.mirror)
         return self
 
     @cached_property
     def matrix(self) -> np.ndarray:
-        """(3, 3) the rotation: rows are the arm's axes in the raw frame."""
+        """(3, 3) rotation matrix, whose rows are the arm's axes in the raw frame."""
         return parse_rotation(self.rotation, Where(Path("frame")), self.mirror)
 
 
 @dataclass(frozen=True)
 class RowsMap:
-    """[rows]: which rows are kept."""
+    """Table [rows] of a map: which rows to import."""
 
     first: Annotated[int, at_least(1)] = 1
     """First row of the main file, counted from 1 without the header."""
     last: int | None = None
-    """Last row that is kept."""
+    """Last row of the main file to import; none: all."""
     every: Annotated[int, at_least(1)] = 1
     """Keep each n-th row."""
     repeated_time: Annotated[str, one_of(("error", "drop"))] = "error"
@@ -258,7 +265,7 @@ class RowsMap:
     """Column whose equal values mark rows that are averaged into one steady-state sample."""
 
     def checked(self, where: Where) -> "RowsMap":
-        """The last row comes after the first."""
+        """The table itself; raises InputError if the last row precedes the first."""
         if self.last is not None and self.last < self.first:
             raise (where / "last").error(f"got {self.last}", f"an integer >= {self.first}")
         return self
@@ -266,28 +273,29 @@ class RowsMap:
 
 @dataclass(frozen=True)
 class RunsMap:
-    """[runs]: what starts a new run besides a new file."""
+    """Table [runs] of a map: what starts a new run, in addition to a new file."""
 
     column: Column | None = None
-    """A new value in this column."""
+    """Column in which a new value starts a run."""
     gap_s: Annotated[float, POSITIVE] | None = None
-    """A gap in time longer than this [s]."""
+    """Longest gap in time within a run [s]."""
     time_restarts: bool = False
-    """Time that jumps back."""
+    """Whether time that jumps back starts a run."""
 
 
 @dataclass(frozen=True)
 class ContextSource:
-    """A column, or a number in the file's name."""
+    """Source of a context value: a column, or a number in the file's name."""
 
     column: Column | None = None
+    """Column of the main file."""
     from_name: Expression | None = None
     """Expression whose first group in the main file's name is the number."""
     otherwise: float | None = None
-    """The value where the name has none."""
+    """Value where the name has no number."""
 
     def checked(self, where: Where) -> "ContextSource":
-        """One source."""
+        """The table itself; raises InputError unless it has exactly one source."""
         if (self.column is None) == (self.from_name is None):
             raise where.error("got a table", A_CONTEXT.expected)
         return self
@@ -298,10 +306,12 @@ A_CONTEXT = Rule("a number, {column = ...} or {from_name = ...}", lambda _: True
 
 @dataclass(frozen=True)
 class ContextMap:
-    """[context]: temperature and payload, each a constant or where it comes from."""
+    """Table [context] of a map: temperature and payload, constant or from a source."""
 
     temp_C: Annotated[float | ContextSource, A_CONTEXT] | None = None
+    """Temperature of the room, degrees Celsius."""
     payload_g: Annotated[float | ContextSource, A_CONTEXT] | None = None
+    """Known mass at the tip, g."""
 
 
 A_FILE = Rule("at least one table [file.NAME]", _not_empty)
@@ -309,23 +319,34 @@ A_FILE = Rule("at least one table [file.NAME]", _not_empty)
 
 @dataclass(frozen=True, kw_only=True)
 class ImportMap:
-    """The whole map."""
+    """Content of a map file."""
 
     file: Annotated[dict[str, FileRole], Rule("at least one table [file.NAME]", _not_empty)] = (
         field(default_factory=lambda: {"main": FileRole()})
     )
     """Roles by name; the first one is the main file, whose rows are the samples."""
     time: TimeMap
+    """Source of the time."""
     measured: ActuationMap
+    """Measured actuation."""
     commanded: ActuationMap | None = None
+    """Commanded actuation, if it was logged."""
     key_points: KeyPointsMap
+    """Key points, base to tip."""
     frame: FrameMap = FrameMap()
+    """From raw positions to the arm base frame."""
     rows: RowsMap = RowsMap()
+    """Which rows to import."""
     runs: RunsMap = RunsMap()
+    """What starts a new run."""
     context: ContextMap = ContextMap()
+    """Temperature and payload."""
     arm: ArmInfo = field(default_factory=ArmInfo)
+    """The arm, as in a recording's sidecar."""
     gravity: GravityTable = field(default_factory=GravityTable)
+    """Direction of gravity, as in a recording's sidecar."""
     recording: RecordingTable = field(default_factory=RecordingTable)
+    """Kind, noise and note, as in a recording's sidecar."""
 
     @property
     def main(self) -> str:

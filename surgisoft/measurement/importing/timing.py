@@ -14,9 +14,9 @@ AHEAD_S = 3.0
 LEAST_STEP_S = 0.005
 """Shortest time between samples [s]."""
 ROWS = 4000
-"""Moves that are looked at, evenly over the recording."""
+"""Largest number of moves for an estimate, evenly over the recording."""
 LEAST_ROWS = 200
-"""Fewest moves."""
+"""Least number of moves for an estimate."""
 STEPS = 25
 """Shifts on each side of zero, before those around the best one."""
 BLOCKS = 30
@@ -126,7 +126,7 @@ class Moves:
         return rows, np.concatenate(moved)
 
     def _errors(self, rows, moved: np.ndarray, length: int, shift: int) -> np.ndarray:
-        """(BLOCKS,) squared error of moves (S, d), each left out of its own fit [mm^2]."""
+        """(BLOCKS,) cross-validated squared error of moves (S, d), block by block [mm^2]."""
         parts = zip(self.actuation, rows, strict=True)
         features = np.concatenate(
             [_features(p[at - shift]) - _features(p[at - shift - length]) for p, at in parts]
@@ -160,11 +160,11 @@ def _seen_on(grid: np.ndarray, t_s: np.ndarray, point: np.ndarray, step: float) 
     known = ~np.isnan(point).any(axis=1)
     if known.sum() < 2:
         return np.full((len(grid), 3), np.nan)
-    own = t_s[known]
-    after = np.clip(np.searchsorted(own, grid), 1, len(own) - 1)
-    lost = own[after] - own[after - 1] > max(GAP_S, 5 * step)
-    lost |= (grid < own[0]) | (grid > own[-1])
-    return np.where(lost[:, None], np.nan, _on(grid, own, point[known]))
+    known_s = t_s[known]
+    after = np.clip(np.searchsorted(known_s, grid), 1, len(known_s) - 1)
+    lost = known_s[after] - known_s[after - 1] > max(GAP_S, 5 * step)
+    lost |= (grid < known_s[0]) | (grid > known_s[-1])
+    return np.where(lost[:, None], np.nan, _on(grid, known_s, point[known]))
 
 
 def _spread(column: np.ndarray) -> float:
@@ -208,7 +208,7 @@ class Lead:
     """By how much time the body leads its measured actuation."""
 
     seconds: float
-    """Best estimate; the arm's own lag comes on top [s]."""
+    """Best estimate, which includes the lag of the arm [s]."""
     ci95_s: tuple[float, float]
     """95 % interval, by a jackknife over blocks of time [s]."""
 
@@ -293,9 +293,9 @@ def body_lead(recording: Recording) -> Lead | None:
 
 
 def timing_notes(recording: Recording, delay_s: float) -> list[str]:
-    """What the data say about the actuation's clock, with what to put into the import's map.
+    """Notes about a delay of the actuation's clock, with what to put into the import's map.
 
-    delay_s: by how much the map has already taken the actuation's log to be late [s].
+    delay_s: delay of the actuation's log that the map already corrects [s].
     """
     notes = []
     period = held_period_s(recording)

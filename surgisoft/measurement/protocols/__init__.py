@@ -1,4 +1,4 @@
-"""Protocols: which pressures a rig is commanded to reach, when, and how samples are taken."""
+"""Protocols: commanded pressures over time, and when samples are recorded."""
 
 from surgisoft.measurement.protocols.catalogue import PROTOCOLS, Entry, make_protocol
 from surgisoft.measurement.protocols.continuous import SIGNALS, Knots, Signal

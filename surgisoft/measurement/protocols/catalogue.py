@@ -21,9 +21,9 @@ class Entry:
     """One protocol of the catalogue."""
 
     about: str
-    """One line."""
+    """Description in one line."""
     points: int
-    """Samples where none are asked for: steady-state points, or frames at 20 Hz."""
+    """Default number of samples: steady-state points, or frames at 20 Hz."""
     steady_state: Callable | None = None
     """Builder of the pressures of steady-state points."""
     signals: tuple[str, ...] = ()
@@ -83,7 +83,7 @@ def make_protocol(
     """A protocol of the catalogue, or a schedule file by its path.
 
     limits: (m, 2) lowest and highest actuation [kPa]; points: samples (default: the catalogue's);
-    seed: of the random parts; each protocol has its own random number stream.
+    seed: of the random parts; protocols have different random number streams.
     """
     if str(name).endswith(".csv"):
         if points is not None:

@@ -39,7 +39,7 @@ class Knots:
             self.rows.append(target)
 
     def hold(self, seconds: float) -> None:
-        """Stay [s]."""
+        """Hold the present pressures for a time [s]."""
         self.times.append(self.now + seconds)
         self.rows.append(self.rows[-1])
 
@@ -120,7 +120,7 @@ def _subset(rng: np.random.Generator, chambers: int) -> np.ndarray:
 
 
 def two_speeds(knots: Knots, seconds: float, rng: np.random.Generator) -> None:
-    """The same path at 3, 20 and 60 kPa/s: separates what depends on time from what does not."""
+    """One path at 3, 20 and 60 kPa/s: separates what depends on time from what does not."""
     while knots.now < seconds:
         chosen = _subset(rng, len(knots.low))
         top = chosen * rng.uniform(0.5, 1.0) * knots.high
@@ -175,7 +175,7 @@ class Signal:
     """One kind of excitation."""
 
     about: str
-    """What is done, in words; {channels} stands for what the actuation goes to."""
+    """Description in words; {channels} is replaced by the names of the channels."""
     draw: Callable[[Knots, float, np.random.Generator], None]
     """Writes at least so many seconds into knots."""
 

@@ -1,4 +1,4 @@
-"""The commands of a protocol as data, so that anybody can write their own."""
+"""The data class of a protocol: its commands over time. Users can write their own."""
 
 import itertools
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ class Protocol:
 
     @property
     def chambers(self) -> int:
-        """m."""
+        """Number m of chambers."""
         return self.commands.shape[1]
 
     @property

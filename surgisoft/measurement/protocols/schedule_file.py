@@ -1,4 +1,4 @@
-"""User-defined schedules: a CSV file with the columns t_s, c1_kPa ... cm_kPa and maybe run."""
+"""User-defined schedules: a CSV file with columns t_s, c1_kPa ... cm_kPa, optionally run."""
 
 import re
 from pathlib import Path

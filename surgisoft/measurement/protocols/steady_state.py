@@ -8,6 +8,7 @@ sizes.
 """
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -36,7 +37,9 @@ def _in_runs(count: int, runs: int) -> np.ndarray:
     return np.arange(count, dtype=np.int64) * min(runs, count) // count
 
 
-def back_and_forth(lows, highs, order, signs) -> np.ndarray:
+def back_and_forth(
+    lows: np.ndarray, highs: np.ndarray, order: Sequence[int], signs: np.ndarray
+) -> np.ndarray:
     """Every lattice point of a box once (T, m): neighbours in a row, the last axis of `order` fast.
 
     lows, highs: (m,) first and last index a chamber; order: chambers from slow to fast; signs: (m,)

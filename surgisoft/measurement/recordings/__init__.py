@@ -1,4 +1,4 @@
-"""Recordings: what a lab measured on one arm, in memory and on disk, and how good the data are.
+"""Recordings of one arm's measurements: in memory, on disk, and checks of data quality.
 
 The file format is described in docs/recordings.md.
 """

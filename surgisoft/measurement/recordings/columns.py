@@ -1,4 +1,4 @@
-"""The names of a recording's columns: what they mean and what is wrong with a header."""
+"""Column names of a recording: their meaning, and checks of a header."""
 
 import re
 from dataclasses import dataclass
@@ -20,14 +20,16 @@ _LOOKS_KNOWN = re.compile(
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each quantity stands in the table: positions of columns, counted from 0."""
+    """Positions, counted from 0, of each quantity's columns in a table."""
 
     names: tuple[str, ...]
     """All names of the header."""
     time: int
+    """Column of the time."""
     measured: tuple[int, ...]
+    """Columns of the measured actuation, chamber by chamber."""
     commanded: tuple[int, ...]
-    """Empty where there is no command."""
+    """Columns of the commanded actuation; empty where there is none."""
     key_points: tuple[int, ...]
     """x, y, z of key point 0, then of key point 1, ..."""
     unit: str
@@ -35,8 +37,11 @@ class Layout:
     mm_per_unit: float
     """Millimetres in one unit of the key points' columns."""
     run: int | None
+    """Column of the run; None where there is none."""
     temp: int | None
+    """Column of the temperature; None where there is none."""
     payload: int | None
+    """Column of the payload; None where there is none."""
     ignored: tuple[str, ...]
     """Names that the format does not know and that do not look like one that it knows."""
 

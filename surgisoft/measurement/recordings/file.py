@@ -251,8 +251,8 @@ def check_writable(path: str | Path, force: bool = False) -> None:
 def save_recording(recording: Recording, path: str | Path, force: bool = False) -> None:
     """Write the table (.csv or .parquet by the suffix) and its sidecar (.toml) beside it.
 
-    Both are complete under temporary names before either is put in place. Existing files are kept
-    unless `force` is set.
+    Both are complete under temporary names before either is renamed. Existing files are not
+    replaced unless `force` is set.
     """
     path = Path(path)
     check_writable(path, force)

@@ -24,7 +24,7 @@ JUMP_SHARE = 0.02
 ACTUATION_SHARE = 0.25
 """The least move of the actuation that explains a step, each as a share of its whole motion."""
 STEP_WINDOW = 12
-"""Steps before and steps after that say what is usual."""
+"""Number of steps before and after that define the usual size of a step."""
 SPIKE_ROWS = 12
 """A key point that comes back within so many rows has made a spike."""
 SPIKE_RETURN = 0.5

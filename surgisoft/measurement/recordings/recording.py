@@ -22,7 +22,7 @@ NOT_NEGATIVE = Rule("a number >= 0", lambda value: value >= 0)
 """For standard deviations."""
 
 UNIT_TOLERANCE = 0.01
-"""How far the length of gravity's direction may be from 1 before it is taken for an error."""
+"""Largest accepted deviation from 1 of the length of gravity's direction."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Recording:
     noise_mm: float | None = None
     """Standard deviation of a key point's coordinate as the lab knows it [mm]."""
     note: str = ""
-    """Free text."""
+    """Free text, for people."""
     source: Path | None = None
     """The file that it was read from."""
 

@@ -25,7 +25,7 @@ UNIT_VECTOR = Rule(
 
 @dataclass(frozen=True)
 class GravityTable:
-    """[gravity]: where the weight points."""
+    """Table [gravity] of a sidecar: direction of gravity."""
 
     direction: Annotated[tuple[float, float, float], UNIT_VECTOR] | None = None
     """Unit vector along the weight, arm base frame."""
@@ -33,23 +33,26 @@ class GravityTable:
 
 @dataclass(frozen=True)
 class RecordingTable:
-    """[recording]: how the recording was made."""
+    """Table [recording] of a sidecar: how the recording was made."""
 
     kind: Annotated[str, one_of(KINDS)] | None = None
     """"continuous", or "settled" where each sample is one steady-state average."""
     noise_mm: Annotated[float, NOT_NEGATIVE] | None = None
     """Standard deviation of a key point's coordinate as the lab knows it [mm]."""
     note: str | None = None
-    """Free text."""
+    """Free text, for people."""
 
 
 @dataclass(frozen=True)
 class Sidecar:
-    """The whole sidecar."""
+    """Content of a recording's sidecar file."""
 
     arm: ArmInfo = field(default_factory=ArmInfo)
+    """Table [arm]: name and proportions of the arm."""
     gravity: GravityTable = field(default_factory=GravityTable)
+    """Table [gravity]."""
     recording: RecordingTable = field(default_factory=RecordingTable)
+    """Table [recording]."""
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -74,7 +77,7 @@ def read_sidecar(path: Path) -> dict[str, Any]:
 
 
 def sidecar_text(recording: Recording) -> str:
-    """The sidecar that says what the recording says."""
+    """TOML text of a recording's sidecar."""
     arm = {"length_mm": recording.arm.length_mm, "diameter_mm": recording.arm.diameter_mm}
     about = {"kind": recording.kind, "noise_mm": recording.noise_mm, "note": recording.note}
     content: dict[str, Any] = {"arm": {k: float(v) for k, v in arm.items() if v is not None}}

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from surgisoft.errors import unknown_name
-from surgisoft.surrogate.effects import own
+from surgisoft.surrogate.effects import user_defined
 from surgisoft.surrogate.effects.base import (
     STAGES,
     ArmFacts,
@@ -75,10 +75,10 @@ __all__ = [
 def known_effects() -> dict[str, type[Effect]]:
     """Every known effect by name: the package's, installed packages', and those of named files."""
     known = dict(EFFECTS)
-    for name in own.offered():
-        if name not in known and name not in own.RESERVED:
-            known[name] = own.load_offered(name)
-    return known | {name: file.kind for name, file in own.FILES.items()}
+    for name in user_defined.offered():
+        if name not in known and name not in user_defined.RESERVED:
+            known[name] = user_defined.load_offered(name)
+    return known | {name: file.kind for name, file in user_defined.FILES.items()}
 
 
 def register_effect_file(path: str | Path) -> str:
@@ -86,7 +86,7 @@ def register_effect_file(path: str | Path) -> str:
 
     The file is code: register only files that the user has named.
     """
-    return own.register_effect_file(path, EFFECTS)
+    return user_defined.register_effect_file(path, EFFECTS)
 
 
 def register_effect_files(paths: Iterable[str | Path]) -> None:
@@ -97,7 +97,7 @@ def register_effect_files(paths: Iterable[str | Path]) -> None:
 
 def registered_files() -> list[str]:
     """The files of user-defined effects that were registered: a new process has to do the same."""
-    return [file.path for file in own.FILES.values()]
+    return [file.path for file in user_defined.FILES.values()]
 
 
 def named_effect(given: str) -> str:
@@ -112,7 +112,7 @@ def named_effect(given: str) -> str:
 
 def effect_class(name: str) -> type[Effect]:
     """The class of an effect by its name in a model: `creep`, or `creep#2` for a second creep."""
-    kind = own.kind_of(name)
+    kind = user_defined.kind_of(name)
     if kind in EFFECTS:
         return EFFECTS[kind]
     known = known_effects()
@@ -126,7 +126,7 @@ def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
     return effect_class(name)(facts, **config)
 
 
-def free_name(kind: str, taken) -> str:
+def free_name(kind: str, taken: Iterable[str]) -> str:
     """Name of one more effect of a kind in a model that has the effects `taken`: `creep#2`."""
     number, name = 1, kind
     while name in taken:

@@ -102,7 +102,7 @@ OLD_NAMES = {
 
 
 class Effect(nn.Module, ABC):
-    """One physical effect: a memory that follows the signal, and what it does to the signal.
+    """One physical effect: a memory that follows a signal, and a change of the signal.
 
     The signal of line and material effects is the actuation (..., m); of body and sensor effects
     the key points (..., n, 3), mm, base frame. With its amplitudes at zero an effect returns the
@@ -113,6 +113,7 @@ class Effect(nn.Module, ABC):
     """
 
     stage: Stage
+    """Place in the chain at which the effect acts."""
     version: int = 1
     """Version of `config` and of the parameters' meaning, stored in a model's file."""
 
@@ -211,8 +212,8 @@ class Effect(nn.Module, ABC):
     def migrated(cls, config: dict, version: int | None) -> dict:
         """The `config` of this version from one that another version wrote.
 
-        version: that of the class that wrote it; None in models that were written before versions
-        were kept. Raises InputError where the parameters mean something else now.
+        version: version of the class that wrote it; None in models older than versions. Raises
+        InputError where the parameters have another meaning now.
         """
         if version is not None and version > cls.version:
             raise InputError(
@@ -256,7 +257,7 @@ def amplitude(*shape: int) -> nn.Parameter:
 
 
 def logarithm(value: float) -> nn.Parameter:
-    """A positive parameter (1,), kept as its logarithm so that it stays positive."""
+    """A positive parameter (1,), stored as its logarithm so that it stays positive."""
     return nn.Parameter(torch.tensor([float(value)]).log())
 
 

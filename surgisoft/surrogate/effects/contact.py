@@ -145,7 +145,7 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 def _neighbours(some: list[Effect]) -> list[list[int]]:
-    """For each direction the supports in it and in the directions beside it."""
+    """Combinations of the supports in one direction and in the neighbouring directions."""
     turns = [round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi)) for effect in some]
     near = [min(turn, AROUND - turn) <= BESIDE for turn in range(AROUND)]
     return [

@@ -50,7 +50,7 @@ class Hypothesis:
     """Experimental setup (`diagnosis.design.schedules.SETUPS`) in which the effect cannot act;
     empty: there is none."""
     own_weight: str = ""
-    """Amplitude by which the arm's own weight acts, for an effect that is a load along gravity;
+    """Amplitude by which the weight of the arm acts, for an effect that is a load along gravity;
     empty: the effect is no such load."""
     tip_mass: str = ""
     """Amplitude by which a mass at the tip acts, for an effect that is a load along gravity."""

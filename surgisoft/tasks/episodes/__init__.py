@@ -1,1 +1,1 @@
-"""Episodes: their log, its parts, and the file that keeps it."""
+"""Logs of episodes: what they hold, how they are recorded, and their file format."""

@@ -20,7 +20,7 @@ from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, BodyLog, CameraLog, 
 SUFFIX = ".npz"
 """Suffix of the file of an episode."""
 FORMAT = "surgisoft episode 1"
-"""What the file says it is."""
+"""Name and version of the file format."""
 
 
 def save_episode(log: EpisodeLog, path: str | Path) -> None:
@@ -55,7 +55,7 @@ def load_episode(path: str | Path) -> EpisodeLog:
     except InputError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise InputError(f"{path}: is no whole episode; {wanted}") from None
+        raise InputError(f"{path}: is not a complete episode; {wanted}") from None
 
 
 def _split(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:

@@ -25,19 +25,19 @@ from surgisoft.tasks.episodes.parts import (
 from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
 
 NO_DIAMETER_MM = 15.0
-"""Outer diameter of an arm of which neither scene nor model says it: the paper's arm (mm)."""
+"""Outer diameter (mm) of an arm where neither scene nor model states it: the paper's arm."""
 
 
 @dataclass(frozen=True, eq=False)
 class EpisodeLog:
-    """One episode; T rows. What a task does not have is None or empty."""
+    """Log of one episode with T rows. What a task does not have is None or empty."""
 
     task: str
-    """The task's name in the registry."""
+    """Name of the task in the registry."""
     agents: tuple[str, ...]
-    """Who acted: names of arms."""
+    """Names of the arms that acted."""
     driver: str
-    """Who drove: `scripted`, `random`, or a policy's name."""
+    """Name of the policy: `scripted`, `random`, or that of a learned one."""
     on: str
     """`simulation` or `rig`."""
     seed: int
@@ -53,9 +53,9 @@ class EpisodeLog:
     arms: dict[str, ArmLog]
     """Each arm by name."""
     targets_mm: np.ndarray
-    """(T, k, 3) mm: where the task's points should be; k is 1 but for tasks of a whole body."""
+    """(T, k, 3) mm: reference of the task's points; k is 1 but for tasks of a whole body."""
     actuals_mm: np.ndarray
-    """(T, k, 3) mm: where they are."""
+    """(T, k, 3) mm: actual place of the task's points."""
     path_mm: np.ndarray
     """(M, 3) mm: the closed path that is asked for; (0, 3) where there is none but the targets."""
     measures: dict[str, np.ndarray]
@@ -73,35 +73,35 @@ class EpisodeLog:
     view_fraction: np.ndarray | None = None
     """(T,) 0..1: share of the ring that the endoscope sees."""
     dose: DoseLog | None = None
-    """What the beam has done."""
+    """Dose map of the organ around the ring."""
     bodies: tuple[BodyLog, ...] = ()
     """The bodies of the scene."""
     events: tuple[Event, ...] = ()
-    """What happened, in order of time."""
+    """Events of the episode, in order of time."""
 
     @property
     def rows(self) -> int:
-        """T."""
+        """Number T of rows."""
         return len(self.time_s)
 
     @property
     def target_mm(self) -> np.ndarray:
-        """(T, 3) mm: where the task's point (of a whole body the tip) should be."""
+        """(T, 3) mm: reference of the task's point (of a whole body the tip)."""
         return self.targets_mm[:, -1]
 
     @property
     def actual_mm(self) -> np.ndarray:
-        """(T, 3) mm: where it is."""
+        """(T, 3) mm: actual place of the task's point (of a whole body the tip)."""
         return self.actuals_mm[:, -1]
 
     @property
     def error_mm(self) -> np.ndarray:
-        """(T,) mm: mean distance of the task's points from where they should be."""
+        """(T,) mm: mean distance of the task's points from their references."""
         return np.linalg.norm(self.targets_mm - self.actuals_mm, axis=-1).mean(axis=1)
 
 
 class EpisodeRecorder:
-    """Makes the log of one episode out of a batch that runs; it copies what it keeps.
+    """Records the log of one episode of a running batch; copies all that it stores.
 
     Built on the state in which the episode starts; `step` after each step; then `log`. Steps after
     the episode's end are left out, so a batch may run on.
@@ -186,7 +186,7 @@ class EpisodeRecorder:
         return replace(log, events=find_events(log, self._ending))
 
     def _of(self, tensor: Tensor) -> np.ndarray:
-        """This episode's row of a tensor, as a copy."""
+        """A copy of the recorded environment's row of a tensor."""
         return tensor[self.environment].detach().cpu().numpy().copy()
 
     def _add(self, state: TaskState, measures, actions, terms) -> None:
@@ -285,7 +285,7 @@ class EpisodeRecorder:
 
 
 _ARM_ROWS = ("command", "pressure", "points_mm", "seen_mm", "line_mm", "tip_direction")
-"""What of a `world_arm.ArmPart` is kept in every row."""
+"""Fields of an `ArmPart` that every row stores."""
 
 
 def _below(rows: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

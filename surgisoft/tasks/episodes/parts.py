@@ -80,21 +80,21 @@ class CameraLog:
 
 @dataclass(frozen=True, eq=False)
 class DoseLog:
-    """What the beam has done to P small triangles of the organ around a ring of N stations.
+    """Dose of P small triangles of the organ around a ring of N stations, over time.
 
-    Of the dose only changes are kept: those of row `rows[i]` are `starts[i]` to `starts[i + 1]`.
+    Only changes are stored: those of row `rows[i]` are `starts[i]` to `starts[i + 1]`.
     """
 
     body: str
-    """The organ's name."""
+    """Name of the organ."""
     points_mm: np.ndarray
-    """(P, 3) mm: centroids."""
+    """(P, 3) mm: centroids of the triangles."""
     normals: np.ndarray
     """(P, 3): outward unit normals."""
     areas_mm2: np.ndarray
-    """(P,) mm^2."""
+    """(P,) mm^2: areas of the triangles."""
     faces: np.ndarray
-    """(P,) face of the organ's mesh that each lies on."""
+    """(P,) face of the organ's mesh that each triangle lies on."""
     offset_mm: np.ndarray
     """(P,) mm: distance from the ring's path, negative inside the ring."""
     station: np.ndarray
@@ -102,7 +102,7 @@ class DoseLog:
     zone: np.ndarray
     """(P,) 0: inside the ring, 1: on it, 2: healthy tissue."""
     stations: int
-    """N."""
+    """Number N of stations of the ring."""
     ring_length_mm: float
     """Length of the ring's closed path, mm."""
     threshold_j_per_mm2: float
@@ -112,11 +112,11 @@ class DoseLog:
     rows: np.ndarray
     """(S,) rows of the log in which the dose changed, rising."""
     starts: np.ndarray
-    """(S + 1,) where each row's changes begin."""
+    """(S + 1,) index at which each row's changes begin."""
     sample: np.ndarray
-    """(C,) which triangle changed."""
+    """(C,) number of the triangle that changed."""
     dose_j_per_mm2: np.ndarray
-    """(C,) J/mm^2: its dose from this row on."""
+    """(C,) J/mm^2: dose of that triangle from this row on."""
 
     def at(self, row: int) -> np.ndarray:
         """(P,) J/mm^2: the dose in a row of the log; a negative row counts from the end."""
@@ -130,10 +130,10 @@ class DoseLog:
 
 @dataclass(frozen=True, eq=False)
 class BodyLog:
-    """One body that stands in the scene."""
+    """One body of the scene: name, role and mesh."""
 
     name: str
-    """Its name."""
+    """Name of the body."""
     role: str
     """`organ`, `keep-out` or `support`."""
     vertices_mm: np.ndarray

@@ -45,13 +45,13 @@ class Traversal:
     def share(self, steps: Tensor, wait: int, loop: int) -> Tensor:
         """(B,) place after steps (B,), as a share of the length, not wrapped to 0..1.
 
-        The reference waits for `wait` steps, then takes `loop` steps for each time around.
+        The reference waits for `wait` steps, then goes round once in `loop` steps.
         """
         return self.start + self.direction * (steps - wait).clamp(min=0).float() / loop
 
 
 def draw_traversal(stream: Stream, anywhere: bool) -> tuple[Stream, Traversal]:
-    """Draw a start and a direction for (B,) streams; without `anywhere` 0 and +1 for all."""
+    """Draw a start and a direction for (B,) random number streams; not `anywhere`: 0 and +1."""
     stream, draw = stream.uniform(0.0, 1.0, 2)
     if not anywhere:
         return stream, Traversal(torch.zeros_like(draw[:, 0]), torch.ones_like(draw[:, 0]))
@@ -74,7 +74,7 @@ class RingCut:
     def share(self, steps: int, ahead: int = 0) -> Tensor:
         """(B,) place `ahead` steps further on, as a share of the length, not wrapped to 0..1.
 
-        Once around takes `steps` steps with the beam on.
+        The reference goes round once in `steps` steps with the beam on.
         """
         return self.start + self.direction * (self.done + ahead) / steps
 
@@ -84,7 +84,7 @@ class RingCut:
 
 
 def draw_cut(stream: Stream) -> tuple[Stream, RingCut]:
-    """Draw the start and the direction of a cut for each of the (B,) streams."""
+    """Draw the start and the direction of a cut for each of the (B,) random number streams."""
     stream, draw = stream.uniform(0.0, 1.0, 2)
     done = torch.zeros_like(stream.count)
     direction = torch.where(draw[:, 1] < 0.5, 1.0, -1.0)

@@ -22,7 +22,7 @@ class WaypointSequence:
 
 
 def draw_sequence(stream: Stream, routes: Routes, visits: int) -> tuple[Stream, WaypointSequence]:
-    """Draw `visits` targets for each of the (B,) streams; consecutive slots differ."""
+    """Draw `visits` targets for each of the (B,) random number streams; no slot twice in a row."""
     stream, draw = stream.uniform(0.0, 1.0, 2, visits)
     slots = len(routes.first) - 1
     turns = 1 + (draw[:, 0] * (slots - 1)).long()

@@ -101,7 +101,7 @@ class Randomisation:
 
 @dataclass(frozen=True, eq=False)
 class Mounted:
-    """An arm model with the pose of its base."""
+    """An arm model and the place and orientation of its base."""
 
     model: ArmModel
     """The arm, driven in kPa."""
@@ -124,9 +124,9 @@ class ArmPart:
     queue: Tensor
     """(B, D, m) kPa: the last D actions, newest last, for actions that come late."""
     delay: Tensor
-    """(B,) int64: steps that this episode's actions are late, at most D."""
+    """(B,) int64: delay of the episode's actions in steps, at most D."""
     gain: Tensor
-    """(B, m): this episode's factor between chamber pressure and what the model is given."""
+    """(B, m): gain of the episode between chamber pressure and the model's input."""
     mount: Tensor
     """(B, 4, 4): this episode's base frame to world frame, mm."""
     arm: ArmState
@@ -154,9 +154,9 @@ class ArmPart:
 
 
 class Arm(Protocol):
-    """One arm of a world, batched: states in, states out.
+    """Interface of one arm of a world, batched: states in, states out.
 
-    Every method is a function of its arguments. Tensors have the batch in front; key points, poses
+    Every method is a function of its arguments. Tensors have the batch in front; key points, bases
     and directions are in the world frame, pressures in kPa.
     """
 
@@ -175,7 +175,7 @@ class Arm(Protocol):
     backbone: Backbone
     """The curve through the key points."""
     pneumatics: Pneumatics
-    """The pumps."""
+    """The pneumatic actuators."""
     low: Tensor
     """(m,) kPa: lowest pressure of each chamber."""
     high: Tensor
@@ -188,7 +188,7 @@ class Arm(Protocol):
     """(1, 3) mm, base frame: far end of the rigid shaft behind the base; (0, 3) without one."""
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
-        """Draw the parameters of an episode for each stream; the arms at its start."""
+        """Draw parameters of an episode for each random number stream; returns (streams, arms)."""
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
@@ -223,7 +223,7 @@ class ModelArm:
         """`samples` is the number K of centreline points."""
         spec = mounted.model.spec
         if spec.unit != "kPa":
-            raise InputError(f"arm '{name}' is driven in {spec.unit}, expected a model in kPa")
+            raise InputError(f"arm '{name}': its model has the unit {spec.unit}, expected kPa")
         start = spec.rest if mounted.start_kPa is None else mounted.start_kPa
         if len(start) != spec.chambers:
             raise InputError(
@@ -244,7 +244,7 @@ class ModelArm:
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
-        """Draw the parameters of an episode for each stream; the arms at its start."""
+        """Draw parameters of an episode for each random number stream; returns (streams, arms)."""
         vary, m, count = self.vary, self.chambers, len(stream.key)
         stream, share = stream.uniform(0.0, 1.0, vary.history, m)
         stream, spread = stream.uniform(-1.0, 1.0, m)

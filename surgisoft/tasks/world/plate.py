@@ -23,7 +23,7 @@ EDGE = 0.05
 ROUTE_POINTS = 9
 """Shapes on the route from the arm at rest to a target."""
 NO_DIAMETER_MM = 15.0
-"""Thickness of an arm whose model does not say it (mm): the paper's."""
+"""Thickness (mm) of an arm whose model does not state it: that of the paper's arm."""
 
 
 def plate_world(

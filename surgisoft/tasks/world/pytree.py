@@ -21,7 +21,7 @@ class TensorDataclass(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ObjectBatch(Generic[Item]):
-    """One Python object for each of B environments, carried in a state beside its tensors.
+    """One Python object for each of B environments, as a leaf of a state of tensors.
 
     `rows` and `with_rows` select and replace objects as they do rows of tensors; `tree_map` leaves
     them alone. An object that changes in a step (a simulated rig) is shared by the old state and
@@ -29,7 +29,7 @@ class ObjectBatch(Generic[Item]):
     """
 
     items: tuple[Item, ...]
-    """B objects."""
+    """The B objects, one for each environment."""
 
 
 def tree_map(function: Callable[..., Tensor], tree: Tree, *others: Tree) -> Tree:

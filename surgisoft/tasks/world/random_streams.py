@@ -1,8 +1,8 @@
-"""Random numbers of many environments: each has its own stream, whatever stands beside it.
+"""Counter-based random number streams: one for each environment, independent of the batch.
 
-A stream is a key and a count; its numbers are a hash of both. Nothing is drawn in turns from a
-shared generator, so that a batch of N is N batches of one, on any device, and a state that is
-saved takes its random numbers along.
+A stream is a key and a count; its numbers are a hash of both (SplitMix64, Steele, Lea & Flood
+2014). No generator is shared, so a batch of N equals N batches of one, on any device, and a saved
+state includes its random numbers.
 """
 
 import math
@@ -20,15 +20,15 @@ _MIX_2 = -0x6B2FB644ECCEEE15
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """A batch of streams."""
+    """A batch of random number streams."""
 
     key: Tensor
-    """(B,) int64: which stream."""
+    """(B,) int64: key of each stream."""
     count: Tensor
     """(B,) int64: numbers drawn so far."""
 
     def uniform(self, low: float, high: float, *shape: int) -> "tuple[Stream, Tensor]":
-        """The streams further on, and (B, *shape) float32 numbers even in [low, high)."""
+        """The advanced streams, and (B, *shape) float32 numbers uniform in [low, high)."""
         size = math.prod(shape)
         place = self.count[:, None] + torch.arange(1, size + 1, device=self.key.device)
         bits = _mix(self.key[:, None] + _GAMMA * place)
@@ -37,21 +37,21 @@ class Stream:
         return Stream(self.key, self.count + size), values
 
     def normal(self, *shape: int) -> "tuple[Stream, Tensor]":
-        """The streams further on, and (B, *shape) float32 standard normals (Box & Muller 1958)."""
+        """The advanced streams, and (B, *shape) float32 standard normals (Box & Muller 1958)."""
         after, draws = self.uniform(0.0, 1.0, 2, *shape)
         radius = (-2.0 * (1.0 - draws[:, 0]).log()).sqrt()
         return after, radius * (2.0 * math.pi * draws[:, 1]).cos()
 
 
 def streams(seed: int, count: int, first: int = 0, device: str | torch.device = "cpu") -> Stream:
-    """Streams `first` to `first + count - 1` of a seed."""
+    """Random number streams `first` to `first + count - 1` of a seed."""
     place = torch.arange(first, first + count, dtype=torch.int64, device=device)
     root = _mix(torch.tensor([_wrapped(seed)], dtype=torch.int64, device=device))
     return Stream(_mix(root + _GAMMA * (place + 1)), torch.zeros_like(place))
 
 
 def joined(parts: Sequence[Stream]) -> Stream:
-    """The streams of all parts, one after the other."""
+    """Concatenate batches of random number streams."""
     key, count = torch.cat([p.key for p in parts]), torch.cat([p.count for p in parts])
     return Stream(key, count)
 

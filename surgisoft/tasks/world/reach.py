@@ -1,4 +1,4 @@
-"""Reach tables of a scene's arms: the shapes of the arm models as plain geometry."""
+"""Reach tables of a scene's arms: centrelines of the arm models as plain geometry."""
 
 from functools import cache
 from pathlib import Path

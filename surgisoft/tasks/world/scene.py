@@ -51,7 +51,7 @@ class SceneState:
     view: View | None = None
     """What the endoscope sees of the ring, (B,)."""
     lesion: Tensor | None = None
-    """(B,) int64: number of this episode's lesion among those laid out."""
+    """(B,) int64: number of the episode's lesion among those laid out."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
@@ -120,7 +120,7 @@ class SceneEngine:
         self.ring_normals = held([look.normals for look in looks])
 
     def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, SceneState]:
-        """Draw a lesion for each stream; the scene with untouched tissue around the arms."""
+        """Draw a lesion for each random number stream; the scene with untouched tissue."""
         lesion = torch.zeros_like(stream.count)
         if self.lesions > 1:
             stream, draw = stream.uniform(0.0, float(self.lesions))

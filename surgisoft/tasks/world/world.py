@@ -78,7 +78,7 @@ class WorldState:
     """(B,) bool: an arm is not finite; the environment stays failed until it is reset."""
 
     def donated(self) -> WorldState:
-        """This state with its buffers donated: a step or reset may overwrite them.
+        """Copy of the state whose buffers a step or reset may overwrite.
 
         Only the owner of a state may ask for this, because the state is invalid afterwards.
         """
@@ -105,13 +105,13 @@ class World:
         }
 
     def with_arms(self, arms: Mapping[str, Arm]) -> World:
-        """This world with other arms in place of its own, for example arms on the virtual rig."""
+        """Copy of the world with other arms, for example arms on the virtual rig."""
         world = copy.copy(self)
         world.arms = dict(arms)
         return world
 
     def start(self, stream: Stream) -> WorldState:
-        """Worlds at the start of an episode, one for each of the (B,) streams."""
+        """Start an episode of the world for each of the (B,) random number streams."""
         parts = {}
         for name, arm in self.arms.items():
             stream, parts[name] = arm.start(stream)
@@ -121,7 +121,7 @@ class World:
         return WorldState(stream, torch.zeros_like(stream.count), parts, scene, _not_finite(parts))
 
     def reset(self, state: WorldState, mask: Tensor) -> WorldState:
-        """Start the environments where mask (B,) is set anew, each from its own stream."""
+        """Restart the environments where mask (B,) is set, each with its random number stream."""
         index = mask.nonzero()[:, 0]
         if not len(index):
             return state
@@ -182,9 +182,9 @@ def scene_world(
     engine: str | None = None,
     arm: str | Path | None = None,
 ) -> World:
-    """The two arms of a scene (or its folder), named `laser` and `endoscope`, among its bodies.
+    """World of a scene (or its folder): its bodies and the two arms `laser` and `endoscope`.
 
-    arm: a model for both in place of the scene's own, as for `named_arm`.
+    arm: a model for both arms instead of those that the scene names, as for `named_arm`.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
@@ -198,7 +198,9 @@ def scene_world(
     return World(arms, config, around, device)
 
 
-def named_arm(name: str | Path, device="cpu", folder: str | Path = ".") -> ArmModel:
+def named_arm(
+    name: str | Path, device: str | torch.device = "cpu", folder: str | Path = "."
+) -> ArmModel:
     """Load `default`, or the fitted model in a folder, relative to `folder` or as it is."""
     if str(name) == "default":
         return default_arm(device)

@@ -33,7 +33,7 @@ def test_play_by_hand():
     )
 
 
-def test_strength_acts_as_written():
+def test_amplitude_acts_by_the_formula():
     """x_eff = x + w (y - u) + v (u - u_rest)(y - u) on one line, by hand."""
     effect = make_effect("hysteresis", FACTS, radii=(0.2,))
     with torch.no_grad():

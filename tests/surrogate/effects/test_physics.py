@@ -168,7 +168,7 @@ def test_stiffening_of_wall_lines_that_the_other_chambers_shorten():
 
 
 @pytest.mark.parametrize("name", ["rate_dependence", "softening", "stiffening"])
-def test_a_ring_of_lines_answers_alike_whichever_chamber_is_loaded(name):
+def test_a_ring_of_lines_responds_equally_to_each_chamber(name):
     ring = make_effect(name, RANGE, others=-0.2, ring=True)
     ring = with_strength(ring, **dict.fromkeys(ring.amplitudes(), 0.3))
     loads = torch.tensor([[1.0, 0.3, 0.0], [0.4, 0.9, 0.1], [0.2, 0.1, 0.0]])
@@ -292,7 +292,7 @@ def test_payload_leaves_a_hanging_arm():
     )
 
 
-def test_payload_bends_a_quarter_circle_as_castigliano_says():
+def test_payload_bends_a_quarter_circle_by_castiglianos_theorem():
     """Against the clamp's tangent by pi / 4 P R^3 / EI, across it by 1 / 2 P R^3 / EI.
 
     The tip load's moment about the slice at the angle a from the clamp is P R cos a.

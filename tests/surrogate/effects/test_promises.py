@@ -44,7 +44,7 @@ def at_zero(effect):
 
 
 @EVERY
-def test_no_strength_no_change(effect):
+def test_zero_amplitude_changes_nothing(effect):
     x = signal(effect, 2, 30, 0)
     assert all(not strength.any() for strength in effect.amplitudes().values())
     assert torch.equal(x, through(effect, x, context(2, 30)))
@@ -71,7 +71,7 @@ def test_stepping_is_scanning(effect, elapsed):
 
 
 @EVERY
-def test_columns_are_the_slopes_at_zero_strength(effect):
+def test_sensitivities_are_the_slopes_at_zero_amplitude(effect):
     """Central differences in float64 of every amplitude, one by one."""
     effect = at_zero(effect).double()
     x, seen = signal(effect, 1, 400, 0).double(), context(1, 400)
@@ -161,7 +161,7 @@ def test_quantities_have_unit_range_and_source(effect):
 
 
 @EVERY
-def test_strengths_and_shapes_are_all_parameters(effect):
+def test_amplitudes_and_nonlinear_parameters_are_all_parameters(effect):
     named = dict(effect.named_parameters())
     assert {**effect.amplitudes(), **effect.nonlinear_parameters()}.keys() == named.keys()
     mine = {id(p) for p in named.values()}

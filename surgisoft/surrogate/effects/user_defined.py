@@ -8,6 +8,7 @@ code and is run only if the user named it.
 import hashlib
 import importlib.util
 import sys
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -37,7 +38,7 @@ FILES: dict[str, EffectFile] = {}
 """Registered effects from files, by name."""
 
 
-def register_effect_file(path: str | Path, taken=()) -> str:
+def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     """Run a user's effect file and register its one `Effect`; returns its name, the file's stem.
 
     taken: names of the package's effects. Raises InputError where the file is missing, does not
@@ -110,7 +111,7 @@ def _check(kind, label: str) -> None:
         raise InputError(f"{label}: expected a 'stage' of {', '.join(STAGES)}")
 
 
-def files_of(names) -> dict[str, dict]:
+def files_of(names: Iterable[str]) -> dict[str, dict]:
     """Path and hash, by name, of those named effects that came from files, for a checkpoint."""
     return {
         kind: {"path": FILES[kind].path, "sha256": FILES[kind].sha256}
@@ -132,5 +133,5 @@ def check_files(wanted: dict[str, dict], label: str) -> None:
             raise InputError(
                 f"{label}: {FILES[name].path} is not the file that its effect '{name}' was made "
                 f"with (sha256 {FILES[name].sha256[:12]}, expected {file['sha256'][:12]}); "
-                "name the same file, or amend the model anew"
+                "name the same file, or amend the model again"
             )

@@ -1,4 +1,4 @@
-"""Effects of the users' own: the documentation's example, by file and by package."""
+"""User-defined effects: the example of the documentation, by file and by package."""
 
 import math
 import re
@@ -17,8 +17,8 @@ from surgisoft.surrogate.effects import (
     known_effects,
     make_effect,
     named_effect,
-    own,
     register_effect_file,
+    user_defined,
 )
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.networks import ConstantCurvature
@@ -30,7 +30,7 @@ EXAMPLE, BREATHING, SECOND = re.findall(r"```python\n(.*?)```", DOCS.read_text()
 
 @pytest.fixture(autouse=True)
 def _no_files_but_the_tests_own(monkeypatch):
-    monkeypatch.setattr(own, "FILES", {})
+    monkeypatch.setattr(user_defined, "FILES", {})
 
 
 @pytest.fixture
@@ -166,12 +166,12 @@ def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
     register_effect_file(slack)
     saved, folder = arm(), tmp_path / "model"
     save_model(saved, folder)
-    own.FILES.clear()
+    user_defined.FILES.clear()
     with pytest.raises(
         InputError, match=r"slack\.py, which opening a model does not run.*--effect-file .*slack"
     ):
         load_model(folder)
-    assert not own.FILES
+    assert not user_defined.FILES
     slack.write_text(EXAMPLE + "\n# changed\n")
     register_effect_file(slack)
     with pytest.raises(InputError, match=r"not the file that its effect 'slack' was made with"):
@@ -196,26 +196,26 @@ def test_opening_a_model_runs_no_code_of_it(slack, tmp_path):
         ("half.py", EXAMPLE.replace("def apply", "def applied"), "found none"),
     ],
 )
-def test_a_bad_file_is_told_in_one_line_and_leaves_nothing(tmp_path, name, text, complaint):
+def test_a_bad_file_is_refused_in_one_line_and_leaves_nothing(tmp_path, name, text, complaint):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=complaint):
         register_effect_file(tmp_path / name)
-    assert not own.FILES
+    assert not user_defined.FILES
 
 
-def test_a_missing_file_is_told():
+def test_a_missing_file_is_refused():
     with pytest.raises(InputError, match="no such file"):
         named_effect("nowhere/slack.py")
 
 
 def test_installed_packages_offer_effects_and_hide_none_of_ours(monkeypatch):
     value = "surgisoft.surrogate.effects.creep:Creep"
-    entries = {name: EntryPoint(name, value, own.GROUP) for name in ("seep", "hysteresis")}
-    monkeypatch.setattr(own, "offered", lambda: entries)
+    entries = {name: EntryPoint(name, value, user_defined.GROUP) for name in ("seep", "hysteresis")}
+    monkeypatch.setattr(user_defined, "offered", lambda: entries)
     assert known_effects()["seep"].__name__ == "Creep"
     assert known_effects()["hysteresis"].__name__ == "Hysteresis"
     assert type(make_effect("seep", FACTS)).__name__ == "Creep"
-    wrong = EntryPoint("seep", "surgisoft.errors:InputError", own.GROUP)
-    monkeypatch.setattr(own, "offered", lambda: {"seep": wrong})
+    wrong = EntryPoint("seep", "surgisoft.errors:InputError", user_defined.GROUP)
+    monkeypatch.setattr(user_defined, "offered", lambda: {"seep": wrong})
     with pytest.raises(InputError, match="expected a subclass of"):
         make_effect("seep", FACTS)

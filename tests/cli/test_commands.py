@@ -85,7 +85,7 @@ def test_a_folder_holds_config_weights_and_report(lab):
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--report", "{lab}/test.parquet/x"],
             "no writable folder",
         ),
-        (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "no writable folder"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "not a writable folder"),
         (["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"], "took every"),
         (["collect", "dance", "-o", "{lab}/x.parquet"], "dance"),
         (["collect", "walk", "-o", "{lab}/x.parquet", "--hidden", "ghost"], "ghost"),

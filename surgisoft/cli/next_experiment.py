@@ -14,6 +14,8 @@ from surgisoft.files import write_atomically, write_json
 
 ON_RIG = (3, "kPa")
 """Number of chambers and unit of the arm on the virtual rig."""
+SHOWN_PAIRS = 10
+"""Pairs of effects that are always printed (a count); a chance below `SURE` is always printed."""
 
 
 @app.command("next-experiment")
@@ -88,12 +90,18 @@ def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> No
     old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
     print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}")
-    for pair in sorted(result.pairs, key=lambda pair: pair.after):
+    pairs = sorted(result.pairs, key=lambda pair: pair.after)
+    open_ = [pair for pair in pairs if pair.effects not in result.separates]
+    shown = max(SHOWN_PAIRS, len(open_))
+    for pair in pairs[:shown]:
         a, b = pair.effects
         print(
             f"  {a} or {b}: expected chance of the right one {pair.before:.2f} -> {pair.after:.2f}"
         )
-    open_ = [pair for pair in result.pairs if pair.effects not in result.separates]
+    if len(pairs) > shown:
+        print(
+            f"  {len(pairs) - shown} further pairs: {pairs[shown].after:.2f} or more (see --json)"
+        )
     if open_:
         print(f"{len(open_)} of {len(result.pairs)} pairs stay below {SURE:g} in this time")
     print(f"wrote {output}: {len(result.protocol.run_rows)} runs, {result.protocol.unit}")

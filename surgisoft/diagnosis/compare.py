@@ -38,8 +38,6 @@ LEAST_ROWS = 60
 """Fewest measured rows from which shares and a best achievable error are computed."""
 AT_FLOOR = 1.05
 """An error below this multiple of the noise floor is at the floor."""
-LEAST_SHARE = 0.05
-"""Smallest share of the error for which an axis is named."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class Comparison:
     @property
     def main_axes(self) -> list[AxisShare]:
         """The best axis, and the best of the other kind (static or memory), where they matter."""
-        found = [a for a in self.axes if a.share >= LEAST_SHARE and a.ci95[0] > 0]
+        found = [a for a in self.axes if a.clear]
         other = [a for a in found[1:] if a.static != found[0].static]
         return found[:1] + other[:1]
 

@@ -161,11 +161,10 @@ def diagnose(
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
-    """The diagnosis with the axis that the error depends on most."""
-    found = shares(problem)
-    if not found or found[0].share <= 0:
+    """The diagnosis with the axis that the error depends on most, where one is clear."""
+    axis = next((each for each in shares(problem) if each.clear), None)
+    if axis is None:
         return result
-    axis = found[0]
     text = f"{result.verdict.sentence}; it depends most on {axis.axis} ({100 * axis.share:.0f} %)"
     return replace(result, axis=axis.axis, verdict=replace(result.verdict, sentence=text))
 

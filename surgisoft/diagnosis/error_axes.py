@@ -250,6 +250,10 @@ def arc_length(table: ResidualTable) -> np.ndarray:
     return np.linalg.norm(table.rest_mm[0]) + np.concatenate([[0.0], np.cumsum(steps)])
 
 
+LEAST_SHARE = 0.05
+"""Smallest share of the error for which an axis is named."""
+
+
 @dataclass(frozen=True)
 class AxisShare:
     """How much of the squared error an axis explains on blocks that took no part."""
@@ -266,6 +270,11 @@ class AxisShare:
     """95 % interval of it from a bootstrap of blocks."""
     static: bool
     """Whether it was evaluated alone, not beyond the actuation."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether the share is large enough to be named, and surely above zero."""
+        return self.share >= LEAST_SHARE and self.ci95[0] > 0
 
 
 def shares(problem: Problem) -> list[AxisShare]:

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis import diagnose as diagnosing
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.error_axes import AXES, gravity_angle, known, shares
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
+from surgisoft.diagnosis.error_axes import AXES, AxisShare, gravity_angle, known, shares
 from surgisoft.diagnosis.residuals import problem_of, residual_table
 from tests.diagnosis.synthetic import (
     POINTS,
@@ -126,3 +128,17 @@ def test_any_number_of_chambers_and_key_points(chambers, points):
     assert rest.body_mm.shape == (600, len(points), 3)
     assert result.axes[0].axis == "pressure"
     assert result.ceiling.rmse_mm < 0.6 * result.rmse_mm
+
+
+@pytest.mark.parametrize(
+    ("share", "low", "named"), [(0.3, 0.2, True), (0.004, 0.001, False), (0.3, -0.1, False)]
+)
+def test_a_diagnosis_names_an_axis_that_is_clear(monkeypatch, share, low, named):
+    found = [AxisShare("pressure", "", "kPa", share, (low, 2 * share), True)]
+    monkeypatch.setattr(diagnosing, "shares", lambda problem: found)
+    verdict = Verdict("unknown_effect", (), "the cause is unknown")
+    before = Diagnosis(verdict, ErrorLevels(1.0, 0.1, 0.5), ())
+    result = diagnosing.with_axis(before, None)
+    assert result.axis == ("pressure" if named else None)
+    more = "; it depends most on pressure (30 %)" if named else ""
+    assert result.verdict.sentence == "the cause is unknown" + more

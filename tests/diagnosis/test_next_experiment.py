@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, replace
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -212,6 +213,24 @@ def test_bad_questions_are_told_in_one_line(arm, rivals, minutes, said):
     with pytest.raises(InputError, match=said) as caught:
         propose(arm, rivals, minutes)
     assert "\n" not in str(caught.value)
+
+
+def test_of_many_pairs_the_least_certain_are_printed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    effects = ["creep", "line_lag", "payload", "twist", "misalignment", "gain_mismatch"]
+    command = ["next-experiment", "default", "--minutes", "6", "--json", "s.json"]
+    assert run([*command, "--between", *effects]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    chances = sorted(pair["after"] for pair in json.loads(Path("s.json").read_text())["pairs"])
+    assert len(chances) == 15
+    printed = [float(line.split()[-1]) for line in lines if "expected chance" in line]
+    assert len(printed) >= 10
+    np.testing.assert_allclose(printed, chances[: len(printed)], atol=0.005)
+    assert all(chance >= 0.95 for chance in chances[len(printed) :])
+    rest = [line for line in lines if "further pairs" in line]
+    assert len(rest) == (len(printed) < 15)
+    if rest:
+        assert rest[0].startswith(f"  {15 - len(printed)} further pairs: ")
 
 
 def test_the_command_writes_a_schedule_or_nothing(tmp_path, lagging, capsys):

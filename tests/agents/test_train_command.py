@@ -49,7 +49,7 @@ def test_trains_and_prints_the_result(tmp_path, capsys):
         ([*SMALL, "--scene", "x"], "this task has no scene"),
         ([*SMALL, "--arm", "nowhere"], "no arm model there"),
         (["--task", "track_circle", "--minutes", "-1"], "minutes is -1"),
-        ([*SMALL, "--minutes", "1"], "give one of them"),
+        ([*SMALL, "--minutes", "1"], "give only one of them"),
         ([*SMALL, "--device", "abacus"], "abacus"),
         ([*SMALL, "--config", "nofile.toml"], "there is no such file"),
         (["--resume", "nowhere"], "no training run there"),

@@ -47,7 +47,7 @@ def check_free(folder: Path) -> None:
     """Raise unless a new run may be written there."""
     above = next(parent for parent in folder.absolute().parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
+        raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if (folder / "config.json").is_file():
         raise InputError(
             f"{folder}: a run is already there; continue it with --resume {folder} or choose "

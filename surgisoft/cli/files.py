@@ -32,7 +32,7 @@ def check_folder(path: Path | None) -> None:
         return
     above = next(parent for parent in (path.absolute() / "x").parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise InputError(f"{path}: cannot be written, {above} is no writable folder")
+        raise InputError(f"{path}: cannot be written, {above} is not a writable folder")
 
 
 def check_replay(path: Path | None) -> None:

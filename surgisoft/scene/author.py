@@ -402,7 +402,7 @@ def check_target(folder: Path, force: bool) -> None:
     """Raise an InputError if a scene cannot be written there; --force replaces scenes only."""
     above = next(place for place in folder.absolute().parents if place.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
+        raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
     if not folder.exists():
         return
     if not force:
@@ -410,7 +410,7 @@ def check_target(folder: Path, force: bool) -> None:
     if not folder.is_dir() or (not (folder / FILE).exists() and any(folder.iterdir())):
         raise InputError(f"{folder}: is no scene; --force replaces only a scene's folder")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"{folder}: cannot be written, it is no writable folder")
+        raise InputError(f"{folder}: cannot be written, it is not a writable folder")
 
 
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:

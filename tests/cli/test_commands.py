@@ -83,9 +83,9 @@ def test_a_folder_holds_config_weights_and_report(lab):
         ),
         (
             ["compare", "{lab}/arm", "{lab}/test.parquet", "--report", "{lab}/test.parquet/x"],
-            "no writable folder",
+            "not a writable folder",
         ),
-        (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "no writable folder"),
+        (["fit", "{lab}/walk.parquet", "-o", "{lab}/walk.parquet/x"], "not a writable folder"),
         (
             ["fit", "--valid", "{lab}/test.parquet", "{lab}/walk.parquet", "-o", "x"],
             "belong to that option",

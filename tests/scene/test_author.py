@@ -370,7 +370,7 @@ def test_a_target_that_cannot_be_written_is_found_before_the_work(tmp_path, caps
     (tmp_path / "text.stl").write_text("no mesh")
     assert new(tmp_path / "file" / "deep" / "scene", tmp_path / "text.stl") == 2
     error = capsys.readouterr().err
-    assert f"cannot be written, {tmp_path / 'file'} is no writable folder" in error
+    assert f"cannot be written, {tmp_path / 'file'} is not a writable folder" in error
     assert (tmp_path / "file").read_text() == "x"
 
 
@@ -378,6 +378,6 @@ def test_a_folder_without_write_permission_is_found(tmp_path, monkeypatch):
     """Asked of the system, as permission bits do not bind every user who runs this test."""
     asked = []
     monkeypatch.setattr(os, "access", lambda path, mode: bool(asked.append((path, mode))))
-    with pytest.raises(InputError, match="is no writable folder"):
+    with pytest.raises(InputError, match="is not a writable folder"):
         check_target(tmp_path / "a" / "scene", False)
     assert asked == [(tmp_path, os.W_OK | os.X_OK)]

@@ -1,7 +1,7 @@
 """`surgisoft collect`: record a protocol on the virtual rig."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -110,7 +110,12 @@ def collect(
 
     _check_output(output, force)
     effects = _pairs(hidden or [], strength or [])
-    mount = {"gravity": gravity, "roll_deg": roll_deg, "payload_g": payload_g, "noise": noise_scale}
+    mount: dict[str, Any] = {
+        "gravity": gravity,
+        "roll_deg": roll_deg,
+        "payload_g": payload_g,
+        "noise": noise_scale,
+    }
     with progress(f"collect {protocol}") as report:
         recording = collect_recording(
             protocol,

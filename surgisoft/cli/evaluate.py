@@ -111,7 +111,7 @@ def evaluate(
             log=policies if report else policies[:1] if replay else (),
         )
     about = f"{counted(episodes, 'episode')} of seed {seed}"
-    written = []
+    written: list[object] = []
     if json_file:
         write_json(json_file, found.to_json())
         written.append(json_file)
@@ -164,8 +164,8 @@ def _show(results) -> None:
         cells = (_cell(result.overall.get(name), name in RATES) for result in results)
         rows.append([name, *cells])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *cells in rows:
-        held = "".join(f"   {cell:>{w}s}" for cell, w in zip(cells, widths[1:], strict=True))
+    for first, *values in rows:
+        held = "".join(f"   {cell:>{w}s}" for cell, w in zip(values, widths[1:], strict=True))
         print(f"{first:{widths[0]}s}{held}")
     for result in results:
         if result.checks is not None:

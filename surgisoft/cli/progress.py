@@ -5,21 +5,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
+from surgisoft.progress import Progress
+
 LINE_EVERY_S = 30.0
 """Time between two lines where there is no terminal, s."""
 
 
 @contextlib.contextmanager
-def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
+def progress(title: str) -> Iterator[Progress]:
     """Show a progress bar with the time left; yields a function of (done, total, note)."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
-        Progress,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.progress import Progress as RichProgress
 
     console = Console(stderr=True)
     columns = (
@@ -31,7 +33,7 @@ def progress(title: str) -> Iterator[Callable[[float, float, str], None]]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Progress(
+    with RichProgress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
         task = bar.add_task(title, total=None, note="")

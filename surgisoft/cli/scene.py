@@ -102,7 +102,7 @@ def check(
     with progress("scene check") as report:
         verdict = check_scene(scene, reaches, report)
     drawn = picture is not None and verdict.work is not None
-    if drawn:
+    if picture is not None and drawn:
         from surgisoft.replay.reach_map import draw_reach_map
 
         draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)

@@ -16,6 +16,8 @@ from surgisoft.report.parts import Picture
 from surgisoft.report.style import DARK_INK, DARK_LINE, DARK_MUTED, INK, LINE, MUTED
 
 mpl.use("Agg")
+from typing import Any
+
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
@@ -23,7 +25,7 @@ CHART = (4.6, 3.0)
 """Size of a chart that is legible on a phone, inches."""
 BLUE, RED, GREEN, AMBER = "#3b82c4", "#d1495b", "#3c9a6b", "#cf9330"
 """Colours with contrast on light and on dark backgrounds."""
-_STYLE = {
+_STYLE: Any = {
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
     "axes.grid": True,

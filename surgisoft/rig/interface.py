@@ -55,10 +55,13 @@ class Rig(Protocol):
     """Time from sample to sample [s]."""
     arm: ArmInfo
     """Length and diameter of the arm, where they are known [mm]."""
-    gravity: np.ndarray | None
-    """(3,) unit vector of weight, arm base frame; None where it is unknown."""
+
     payload_g: float | None
     """Known mass attached to the arm [g]; None where none was weighed."""
+
+    @property
+    def gravity(self) -> np.ndarray | None:
+        """(3,) unit vector of weight, arm base frame; None where it is unknown."""
 
     def reset(self) -> None:
         """Vent the arm and wait until it has no memory of earlier pressures: the start of a run."""

@@ -57,16 +57,16 @@ def collect(
     `roll_deg`, `payload_g` and `noise` of `VirtualRig`.
     points: number of steady-state points, or of frames; default: by the protocol.
     """
-    virtual = rig is None
-    if virtual:
+    virtual = None
+    if rig is None:
         number = zlib.crc32(f"{protocol} {trial}".encode())
-        rig = VirtualRig(seed, take=number, hidden=hidden_effects(hidden), **mount)
+        rig = virtual = VirtualRig(seed, take=number, hidden=hidden_effects(hidden), **mount)
     elif mount or hidden:
         given = ", ".join([*mount, *(["hidden"] if hidden else [])])
         raise InputError(f"{given}: options of the virtual rig, but another rig is given")
     if not isinstance(protocol, Protocol):
         drawn = seed + TRIAL_STEP * trial
         protocol = make_protocol(protocol, rig.limits, points, seed=drawn)
-    if virtual:
-        return rig.record(protocol, progress)[0]
+    if virtual is not None:
+        return virtual.record(protocol, progress)[0]
     return collect_samples(rig, protocol, progress)

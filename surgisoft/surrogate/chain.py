@@ -366,19 +366,19 @@ class Chain:
         before = self.walk(start, mode, self.static[:place])
         return before.value, self.walk(before, mode, self.static[place : place + 1]).value
 
-    @torch.no_grad()
     def network_slope(self, actuation: Tensor, direction: Tensor) -> Tensor:
         """(S, n, 3, m) derivative of the key points by the effective actuation, mm a unit.
 
-        actuation, direction: (S, m) in front of a static network. By forward differentiation.
+        actuation, direction: (S, m) in front of a static network. By reverse differentiation, one
+        pass for each coordinate: the first use of PyTorch's forward mode (`torch.func.jvp`) costs
+        1.3 s, which is a quarter of a diagnosis.
         """
-        slopes = [
-            torch.func.jvp(
-                lambda at: self.net(at, direction), (actuation,), (unit.expand_as(actuation),)
-            )[1]
-            for unit in torch.eye(actuation.shape[-1], dtype=actuation.dtype)
-        ]
-        return torch.stack(slopes, dim=-1)
+        with torch.enable_grad():
+            at = actuation.detach().clone().requires_grad_(True)
+            points = self.net(at, direction)
+            coordinates = points.flatten(1).unbind(1)
+            slopes = [torch.autograd.grad(c.sum(), at, retain_graph=True)[0] for c in coordinates]
+        return torch.stack(slopes, 1).unflatten(1, points.shape[1:])
 
     @torch.no_grad()
     def sensitivities(

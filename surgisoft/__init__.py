@@ -30,7 +30,8 @@ from surgisoft.environments import register_with_gymnasium
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from surgisoft.agents.session import evaluate, train
+    from surgisoft.agents.session import evaluate
+    from surgisoft.agents.training_request import train
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
     from surgisoft.diagnosis.design.next_experiment import next_experiment
@@ -70,7 +71,7 @@ _PLACES = {
     "register_effect_file": "surrogate.effects",
     "save_model": "surrogate.checkpoint",
     "save_recording": "measurement.recordings",
-    "train": "agents.session",
+    "train": "agents.training_request",
 }
 """The module of each function, inside the package."""
 _OTHER_NAMES = {"load": "load_model"}

@@ -1,23 +1,19 @@
-"""Train and evaluate policies by the names of their tasks and the folders of their runs."""
+"""Evaluate policies by the names of their tasks and the folders of their runs."""
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgisoft.agents.distributed import processes
 from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import POLICIES, check_policy, open_policy
-from surgisoft.agents.presets import Plan, preset_for, steps_for
 from surgisoft.agents.rollout import EpisodeRecorders
-from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
-from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
+from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
@@ -30,7 +26,6 @@ from surgisoft.tasks.registry import (
     read_config,
     with_fields,
 )
-from surgisoft.workers import torch_threads
 
 
 def task_config(
@@ -49,114 +44,6 @@ def task_config(
         config = read_config(task, Path(config))
     given = {"arm": arm, "scene": scene}
     return with_fields(config, **{name: str(v) for name, v in given.items() if v is not None})
-
-
-@dataclass(frozen=True)
-class TrainingRequest:
-    """What to train, before it is resolved to a `Plan`."""
-
-    task: str
-    """Name of the task."""
-    preset: str = "fast"
-    """`fast`, or `paper`: the hyper-parameters of Chen et al. 2025."""
-    steps: int | None = None
-    """Steps over all episodes; None: the number that the task names, unless minutes are given."""
-    minutes: float | None = None
-    """Time to train in place of steps, minutes."""
-    envs: int | None = None
-    """Episodes side by side; None: the preset's."""
-    seed: int = 0
-    """Seed of weights, noise and episodes."""
-    target_error: float | None = None
-    """Training ends when evaluation finds no larger mean error, mm, and full success."""
-    arm: str | Path | None = None
-    """Arm model of all arms; None: the configuration's."""
-    scene: str | Path | None = None
-    """Scene; None: the configuration's."""
-    config: Any = None
-    """Configuration of the task, or a TOML file with fields of it."""
-
-    def plan(self) -> Plan:
-        """Resolve the request to a `Plan`; raises InputError for contradicting options."""
-        if self.steps is not None and self.minutes is not None:
-            raise InputError(
-                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
-                "training ends by one or the other"
-            )
-        config = task_config(self.task, self.config, self.arm, self.scene)
-        numbers = preset_for(self.preset, self.task, envs=self.envs)
-        steps = self.steps
-        if steps is None and self.minutes is None:
-            steps = steps_for(self.preset, self.task)
-        return Plan(
-            self.task,
-            config,
-            self.preset,
-            numbers,
-            steps,
-            self.minutes,
-            self.target_error,
-            self.seed,
-        )
-
-
-@dataclass(frozen=True)
-class TrainedRun:
-    """A training run after its training."""
-
-    folder: Path
-    """Folder of the run."""
-    result: Result
-    """How training ended."""
-    leads: bool
-    """Whether this process wrote the folder, where torchrun started several."""
-
-
-def train(
-    task: str | None = None,
-    output: str | Path | None = None,
-    *,
-    resume_from: str | Path | None = None,
-    device: str = "cpu",
-    threads: int = 1,
-    progress: Callable[[TrainingProgress], None] | None = None,
-    **fields: Any,
-) -> TrainedRun:
-    """Train the agents of a task with PPO; all of them learn at the same time.
-
-    output: folder of the new run; default `runs/TASK-DATE-TIME`.
-    resume_from: folder of an interrupted run that goes on, in place of a task and its fields.
-    fields: other fields of `TrainingRequest`, such as `steps=100_000` or `arm="my_arm"`.
-    progress: called with the state of the training after each iteration.
-    """
-    report = progress or (lambda state: None)
-    if resume_from is not None:
-        names = [*(["task"] if task else []), *(["output"] if output else []), *fields]
-        if names:
-            given = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-            raise InputError(f"--resume continues with the options of the run: leave out {given}")
-        plan, folder = None, Path(resume_from)
-    elif task is None:
-        raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}, or --resume RUN")
-    else:
-        plan = TrainingRequest(task, **fields).plan()
-        folder = _new_folder(task, output)
-    with torch_threads(threads), processes(device) as (here, kind):
-        if plan is None:
-            result = resume(folder, here, kind, report)
-        else:
-            result = train_new(folder, plan, here, kind, report)
-        return TrainedRun(folder, result, here.leads)
-
-
-def _new_folder(task: str, output: str | Path | None) -> Path:
-    """The folder of a new run; several processes cannot each name it by the time."""
-    if output is None and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise InputError("several processes need one folder: name it with -o RUN")
-    folder = Path(output) if output else default_folder(task)
-    if os.environ.get("RANK", "0") == "0":
-        check_free(folder)
-    return folder
 
 
 @dataclass(frozen=True)

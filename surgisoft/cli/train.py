@@ -73,7 +73,7 @@ def train(
     --resume continues with the same numbers as an uninterrupted run. For several processes:
     torchrun --nproc-per-node N -m surgisoft train ...
     """
-    from surgisoft.agents.session import train as train_agents
+    from surgisoft.agents.training_request import train as train_agents
 
     given = {
         "preset": preset, "steps": steps, "minutes": minutes, "envs": envs, "seed": seed,

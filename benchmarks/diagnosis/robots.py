@@ -73,7 +73,7 @@ def bent(model: ArmModel, robot: int, wanted_mm: float, seed: int) -> ArmModel:
             for name, value in answer.network.layers.named_parameters():
                 if name in noise:
                     value.add_(middle * noise[name])
-        rows = Data(history, history, None).judging_rows(answer)
+        rows = Data(history, history, None).validation_rows(answer)
         found = validated_error(rows.target, model_rows(answer, rows))
         answer.validation = replace(found, noise_mm=model.validation.noise_mm)
         if found.rmse_mm < wanted_mm:

@@ -54,7 +54,7 @@ class Basis:
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows that are fitted and judged in turn, and what no column changes about it."""
+    """Rows that are fitted and held out in turn, and what is the same for every effect."""
 
     features: np.ndarray
     """(S, F) features of the static part."""
@@ -63,11 +63,11 @@ class Split:
     seen: np.ndarray
     """(S, n) which key points were measured."""
     block: np.ndarray
-    """(S,) block of each row; rows that are never judged come last."""
+    """(S,) block of each row; rows that are never held out come last."""
     fold: np.ndarray
-    """(B,) fold of each judged block, from 0."""
+    """(B,) fold of each block that is held out, from 0."""
     held: list[np.ndarray]
-    """The rows that each fold judges."""
+    """The rows that each fold holds out."""
     ridges: np.ndarray
     """(L, n) ridge on the features of each key point, for each room and each of PERSISTENCE."""
     bases: list[list[Basis]]
@@ -104,9 +104,9 @@ class Split:
                 for rows in PERSISTENCE
             ]
         )
-        judged = np.unique(fold[fold != FITTED], return_inverse=True)[1]
-        owner = np.append(judged, FITTED)[np.minimum(block, len(judged))]
-        held = [np.flatnonzero(owner == number) for number in range(judged.max() + 1)]
+        held_out = np.unique(fold[fold != FITTED], return_inverse=True)[1]
+        owner = np.append(held_out, FITTED)[np.minimum(block, len(held_out))]
+        held = [np.flatnonzero(owner == number) for number in range(held_out.max() + 1)]
         groups, which = np.unique(seen, axis=1, return_inverse=True)
         alike = [np.flatnonzero(which.reshape(-1) == g) for g in range(groups.shape[1])]
         bases: list[list[Basis]] = []
@@ -114,11 +114,11 @@ class Split:
             some = [features[(owner != number) & seen[:, points[0]]] for points in alike]
             found = [linalg.eigh(rows.T @ rows, check_finite=False) for rows in some]
             bases.append([Basis(p, *pair) for p, pair in zip(alike, found, strict=True)])
-        return cls(features, residual, seen, block, judged, held, ridges, bases)
+        return cls(features, residual, seen, block, held_out, held, ridges, bases)
 
     @property
     def rows(self) -> int:
-        """Rows that are judged."""
+        """Rows that are held out in turn."""
         return int((self.block < len(self.fold)).sum())
 
     def turned(self, field: np.ndarray, known: np.ndarray | None = None) -> list[np.ndarray]:
@@ -150,7 +150,7 @@ class Split:
         return answer
 
     def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
-        """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it judges."""
+        """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it holds out."""
         rows = self.held[number]
         answer = field[rows].copy()
         for place, basis in enumerate(self.bases[number]):
@@ -172,8 +172,8 @@ class CrossValidation:
     """(rows, n, 3, 1 + K) residual and columns, mm; 0 where missing."""
     grams: np.ndarray
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
-    judged: np.ndarray
-    """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each judged block."""
+    held_out: np.ndarray
+    """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each held-out block."""
     cache: dict = field(default_factory=dict)
     """Held-out sums of squares and amplitudes by columns."""
 
@@ -184,9 +184,9 @@ class CrossValidation:
         both = np.concatenate([first, _masked(split, columns)], axis=3)
         known = split.residual[split.rows :]
         turned = split.turned(both, known)
-        grams, judged = _products(split, both, turned, both, turned)
+        grams, held_out = _products(split, both, turned, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
-        return cls(split, both, grams, judged)
+        return cls(split, both, grams, held_out)
 
     def extended(self, columns: np.ndarray) -> "CrossValidation":
         """The same with further columns (rows, n, 3, K') behind those that it has."""
@@ -197,14 +197,14 @@ class CrossValidation:
         old = self.split.turned(self.fields, known)
         whole = [np.concatenate(pair, axis=3) for pair in zip(old, turned, strict=True)]
         beside = _products(self.split, both, whole, more, turned)
-        grams, judged = (
-            _bordered(*pair) for pair in zip((self.grams, self.judged), beside, strict=True)
+        grams, held_out = (
+            _bordered(*pair) for pair in zip((self.grams, self.held_out), beside, strict=True)
         )
-        return CrossValidation(self.split, both, grams, judged, dict(self.cache))
+        return CrossValidation(self.split, both, grams, held_out, dict(self.cache))
 
     def level_losses(self) -> np.ndarray:
         """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""
-        return self.judged[:, :, 0, 0].astype(float)
+        return self.held_out[:, :, 0, 0].astype(float)
 
     @property
     def columns(self) -> int:
@@ -241,7 +241,7 @@ class CrossValidation:
             rows = np.concatenate([[0], columns + 1])
             amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
             mix = np.insert(-amplitudes, 0, 1.0, axis=-1)[:, :, self.split.fold]
-            part = self.judged[:, :, rows[:, None], rows].astype(float)
+            part = self.held_out[:, :, rows[:, None], rows].astype(float)
             losses = (mix * (part[:, None] @ mix[..., None])[..., 0]).sum(axis=-1)
             self.cache[key] = losses, amplitudes
         return self.cache[key]
@@ -253,11 +253,11 @@ def _masked(split: Split, columns: np.ndarray) -> np.ndarray:
 
 
 def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
-    """(grams, judged) of the columns of two fields (rows, n, 3, A or B), as in CrossValidation."""
+    """(grams, held_out) of CrossValidation from the columns of two fields (rows, n, 3, A or B)."""
     levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
     parts = np.array([_product(a[rows], b[rows]) for rows in split.held], float)
     grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
-    judged = np.empty((levels, len(split.fold), *size), np.float32)
+    held_out = np.empty((levels, len(split.fold), *size), np.float32)
     for number, rows in enumerate(split.held):
         for level in range(levels):
             mine = split.shrunk(turned_b[number], number, level)
@@ -268,8 +268,8 @@ def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.nd
                 left = split.away(a, split.shrunk(turned_a[number], number, level), number)
             for one in np.unique(split.block[rows]):
                 own = split.block[rows] == one
-                judged[level, one] = _product(left[own], right[own])
-    return grams, judged
+                held_out[level, one] = _product(left[own], right[own])
+    return grams, held_out
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

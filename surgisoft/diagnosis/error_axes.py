@@ -1,8 +1,8 @@
 """The axes that an error is laid out on, and how much of it each of them explains.
 
 An axis has columns to sort the rows by, and a design: functions of it, alone and times the
-actuation, from which a regression may predict the residual. What it explains is judged on blocks
-of time that took no part. Static axes (what the arm's posture says) are judged alone, axes of
+actuation, from which a regression may predict the residual. What it explains is measured on
+held-out blocks of time. Static axes (what the arm's posture says) are evaluated alone, axes of
 memory and context by what they explain beyond the actuation. Shares overlap: they do not add up.
 """
 
@@ -265,7 +265,7 @@ class AxisShare:
     ci95: tuple[float, float]
     """95 % interval of it from a bootstrap of blocks."""
     static: bool
-    """Whether it was judged alone, not beyond the actuation."""
+    """Whether it was evaluated alone, not beyond the actuation."""
 
 
 def shares(problem: Problem) -> list[AxisShare]:

@@ -3,7 +3,7 @@
 `compare`, `diagnose`, `amend`, `improve` and `next_experiment` all start from one `ResidualTable`,
 which is built once from a model and recordings. `ResidualTable.view` hands out the training rows,
 the held-out rows or all rows as a `Problem`: the rows of that part alone, thinned, in blocks of
-time and folds, with the measurement noise and the model discrepancy that errors are judged
+time and folds, with the measurement noise and the model discrepancy that errors are compared
 against. Key points of rows outside the part are NaN in a view, so that nothing that works on a
 view can see them.
 """
@@ -85,16 +85,31 @@ def noise_of(recordings: list[Recording]) -> tuple[np.ndarray, str]:
     for floor in (_stated_floor(recordings), hold_floor(recordings)):
         if floor.rmse_mm is not None:
             return np.full(count, max(floor.rmse_mm, LEAST_NOISE_MM)), floor.source
-    second = [np.diff(r.key_points_mm[run], 2, axis=0) for r in recordings for run in r.runs]
-    second = np.concatenate([part for part in second if len(part)] or [np.zeros((1, count, 3))])
+    parts = [r.key_points_mm[run] for r in recordings for run in r.runs]
+    run = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return _differences_noise(np.concatenate(parts), run)
+
+
+def _differences_noise(points_mm: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, str]:
+    """(n,) RMS noise of each key point's distance, mm, from second differences, and its source.
+
+    points_mm: (N, n, 3), NaN where missing; run: (N,) run of each row. The spread is the median of
+    absolute values, scaled to the standard deviation of a normal distribution.
+    """
+    second = np.diff(points_mm, 2, axis=0)[run[2:] == run[:-2]]
     seen = np.isfinite(second).any(axis=0)
-    spread = np.zeros(second.shape[1:])
+    spread = np.zeros(points_mm.shape[1:])
     if seen.any():
         median = np.nanmedian(np.abs(second[:, seen]), axis=0)
         spread[seen] = 1.4826 * median / np.sqrt(6.0)
     noise = np.sqrt((spread**2).sum(1))
     source = "second differences" if noise.any() else "unknown"
     return np.maximum(noise, LEAST_NOISE_MM), source
+
+
+def _floor_of(noise_mm: np.ndarray, source: str) -> Floor:
+    """The floor over all key points from the noise (n,) of each."""
+    return Floor(float(np.sqrt(np.mean(noise_mm**2))), source) if source != "unknown" else UNKNOWN
 
 
 def _stated_floor(recordings: list[Recording]) -> Floor:
@@ -203,9 +218,18 @@ class ResidualTable:
         return features(self.memory, self.spec, context, timed)
 
     def only(self, part: Part) -> "ResidualTable":
-        """The table of one part: key points of all other rows are NaN, in the history too."""
+        """The table of one part: key points of all other rows are NaN, in the history too.
+
+        A noise floor from second differences is then that of the training rows, for either part:
+        the held-out rows decide nothing before the final check.
+        """
         if part == "all":
             return self
+        noise, floor = self.noise_mm, self.floor
+        if floor.source == "second differences":
+            training = np.where(self.held_out[:, None, None], np.nan, self.measured_mm)
+            noise, source = _differences_noise(training, self.run)
+            floor = _floor_of(noise, source)
         shown = self.held_out if part == "held_out" else ~self.held_out
         points = self.history.key_points.clone()
         points[self.history.valid] = points[self.history.valid].masked_fill(
@@ -215,6 +239,8 @@ class ResidualTable:
             self,
             measured_mm=np.where(shown[:, None, None], self.measured_mm, np.nan),
             history=replace(self.history, key_points=points),
+            noise_mm=noise,
+            floor=floor,
         )
 
     def view(
@@ -245,7 +271,7 @@ class ResidualTable:
             block_of_row=places,
             motion=motion,
             fold=folds(motion),
-            discrepancy_mm=model_discrepancy(self.model, self.noise_mm),
+            discrepancy_mm=model_discrepancy(self.model, table.noise_mm),
         )
 
     def training(self, rows: int = ROWS) -> "Problem":
@@ -267,7 +293,6 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
     if not torch.isfinite(predicted).all():
         raise InputError("the model predicts values that are not finite; fit it again")
     noise, source = noise_of(recordings)
-    known = source != "unknown"
 
     def each(pick, width: tuple[int, ...] = ()) -> np.ndarray:
         """One value a row, from what each recording has; NaN where it has nothing."""
@@ -296,7 +321,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         payload_g=each(lambda r: r.payload_g),
         held_out=held_out_rows(recordings),
         noise_mm=noise,
-        floor=Floor(float(np.sqrt(np.mean(noise**2))), source) if known else UNKNOWN,
+        floor=_floor_of(noise, source),
         holds=hold_floor(recordings),
     )
 

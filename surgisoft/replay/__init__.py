@@ -1,1 +1,1 @@
-"""Pictures and recordings for the eye: the only part that draws."""
+"""Replays of episodes, scenes and comparisons in the Rerun viewer; the only part that draws."""

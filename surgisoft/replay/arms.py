@@ -12,20 +12,20 @@ from surgisoft.scene import frames
 from surgisoft.tasks.episodes.parts import ArmLog
 
 BORE_MM = 1.5
-"""Radius of the channel in the tip: the paper's is 3 mm across (mm)."""
+"""Radius of the channel in the tip (mm); it is 3 mm across in the paper's arm."""
 BAND_MM = 1.4
 """Length of the band at a key point (mm)."""
 TIP_MM = 1.2
 """Length of the bevelled end (mm)."""
 SOCKET_MM = 3.0
-"""What stands behind an arm that has no shaft (mm)."""
+"""Length of the socket that is drawn behind an arm without a shaft (mm)."""
 SIDES = 40
 """Corners of a sleeve's section."""
 SOLID = rr.components.FillMode.Solid
 
 
 def log_arm(columns: Columns, name: str, arm: ArmLog, rows: np.ndarray) -> None:
-    """One arm in the log's `rows`: its shaft once, its body, its bands, its tip."""
+    """Log one arm in the log's `rows`: shaft, body, bands at the key points, tip."""
     colour = ARM_COLOURS.get(name, ARM_COLOURS["arm"])
     band = BAND_COLOURS.get(name, BAND_COLOURS["arm"])
     radius, base = arm.radius_mm, arm.mount[:3, 3]
@@ -49,8 +49,8 @@ def log_arm(columns: Columns, name: str, arm: ArmLog, rows: np.ndarray) -> None:
 def joined(line_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cylinders of a tube along lines (T, K, 3): middles (T, K - 1, 3), axes, lengths (T, K - 1).
 
-    Each is longer than its stretch by what closes the gap on the outer side of a bend, but for the
-    ends of the tube.
+    Each cylinder is longer than its segment, so that no gap opens on the outer side of a bend; at
+    the ends of the tube it is not.
     """
     steps = np.diff(line_mm, axis=1)
     length = frames.norm(steps)
@@ -64,7 +64,7 @@ def joined(line_mm: np.ndarray, radius_mm: float) -> tuple[np.ndarray, np.ndarra
 
 
 def key_planes(points_mm: np.ndarray, line_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (T, n, 3) and axes (T, n, 3) of the key planes of points on lines (T, K, 3)."""
+    """Middles (T, n, 3) and axes (T, n, 3) of the key planes at points on lines (T, K, 3)."""
     away = frames.norm(points_mm[:, :, None] - line_mm[:, None])
     near = away.argmin(axis=2)
     last = line_mm.shape[1] - 1
@@ -76,7 +76,7 @@ def key_planes(points_mm: np.ndarray, line_mm: np.ndarray) -> tuple[np.ndarray, 
 def _log_sleeves(
     columns: Columns, entity: str, rows, line_mm: np.ndarray, radius_mm: float, colour
 ) -> None:
-    """The body along lines (R, K, 3): one open sleeve, drawn K - 1 times in each row."""
+    """Log the body along lines (R, K, 3) mm: one open sleeve, drawn K - 1 times in each row."""
     middles, axes, lengths = joined(line_mm, radius_mm)
     middles[:, -1] -= 0.5 * TIP_MM * axes[:, -1]
     lengths[:, -1] -= TIP_MM
@@ -110,7 +110,7 @@ def _sleeve(radius_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _log_tip(columns: Columns, entity: str, rows, tip_mm, aim, radius_mm: float, colour) -> None:
-    """The bevelled end with its channel, at tips (R, 3) mm along (R, 3)."""
+    """Log the bevelled end with its channel, at tips (R, 3) mm along `aim` (R, 3)."""
     line = np.array([[0.0, 0.0, -1.5 * TIP_MM], [0.0, 0.0, -0.5 * TIP_MM], [0.0, 0.0, 0.0]])
     vertices, faces, normals = tube(line, radius_mm, BORE_MM, SIDES)
     hole = np.arange(len(vertices)) >= len(vertices) - BORE_RINGS * SIDES
@@ -127,7 +127,7 @@ def _log_tip(columns: Columns, entity: str, rows, tip_mm, aim, radius_mm: float,
 
 
 def _log_bands(columns: Columns, entity: str, rows, middles, axes, radius_mm: float, colour):
-    """A short cylinder at each key point: middles and axes (R, n, 3)."""
+    """Log a short cylinder at each key point: middles and axes (R, n, 3)."""
     count = middles.shape[1]
     still = rr.Cylinders3D.from_fields(
         lengths=BAND_MM, radii=radius_mm, colors=colour, fill_mode=SOLID
@@ -140,7 +140,7 @@ def _log_bands(columns: Columns, entity: str, rows, middles, axes, radius_mm: fl
 
 
 def turns_from_z(axes: np.ndarray) -> np.ndarray:
-    """(N, 4) quaternions x, y, z, w that turn the z axis the short way onto unit axes (N, 3)."""
+    """(N, 4) quaternions x, y, z, w: smallest rotations of the z axis onto unit axes (N, 3)."""
     x, y, z = axes.T
     flipped = z < -1.0 + 1e-6
     turn = np.column_stack((-y, x, np.zeros_like(x), 1.0 + z))
@@ -149,7 +149,7 @@ def turns_from_z(axes: np.ndarray) -> np.ndarray:
 
 
 def _log_rod(recording, entity: str, start, end, radius_mm: float) -> None:
-    """One cylinder that never moves."""
+    """Log one cylinder that does not move."""
     axis = end - start
     length = float(np.linalg.norm(axis))
     rod = rr.Cylinders3D(

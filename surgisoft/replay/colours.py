@@ -1,4 +1,4 @@
-"""The colours that every picture shares, as sRGB 0..255."""
+"""Colours that all 3D views and plots share, as sRGB 0..255."""
 
 import numpy as np
 
@@ -7,27 +7,27 @@ ROLE_COLOURS = {
     "keep-out": (112, 140, 62),
     "support": (128, 136, 146),
 }
-"""A body by its role."""
+"""Colour of a body by its role."""
 ROLE_NAMES = {"organ": "red-brown", "keep-out": "olive green", "support": "grey"}
-"""Words for those colours."""
+"""Name of the colour of each role."""
 ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196), "arm": (236, 226, 208)}
-"""A soft body by its arm's name."""
+"""Colour of a soft body by its arm's name."""
 BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196, 132, 56)}
-"""The bands that mark an arm's key points."""
+"""Colour of the bands that mark an arm's key points."""
 SHAFT_COLOUR = (88, 94, 102)
 LESION_COLOUR = (214, 172, 118)
 LESION_TINT = 0.35
-"""How far tissue inside the ring goes from the organ's colour to the lesion's."""
+"""Share of the lesion's colour that is mixed into the organ's inside the ring."""
 PLAN_COLOUR = (255, 214, 64)
-"""Reference: ring, path, target."""
+"""Colour of the reference: ring, path, target."""
 REAL_COLOUR = (70, 225, 240)
-"""Actual path."""
+"""Colour of the actual path."""
 BEAM_COLOUR = (80, 255, 120)
-"""The aiming beam is green, as in the endoscope's picture: red is lost on an organ."""
+"""Colour of the beam: green, as in the endoscope's picture, because red is lost on an organ."""
 CONE_COLOUR = (90, 200, 250)
 BACKGROUND = (24, 28, 34)
 LIMIT_COLOUR = (255, 96, 80)
-"""A limit in a plot."""
+"""Colour of a limit in a plot."""
 SERIES = (
     (86, 180, 233),
     (230, 159, 0),
@@ -38,12 +38,12 @@ SERIES = (
     (150, 150, 250),
     (200, 200, 200),
 )
-"""Lines of a plot: safe for colour-blind viewers (Okabe & Ito 2008), lighter for black."""
+"""Colours of a plot's lines: safe for colour-blind viewers (Okabe & Ito 2008), on black."""
 
 BLANCHED = (204, 186, 172)
-"""Tissue at the threshold of ablation."""
+"""Colour of tissue at the threshold of ablation."""
 CHARRED = (26, 20, 18)
-"""Ablated tissue."""
+"""Colour of ablated tissue."""
 
 
 def series_colour(number: int) -> tuple[int, int, int]:
@@ -52,15 +52,15 @@ def series_colour(number: int) -> tuple[int, int, int]:
 
 
 def paler(colour: tuple[int, int, int], share: float = 0.5) -> tuple[int, int, int]:
-    """The colour mixed with the plot's dark ground."""
+    """The colour mixed with the plot's dark background."""
     return tuple(round(share * part + (1.0 - share) * 40) for part in colour)
 
 
 def tissue_colours(heat: np.ndarray, base: np.ndarray | tuple[int, int, int]) -> np.ndarray:
-    """(V, 4) uint8 of tissue at `heat` (V,), its dose as a share of the threshold of ablation.
+    """(V, 4) uint8 colours of tissue at `heat` (V,): dose divided by the threshold of ablation.
 
-    `base` (3,) or (V, 3) is its colour untouched. It turns pale on the way to the threshold and is
-    charred beyond.
+    `base` (3,) or (V, 3) is the colour without dose. Tissue turns pale up to the threshold and is
+    charred beyond it.
     """
     share = np.clip(heat, 0.0, 1.0)[:, None]
     colour = np.array(base) + (np.array(BLANCHED) - np.array(base)) * share

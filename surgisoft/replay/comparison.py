@@ -1,4 +1,4 @@
-"""A model against a recording as a replay: measured and predicted body, coloured by error."""
+"""Replay of a model compared with a recording: measured and predicted body, with the errors."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from surgisoft.replay.shapes import finer
 MOST_ROWS = 6000
 """Longer comparisons are thinned evenly to so many rows."""
 STRETCH_OF_ERROR = 0.15
-"""Errors are drawn so long that a large one (95 %) is this share of the body's size."""
+"""Length of the drawn error at the 95 % quantile, as a share of the body's size."""
 LARGE = 0.95
-"""Share of all errors that the colour scale reaches up to."""
+"""Quantile of the errors at which the colour scale ends."""
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
 
@@ -37,10 +37,10 @@ def write_comparison(
 ) -> Replay:
     """Write measured against predicted key points as an .rrd file.
 
-    t_s (S,) s, where it falls back a new run begins; measured_mm (S, n, 3) and predicted_mm
-    (S, n, 3) in the base frame, nan where missing; pressure (S, m) in `unit`, drawn if given;
-    `name` says what is compared. Both bodies lie on each other, so each error is also drawn as an
-    arrow from measured to predicted, stretched by the factor that the view's title gives.
+    t_s (S,) s; a new run begins where it decreases. measured_mm (S, n, 3) and predicted_mm
+    (S, n, 3) are in the base frame, nan where missing. pressure (S, m) in `unit` is plotted if
+    given. `name` describes the comparison. The two bodies nearly coincide, so each error is also
+    drawn as an arrow from measured to predicted, magnified by the factor in the view's title.
     """
     began, path = time.perf_counter(), Path(path)
     t_s, measured, predicted = (np.asarray(x, float) for x in (t_s, measured_mm, predicted_mm))
@@ -66,7 +66,7 @@ def write_comparison(
 
 
 def continued(t_s: np.ndarray) -> np.ndarray:
-    """(S,) s that never fall: where time falls back, a new run goes on after the one before."""
+    """(S,) s that never decrease: a run whose time starts again continues after the one before."""
     steps = np.diff(t_s)
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     steps = np.where(steps < 0.0, usual, steps)
@@ -92,7 +92,7 @@ def _quantile(error: np.ndarray, share: float) -> float:
 
 
 def _stretch(measured: np.ndarray, large: float) -> float:
-    """A round factor by which errors are drawn longer."""
+    """The round factor by which the drawn errors are magnified."""
     points = measured[np.isfinite(measured).all(-1)]
     size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 1.0
     factor = STRETCH_OF_ERROR * size / max(large, 1e-9)
@@ -101,7 +101,7 @@ def _stretch(measured: np.ndarray, large: float) -> float:
 
 
 def _lines(error, pressure, unit: str) -> dict[str, list[Line]]:
-    """Title of each plot -> its lines."""
+    """Lines of each plot by its title."""
     count = error.shape[1]
     groups = {
         "Error of each key point (mm)": [
@@ -117,7 +117,7 @@ def _lines(error, pressure, unit: str) -> dict[str, list[Line]]:
 
 
 def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> None:
-    """A spline through the key points of each row in which all are known and apart."""
+    """Log a spline through the key points of each row in which all are known and distinct."""
     apart = (np.linalg.norm(np.diff(points, axis=1), axis=-1) > 1e-6).all(1)
     rows = np.flatnonzero(np.isfinite(points).all((1, 2)) & apart)
     if points.shape[1] < 2 or not len(rows):
@@ -129,7 +129,7 @@ def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> N
 
 
 def _log_errors(columns: Columns, measured, predicted, error, stretch: float, large: float) -> None:
-    """Key points coloured by error, and an arrow for each; what is missing is left out."""
+    """Log key points coloured by error, and an arrow for each; missing values are omitted."""
     known = np.isfinite(error)
     rows, counts = np.flatnonzero(known.any(1)), known.sum(1)
     counts = counts[rows]

@@ -29,7 +29,7 @@ CONE = "/endoscope/cone"
 PIXELS = 240
 """Width and height of a picture."""
 PICTURES_HZ = 2.5
-"""Pictures a second."""
+"""Pictures per second."""
 JPEG_QUALITY = 82
 CONE_MM = 16.0
 """Length of the drawn cone (mm)."""
@@ -48,7 +48,7 @@ def log_camera(
     looks: np.ndarray,
     report: Progress = silent,
 ) -> None:
-    """The camera's pose in the log's `rows`, and its picture in `looks`."""
+    """Log the camera's pose in the log's `rows`, and its picture in rows `looks`."""
     arm, half = log.arms[ENDOSCOPE], 0.5 * log.camera.fov_rad
     pinhole = rr.Pinhole(
         resolution=[PIXELS, PIXELS],
@@ -96,14 +96,14 @@ def jpegs(log: EpisodeLog, rows: np.ndarray, report: Progress = silent) -> list[
 
 
 def _visible_beam(log: EpisodeLog, row: int) -> np.ndarray | None:
-    """(2, 3) mm: the beam's ends while it burns."""
+    """(2, 3) mm: the beam's ends while it is on, else None."""
     if log.beam is None or not log.beam.on[row]:
         return None
     return np.stack((log.arms[LASER].line_mm[row, -1], log.beam.end_mm[row]))
 
 
 class _Paint:
-    """Colours the organ in the picture: the lesion by its tint, and all by the dose of a row."""
+    """Colours the organ in the picture: a tint for the lesion, and the dose of a row."""
 
     def __init__(self, log: EpisodeLog):
         self.dose = log.dose
@@ -114,7 +114,7 @@ class _Paint:
             self.tint = LESION_TINT * np.append(self.dose.zone == LESION, False)[:, None]
 
     def at(self, row: int):
-        """For `Renderer.image`."""
+        """The `paint` argument of `Renderer.image` for a row; None without a dose."""
         if self.dose is None:
             return None
         share = np.append(self.dose.at(row) / self.dose.threshold_j_per_mm2, 0.0)[:, None]

@@ -38,7 +38,7 @@ from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 SCENE = "Scene"
 """Name of the 3D view."""
 TRAIL = "/path/real"
-"""Entity that is shown from the start up to the present, not only as it is now."""
+"""Entity that is shown from the start of the episode up to the current time."""
 LEGEND = "/legend"
 """Text that explains the colours of the 3D view."""
 
@@ -77,7 +77,7 @@ def _view_names(part: rrb.Container | rrb.View) -> Iterator[str]:
 
 
 def _cells(plots: tuple[Plot, ...]) -> list:
-    """One view a plot, those of a group as tabs."""
+    """One view for each plot; the plots of a group become tabs."""
     cells, groups = [], {}
     for plot in plots:
         legend = rrb.PlotLegend(visible=False)
@@ -131,10 +131,10 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
 
 
 def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
-    """Where the 3D view looks from and to (3,) mm: the arms and the work in it.
+    """Eye and target (3,) mm of the 3D view, with the arms and the path in the picture.
 
-    With two arms it looks across both, from the side that the lesion faces; a lone arm is seen
-    from the front, a little from above.
+    Two arms are seen side by side, from the side that the lesion faces. A single arm is seen from
+    the front, a little from above.
     """
     alone = len(log.arms) == 1
     lines = [arm.line_mm for arm in log.arms.values()]
@@ -153,7 +153,7 @@ def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _across(log: EpisodeLog, apart: np.ndarray) -> np.ndarray:
-    """(3,) level direction from which both arms lie side by side and the lesion is seen."""
+    """(3,) horizontal direction from which both arms lie side by side and the lesion is seen."""
     facing = np.array([0.0, -1.0, 0.0])
     if log.dose is not None:
         normal = log.dose.normals.mean(axis=0) * [1.0, 1.0, 0.0]
@@ -167,29 +167,29 @@ def _across(log: EpisodeLog, apart: np.ndarray) -> np.ndarray:
 
 
 MOTION_HZ = 10.0
-"""Bodies are drawn so many times a second; plots have every step."""
+"""Rate at which bodies are drawn (1/s); plots have every step."""
 JUMP_MM = 3.0
-"""A target that goes farther in a step than this has jumped (mm)."""
+"""A target that moves farther than this in one step has jumped (mm)."""
 RING_CORNERS, RING_WIDER = 24, 1.15
 """Corners of the rings around a target body, and their radius in radii of the arm."""
 DOSE_HZ = 2.5
-"""The organ's colours change so many times a second."""
+"""Rate at which the organ's colours are updated (1/s)."""
 LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 """An event's level in Rerun's text log."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """A recording that was written."""
+    """A replay that was written to a file."""
 
     path: Path
     """The .rrd file."""
     megabytes: float
     """Its size, 10^6 bytes."""
     duration_s: float
-    """Time that it shows, s."""
+    """Duration of the episode, s."""
     cost_s: float
-    """Time that writing it took, s."""
+    """Time that writing took, s."""
 
     def __str__(self) -> str:
         rate = self.megabytes / max(self.duration_s, 1e-9) * 60.0
@@ -205,10 +205,10 @@ def write_replay(
     pictures_hz: float = PICTURES_HZ,
     report: Progress = silent,
 ) -> Replay:
-    """Write the log as an .rrd file that opens by itself with a fitting layout.
+    """Write an episode's log as an .rrd file that includes its layout.
 
-    pictures_hz: endoscope pictures for each second of the episode, which take nearly all of the
-    time. report: called with pictures drawn and to draw.
+    pictures_hz: endoscope pictures per second of the episode; they take nearly all of the time.
+    report: receives the number of pictures drawn, and of all pictures.
     """
     began, path = time.perf_counter(), Path(path)
     plots = plots_of(log)
@@ -236,7 +236,7 @@ def write_replay(
 
 
 def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
-    """(R,) rows about 1 / rate_hz apart, the last one among them, in which every arm is finite."""
+    """(R,) rows about 1 / rate_hz apart, with the last one, in which every arm is finite."""
     stride = max(1, round(1.0 / (rate_hz * log.dt_s)))
     rows = np.unique(np.append(np.arange(0, log.rows, stride), log.rows - 1))
     finite = [np.isfinite(arm.line_mm[rows]).all((1, 2)) for arm in log.arms.values()]
@@ -244,7 +244,7 @@ def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
 
 
 def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
-    """Every body once; the organ's faces around the lesion apart, coloured as they are cut."""
+    """Log every body once; the organ's faces around the lesion separately, coloured by dose."""
     for body in log.bodies:
         mesh, entity = Mesh(body.vertices_mm, body.faces), f"/bodies/{body.name}"
         kept = np.ones(len(mesh.faces), dtype=bool)
@@ -284,7 +284,7 @@ def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) ->
 
 
 def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
-    """The reference path once; the actual path, piece by piece; both points as they move."""
+    """Log the reference path once, and over time the actual path and the target."""
     closed = np.vstack((log.path_mm, log.path_mm[:1]))
     planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
     if planned:
@@ -309,14 +309,14 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
 
 
 def _unbroken(points_mm: np.ndarray) -> list[np.ndarray]:
-    """The pieces of (T, 3) mm that are walked without a jump, where anything moves."""
+    """The pieces of a path (T, 3) mm between jumps; pieces without motion are omitted."""
     steps = np.linalg.norm(np.diff(points_mm, axis=0), axis=1)
     pieces = np.split(points_mm, np.flatnonzero(~(steps <= JUMP_MM)) + 1)
     return [piece for piece in pieces if len(piece) > 1 and np.ptp(piece, axis=0).max() > 0.0]
 
 
 def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: float) -> None:
-    """Rings around the reference points (R, k, 3) of a whole body, a little wider than it."""
+    """Log rings around the reference points (R, k, 3) of a whole body, slightly wider than it."""
     count = targets.shape[1]
     turn = 2.0 * np.pi * np.arange(RING_CORNERS + 1) / RING_CORNERS
     flat = np.stack((np.cos(turn), np.sin(turn), 0.0 * turn), axis=1)
@@ -330,7 +330,7 @@ def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: flo
 
 
 def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
-    """The beam from the tip to where it ends: thick while it burns, thin while it only aims."""
+    """Log the beam from the tip to its end: thick while the laser is on, thin while it aims."""
     ends = np.stack((log.arms[LASER].line_mm[:, -1], log.beam.end_mm), axis=1)[rows]
     on = log.beam.on[rows]
     strips = rr.LineStrips3D.columns(
@@ -345,7 +345,7 @@ def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
 
 
 def legend(log: EpisodeLog) -> str:
-    """Markdown that names the colours of the 3D view, as far as the log has what they stand for."""
+    """Markdown that explains those colours of the 3D view that occur in the log."""
     rows = [
         ("yellow", "reference: path and target", True),
         ("cyan", "actual path, while the beam is on" if log.beam else "actual path", True),

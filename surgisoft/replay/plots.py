@@ -12,7 +12,7 @@ from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import ArmLog
 
 SHARES = ("completion", "visited", "view_fraction", "safe")
-"""Measures that run from 0 to 1 together."""
+"""Measures from 0 to 1, which share one plot."""
 SHOWN_ELSEWHERE = (
     "success",
     "collided",
@@ -23,7 +23,7 @@ SHOWN_ELSEWHERE = (
     "beam",
     "beam_unsafe",
 )
-"""Measures that events or another plot show; the last ones are those of experiments."""
+"""Measures that events or another plot show; from `phase` on those of experiments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Line:
     name: str
     """Its name in the legend."""
     values: np.ndarray
-    """(T,) one for each row of the log; what is not finite is left out."""
+    """(T,) one value for each row of the log; values that are not finite are omitted."""
     colour: tuple[int, int, int]
     """sRGB, 0..255."""
     width: float = 1.6
@@ -51,13 +51,13 @@ class Plot:
     lines: tuple[Line, ...]
     """Its lines."""
     legend: str | None = None
-    """The corner of the legend; None: the title suffices."""
+    """Corner of the legend; None: no legend."""
     group: str = ""
-    """Plots of one group share a place as tabs."""
+    """Plots of one group share a place in the layout, as tabs."""
 
 
 def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
-    """The plots for a log, in the order in which they are laid out."""
+    """The plots of a log, in the order of the layout."""
     errors = {name: values for name, values in log.measures.items() if "error" in name}
     if not any(np.isfinite(values).any() for values in errors.values()):
         errors["error_mm"] = log.error_mm
@@ -82,7 +82,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
 
 
 def _corner(series: Mapping[str, np.ndarray], corner: str) -> str | None:
-    """A legend where there is more than one line."""
+    """The corner of the legend if there is more than one line, else None."""
     return corner if len(series) > 1 else None
 
 
@@ -94,7 +94,7 @@ def _lines(group: str, series: Mapping[str, np.ndarray]) -> tuple[Line, ...]:
 
 
 def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
-    """Each chamber's pressure, and its command, thinner and darker."""
+    """Each chamber's pressure and, thinner and darker, its command."""
     lines = []
     for i in range(arm.pressure_kPa.shape[1]):
         where, colour = f"/plots/pressure/{name}", series_colour(i)

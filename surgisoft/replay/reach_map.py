@@ -1,4 +1,4 @@
-"""The reachability map of a scene: the surface around the lesion as the laser meets it."""
+"""The reachability map of a scene: which surface around the lesion the laser reaches."""
 
 import io
 from pathlib import Path
@@ -11,11 +11,11 @@ from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
 
 REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
-"""One colour a reason, in the order of REASONS."""
+"""Colour of each reason, in the order of REASONS."""
 
 
 def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) -> None:
-    """Write a .png: the patch coloured by incidence where it can be cut, and the ring unrolled."""
+    """Write a .png: the patch coloured by the beam's incidence, and the values around the ring."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

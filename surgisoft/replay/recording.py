@@ -1,4 +1,4 @@
-"""An .rrd file that is written whole or not at all, and fed with whole columns."""
+"""Write an .rrd file, whole or not at all, in columns of one entity each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TIME, STEP = "time", "step"
 def new_recording(
     path: Path, application: str, identity: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """A recording to log to; the file is there when the block ends, unless it raises."""
+    """A recording to log to; the file appears when the block ends without an exception."""
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
@@ -37,14 +37,14 @@ def new_recording(
 
 
 class Columns:
-    """Sends what changes over time, all rows of an entity in one call."""
+    """Logs data that change over time, all rows of an entity in one call."""
 
     def __init__(self, recording: rr.RecordingStream, time_s: np.ndarray):
         """time_s (T,): the time of every row of the log."""
         self.recording, self.time_s = recording, np.asarray(time_s, dtype=np.float64)
 
-    def send(self, entity: str, rows: np.ndarray, columns) -> None:
-        """The columns, one entry for each of the log's `rows` (R,), which are its steps."""
+    def send(self, entity: str, rows: np.ndarray, columns: rr.ComponentColumnList) -> None:
+        """Log columns with one entry for each of the log's `rows` (R,)."""
         rows = np.asarray(rows, dtype=np.int64)
         if not len(rows):
             return
@@ -55,7 +55,7 @@ class Columns:
         self.recording.send_columns(entity, indexes=times, columns=columns)
 
     def plot(self, line: Line) -> None:
-        """A line of a plot; rows that are not finite are left out."""
+        """Log a line of a plot; rows that are not finite are omitted."""
         style = rr.SeriesLines(names=line.name, colors=line.colour, widths=line.width)
         self.recording.log(line.entity, style, static=True)
         values = np.asarray(line.values, dtype=np.float64)

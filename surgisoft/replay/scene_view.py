@@ -32,15 +32,15 @@ from surgisoft.scene.mounted_arm import (
 from surgisoft.scene.reach import ArmReach
 
 BORE_MM = 1.5
-"""Radius of the arm's channel: 3 mm across in the paper's arm (mm)."""
+"""Radius of the arm's channel (mm); it is 3 mm across in the paper's arm."""
 LIFT_MM = 0.5
-"""What is drawn on a surface lies this far above it, so that neither shows through (mm)."""
+"""Height of drawings above the surface they lie on, so that it does not hide them (mm)."""
 FRAMES = 72
-"""Moments of the recording: the laser goes once around the ring."""
+"""Number of frames, during which the laser goes once around the ring."""
 
 
 def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> None:
-    """Write the scene as an .rrd file that opens by itself with a fitting view."""
+    """Write the scene as an .rrd file that includes its layout."""
     arms, ring = mounted_arms(scene, reaches), scene.ring
     cut = solve_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
@@ -53,7 +53,7 @@ def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> N
 
 
 def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
-    """One 3D view from the side on which the lesion lies, with lesion and both bases in it."""
+    """A layout with one 3D view from the lesion's side that contains lesion and both bases."""
     organ = scene.organ.world_mesh.bounds_mm
     points = np.array([*organ, *(arm.pose[:3, 3] for arm in arms.values())])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -76,7 +76,7 @@ def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
 
 
 def _side_of_both_arms(scene: Scene, arms: dict[str, MountedArm]) -> np.ndarray:
-    """(3,) horizontal unit vector from which lesion and both arms lie side by side."""
+    """(3,) horizontal unit vector towards an eye that sees both arms side by side."""
     first, second = (arm.pose[:3, 3] for arm in arms.values())
     apart = (first - second) * [1.0, 1.0, 0.0]
     facing = scene.ring.normal * [1.0, 1.0, 0.0]
@@ -141,7 +141,7 @@ def _log_lesion(recording, scene: Scene) -> None:
 
 
 def _log_arm(recording, tool: str, arm: MountedArm, line_mm: np.ndarray, static: bool) -> None:
-    """The soft body as a tube; the shaft behind it once."""
+    """Log the soft body as a tube."""
     body = line_mm[1:] if arm.shaft_mm > 0.0 else line_mm
     vertices, faces, normals = tube(finer(body, 2.0), arm.reach.radius_mm, BORE_MM)
     recording.log(
@@ -186,7 +186,7 @@ def _log_endoscope(recording, scene: Scene, arm: MountedArm, look: EndoscopePose
 
 
 def _log_laser(recording, arm: MountedArm, cut: RingSolution, ring_mm: np.ndarray) -> None:
-    """The laser goes round the ring, one moment a point."""
+    """Log the laser arm going round the ring, one frame for each point."""
     _log_shaft(recording, "laser", arm)
     for i in range(0, len(ring_mm), max(1, len(ring_mm) // FRAMES)):
         recording.set_time("ring_point", sequence=i)

@@ -1,8 +1,9 @@
-"""Triangles for what has no mesh file: tubes along a centreline, cones, patches on a surface."""
+"""Geometry to draw that has no mesh file: tubes along a centreline, cones, surface patches."""
 
 import numpy as np
 
 from surgisoft.scene import frames
+from surgisoft.scene.mesh import Mesh
 
 
 def carried_frames(line_mm: np.ndarray) -> np.ndarray:
@@ -33,7 +34,7 @@ def finer(line_mm: np.ndarray, step_mm: float) -> np.ndarray:
 
 
 BORE_RINGS = 3
-"""Rings of vertices, the last ones of a tube, that are its bore's wall and floor."""
+"""Number of vertex rings, the last ones of a tube, that form the wall and floor of its bore."""
 
 
 def tube(
@@ -73,7 +74,7 @@ def _strips(rows: int, sides: int) -> np.ndarray:
 
 
 def polar_patch(circles: list[np.ndarray], centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a disc from its centre (3,) and circles (M, 3), inside to outside."""
+    """Vertices and faces of a disc from its centre (3,) and circles (M, 3), innermost first."""
     count = len(circles[0])
     vertices = np.concatenate((centre[None], *circles))
     j = np.arange(count)
@@ -93,8 +94,8 @@ def view_cone(eye: np.ndarray, axis: np.ndarray, half_rad: float, length_mm: flo
     return [rim, *(np.stack((eye, point)) for point in rim[:-1:8])]
 
 
-def creased(mesh):
-    """Vertices, faces and normals to draw; sharp coarse meshes keep a normal for every face."""
+def creased(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and normals to draw; coarse meshes with sharp edges get flat shading."""
     cosine = np.einsum("fk,fck->fc", mesh.face_normals, mesh.vertex_normals[mesh.faces])
     if np.mean(cosine < 0.8) < 0.3:
         return mesh.vertices_mm, mesh.faces, mesh.vertex_normals

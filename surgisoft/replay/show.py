@@ -21,13 +21,13 @@ from surgisoft.replay.viewer import (
 from surgisoft.tasks.episodes.file import load_episode
 
 PLACES = (f"*{SUFFIX}", f"replays/*{SUFFIX}", "replays/*.npz")
-"""Where a run's folder keeps its replays."""
+"""Patterns of replays in a run's folder."""
 MAGIC = b"RRF2"
 """First bytes of a Rerun recording, as rerun-sdk 0.41 writes it."""
 
 
 def find_replay(path: str | Path) -> Path:
-    """The replay (.rrd) or episode's log (.npz) itself, or the newest replay of a run's folder."""
+    """The given replay (.rrd) or episode log (.npz), or the newest replay in a run's folder."""
     path = Path(path)
     if path.is_dir():
         replays = [file for place in PLACES for file in path.glob(place) if file.is_file()]
@@ -53,14 +53,14 @@ def find_replay(path: str | Path) -> Path:
 
 
 def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:
-    """Timeline and time for a picture; without a time two thirds through.
+    """Timeline and time for a screenshot; the default is two thirds of the episode.
 
     None for a recording without a timeline of seconds, such as a scene's.
     """
     end = duration_s(recording)
     if end is None:
         if time_s is not None:
-            raise InputError(f"{recording}: has no timeline '{TIME}', so --time says nothing")
+            raise InputError(f"{recording}: has no timeline '{TIME}'; leave --time out")
         return None
     if time_s is not None and not 0.0 <= time_s <= end + 1e-6:
         raise InputError(f"time is {time_s:g} s, expected 0 to {end:g} s as {recording} lasts")
@@ -68,7 +68,7 @@ def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:
 
 
 def duration_s(recording: Path) -> float | None:
-    """How long a replay lasts on its timeline of seconds; None where it has none."""
+    """Duration of a replay on its timeline of seconds; None if it has no such timeline."""
     from rerun.chunk import RrdReader
 
     ends = []
@@ -82,7 +82,7 @@ def duration_s(recording: Path) -> float | None:
 
 
 WINDOW = "1600x1000"
-"""Size of a picture's window, in points."""
+"""Default size of the window of a screenshot, in points."""
 
 
 def open_replay(
@@ -99,21 +99,22 @@ def open_replay(
 ) -> Replay | None:
     """Open an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events.
 
-    what: a replay (.rrd), the log of an episode (.npz), or a folder, whose newest replay it is.
-    save: write the replay of a log there (.rrd) instead. screenshot: write a picture there, of the
-    moment `time_s` (default: two thirds through), of one `view` or all, in a window of `size`.
-    web: serve it to a browser on this machine; `on_address` is called with the address.
+    what: a replay (.rrd), the log of an episode (.npz), or a folder whose newest replay is opened.
+    save: write the replay of a log to this .rrd file instead. screenshot: write a picture to this
+    .png file instead, at `time_s` (default: two thirds of the episode), of one `view` or of all,
+    from a window of `size`. web: serve the replay to a browser on this machine; `on_address` is
+    called with the address.
     """
     window, found = parse_size(size), find_replay(what)
     if sum((web, screenshot is not None, save is not None)) > 1:
         raise InputError("expected at most one of --web, --screenshot and --save")
     if screenshot is None and (time_s is not None or view is not None):
-        raise InputError("--time and --view are for a picture: give --screenshot too")
+        raise InputError("--time and --view apply to a picture only: give --screenshot too")
     if view is not None and found.suffix != SUFFIX:
         check_view(view, layout_names(load_episode(found)))
     if save is not None:
         if found.suffix == ".rrd":
-            raise InputError(f"{found}: is a replay already; --save makes one of an episode's log")
+            raise InputError(f"{found}: is a replay already; --save makes one from an episode log")
         return write_replay(load_episode(found), Path(save), report=progress)
     with _recording(found, progress) as recording:
         if screenshot is not None:
@@ -128,7 +129,7 @@ def open_replay(
 
 @contextlib.contextmanager
 def _recording(found: Path, progress: Progress) -> Iterator[Path]:
-    """A replay itself; the replay of a log for the time of the block."""
+    """The replay itself, or the replay of a log in a temporary file."""
     if found.suffix == ".rrd":
         yield found
         return

@@ -1,7 +1,4 @@
-"""Surfaces to draw: meshes with sharp edges, a disc on a surface, the organ around the cut.
-
-`dosed_surface` divides the organ's faces around the cut finely enough to colour them by dose.
-"""
+"""The organ's surface around the cut, divided finely enough to colour it by its dose."""
 
 from __future__ import annotations
 
@@ -17,13 +14,13 @@ from surgisoft.scene.render import corner_normals
 from surgisoft.tasks.episodes.parts import DoseLog
 
 EDGE_MM = 0.4
-"""Longest edge of the coloured triangles: the finest cut is a few of them wide (mm)."""
+"""Longest edge of the coloured triangles (mm); the narrowest cut is a few of them wide."""
 NEAR_MM = 0.6
 """A vertex takes its dose from samples within this distance (mm)."""
 NEIGHBOURS = 3
-"""Samples that a vertex takes the mean of."""
+"""Number of samples whose mean a vertex takes."""
 COARSE = 8
-"""Faces longer than so many edges are quartered first, away from the samples not at all."""
+"""Faces with edges longer than this many EDGE_MM are quartered first, if samples are near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +34,12 @@ class DosedSurface:
     normals: np.ndarray
     """(V, 3) unit normals."""
     replaced: np.ndarray
-    """(R,) faces of the organ's mesh that these triangles stand for."""
+    """(R,) faces of the organ's mesh that these triangles replace."""
     samples: np.ndarray
     """(V, NEIGHBOURS) samples of the dose that each vertex takes the mean of; P for none."""
 
     inside: np.ndarray
-    """(V,) bool: inside the ring, so of the lesion."""
+    """(V,) bool: inside the ring, so part of the lesion."""
 
     def heat(self, dose: np.ndarray, threshold: float) -> np.ndarray:
         """(V,) dose at the vertices as a share of the threshold, for doses (P,), J/mm^2."""
@@ -52,7 +49,7 @@ class DosedSurface:
 
 
 def dosed_surface(mesh: Mesh, dose: DoseLog, edge_mm: float = EDGE_MM) -> DosedSurface:
-    """The faces of the organ's mesh on which the dose's samples lie, parted to `edge_mm`."""
+    """The faces of the organ's mesh that carry samples of the dose, divided to `edge_mm`."""
     tree = cKDTree(dose.points_mm)
     replaced = np.unique(dose.faces)
     pieces = np.stack((mesh.triangles_mm, corner_normals(mesh)), axis=2)[replaced]
@@ -90,7 +87,7 @@ def _near(pieces: np.ndarray, tree: cKDTree, margin_mm: float) -> np.ndarray:
 
 
 def _quartered(pieces: np.ndarray, tree: cKDTree, longest_mm: float) -> np.ndarray:
-    """The pieces, those near samples quartered until no edge is longer."""
+    """The pieces; those near samples are quartered until no edge is longer than longest_mm."""
     done = []
     while len(pieces):
         large = (_longest(pieces) > longest_mm) & _near(pieces, tree, NEAR_MM)

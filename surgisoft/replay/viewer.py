@@ -23,11 +23,11 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_atomically
 
 LOCAL = "127.0.0.1"
-"""The only address ever served on."""
+"""The only address that the viewer serves on: this machine."""
 
 
 def viewer_command() -> str:
-    """The viewer's program, as it came with rerun-sdk."""
+    """Path of the viewer's program, which rerun-sdk installs."""
     import rerun_cli
 
     beside = Path(sys.executable).with_name("rerun")
@@ -39,7 +39,7 @@ def viewer_command() -> str:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on."""
+    """A free TCP port of this machine."""
     with socket.socket() as probe:
         probe.bind((LOCAL, 0))
         return probe.getsockname()[1]
@@ -47,7 +47,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def temporary_recording() -> Iterator[Path]:
-    """A path for a recording that is gone afterwards."""
+    """A path for a temporary recording, deleted when the block ends."""
     with tempfile.TemporaryDirectory(prefix="surgisoft-") as folder:
         yield Path(folder) / "scene.rrd"
 
@@ -60,7 +60,7 @@ def _die_with_parent() -> None:
 
 @contextlib.contextmanager
 def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
-    """The viewer in a session of its own; whatever happens, its whole group ends with the block."""
+    """Run the viewer in its own session; its process group is ended when the block ends."""
     sink = subprocess.DEVNULL if quiet else None
     process = subprocess.Popen(
         [viewer_command(), *arguments],
@@ -80,7 +80,7 @@ def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
 
 
 def wait_for_port(process: subprocess.Popen, port: int, patience_s: float = 30.0) -> None:
-    """Until somebody listens on the port; an InputError if the viewer ends or takes too long."""
+    """Wait until the viewer listens on the port; an InputError if it ends or takes too long."""
     end = time.monotonic() + patience_s
     while time.monotonic() < end:
         if process.poll() is not None:
@@ -105,11 +105,11 @@ def open_viewer(recording: Path) -> None:
             )
 
 
-def serve_viewer(recording: Path, tell: Callable[[str], None]) -> None:
+def serve_viewer(recording: Path, on_address: Callable[[str], None]) -> None:
     """Serve viewer and recording to browsers on this machine until interrupted.
 
-    The recording is handed to the running server: given as an argument of the server, it keeps one
-    core busy for ever (rerun-sdk 0.41).
+    The recording is sent to the running server. As an argument of the server it would keep one core
+    busy for ever (rerun-sdk 0.41).
     """
     page, data = free_port(), free_port()
     ports = ("--web-viewer-port", str(page), "--port", str(data))
@@ -121,13 +121,13 @@ def serve_viewer(recording: Path, tell: Callable[[str], None]) -> None:
         stream.log_file_from_path(recording)
         stream.flush()
         stream.disconnect()
-        tell(web_address(page, data))
+        on_address(web_address(page, data))
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()
 
 
 def web_address(page: int, data: int) -> str:
-    """The page that shows the served recording."""
+    """Address of the page that shows the served recording."""
     source = f"rerun%2Bhttp%3A%2F%2F{LOCAL}%3A{data}%2Fproxy"
     return f"http://{LOCAL}:{page}/?url={source}&renderer=webgl"
 
@@ -137,9 +137,9 @@ WINDOW = (1600, 1000)
 LEAST, MOST = 100, 4000
 """Bounds of width and height (points)."""
 NOTICES_S = 7.0
-"""The viewer's notices about its start lie over the picture for so long (s)."""
+"""Time for which the viewer's start-up notices cover the picture (s)."""
 PATIENCE_S = 60.0
-"""How long the viewer may take to load the recording and draw (s)."""
+"""Longest time for the viewer to load the recording and draw (s)."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -186,8 +186,9 @@ def take_screenshot(
 ) -> None:
     """Draw an .rrd file into a .png: one view by its name, or the whole window.
 
-    `cursor` is a timeline and the place on it, s or a whole number; `size` the window in points,
-    which are pixels of the file; before it, `wait_s` for the viewer's notices to go.
+    `cursor` is a timeline and the position on it, s or an integer. `size` is that of the window in
+    points, which are the pixels of the file. `wait_s` is the time until the viewer's start-up
+    notices disappear.
     """
     picture = Path(picture)
     if view is not None:
@@ -204,7 +205,7 @@ def take_screenshot(
 
 
 def _draw(port: int, view: str | None, cursor, max_size: int, wait_s: float) -> bytes:
-    """Ask the running viewer for the picture, once its views are there and their data have come."""
+    """The picture from the running viewer, after its views and their data are loaded."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from rerun.experimental import ViewerClient
@@ -232,7 +233,7 @@ def _draw(port: int, view: str | None, cursor, max_size: int, wait_s: float) -> 
 
 
 def _packed(png: bytes) -> bytes:
-    """The same picture in fewer bytes: no transparency, better compressed."""
+    """The picture without transparency and better compressed."""
     from PIL import Image
 
     file = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Matplotlib figures as pictures of a page, in the colours of the reader's theme.
+"""Matplotlib figures as SVG pictures of a page, in the colours of the reader's theme.
 
 with drawing():
     figure, axis = plt.subplots(figsize=CHART)
@@ -17,11 +17,12 @@ from surgisoft.report.style import DARK_INK, DARK_LINE, DARK_MUTED, INK, LINE, M
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 CHART = (4.6, 3.0)
-"""Size of a chart that can be read on a telephone, inches."""
+"""Size of a chart that is legible on a phone, inches."""
 BLUE, RED, GREEN, AMBER = "#3b82c4", "#d1495b", "#3c9a6b", "#cf9330"
-"""Colours that stand out on light and on dark paper."""
+"""Colours with contrast on light and on dark backgrounds."""
 _STYLE = {
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
@@ -55,16 +56,16 @@ _THEME = (
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Draw in the style of the pages."""
+    """Use the pages' matplotlib style inside the block."""
     with mpl.rc_context(_STYLE):
         yield
 
 
-def chart(figure, alt: str, caption: str = "") -> Picture:
-    """A figure drawn inside `drawing` as an SVG picture; the figure is closed.
+def chart(figure: Figure, alt: str, caption: str = "") -> Picture:
+    """Convert a figure drawn inside `drawing` to an SVG picture, and close the figure.
 
-    Ink, muted and line colours become variables that follow the reader's theme. Draw clouds of
-    points with `rasterized=True`: each point would be an element of its own.
+    Ink, muted and line colours become variables that follow the reader's theme. Draw scatter plots
+    of many points with `rasterized=True`; otherwise each point becomes an SVG element.
     """
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", dpi=160, metadata={"Date": None, "Creator": None})

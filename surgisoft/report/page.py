@@ -1,4 +1,4 @@
-"""One page: title, verdict, parts; rendered to one file that needs no other."""
+"""A report page: title, verdict, parts; rendered to one self-contained HTML file."""
 
 import html
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from surgisoft.report.style import STYLE
 
 TONES = ("plain", "good", "warn", "bad")
 LEAST_CONTENTS = 3
-"""Fewest sections that are worth a table of contents."""
+"""Number of sections from which a page gets a table of contents."""
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""Nothing is fetched, whatever somebody's text may hold."""
+"""Content security policy: the page loads nothing, whatever text it contains."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """One report."""
+    """One report page."""
 
     title: str
     """What was examined."""
     verdict: str
     """The main result in one or two sentences, at the top of the page."""
     parts: Sequence[Part]
-    """What follows, in order."""
+    """The parts of the page, in order."""
     about: str = ""
     """A line under the title: the command, the files."""
     tone: str = "plain"
@@ -39,7 +39,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The page as one HTML document without any reference to another file."""
+    """The page as one self-contained HTML document."""
     sections = [part for part in page.parts if isinstance(part, Section)]
     contents = ""
     if len(sections) >= LEAST_CONTENTS:
@@ -63,7 +63,7 @@ def render(page: Page) -> str:
 
 
 def write_page(page: Page, path: Path) -> Path:
-    """Write the page to an .html file, whole or not at all; its folder is made."""
+    """Write the page to an .html file, whole or not at all; creates its folder."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, render(page).encode("utf-8"))

@@ -1,4 +1,4 @@
-"""What a page is made of. Every text is plain: it is escaped where it is set."""
+"""The parts of a page: text, facts, tables, pictures, sections. All texts are escaped."""
 
 import base64
 import html
@@ -12,14 +12,14 @@ from surgisoft.errors import InputError
 KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".jpg": "image/jpeg"}
 """Picture files that can be embedded, by suffix."""
 LONG_CELL = 24
-"""Letters above which a cell of a table is broken into lines, but not into a column of words."""
+"""Cells with more letters than this are wrapped, in a column of at least 18 em."""
 
 
 class Part(Protocol):
-    """Anything that a page can hold."""
+    """The interface of everything that a page can hold."""
 
     def to_html(self) -> str:
-        """The part as HTML, every foreign text in it escaped."""
+        """The part as HTML; all texts in it are escaped."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Facts:
-    """A few large figures side by side."""
+    """A few values in large type side by side."""
 
     items: Sequence[tuple[str, str]]
     """Name and value, the value with its unit."""
@@ -54,7 +54,7 @@ class Share:
     """A share between 0 and 1: a bar with its percentage, as the cell of a table."""
 
     value: float
-    """The share; the bar ends at 0 and 1, the number does not."""
+    """The share; the bar is clipped to 0 and 1, the number is not."""
 
     def to_html(self) -> str:
         width = 100 * min(max(self.value, 0.0), 1.0)
@@ -69,7 +69,7 @@ class Table:
     header: Sequence[str]
     """Names of the columns, with units."""
     rows: Sequence[Sequence[str | Share]]
-    """Cells; a column whose cells all start like numbers is set flush right."""
+    """Cells; a column whose cells all start with a number is aligned right."""
     title: str = ""
     """Heading above the table."""
 
@@ -126,17 +126,17 @@ class Picture:
     data: bytes
     """The encoded picture."""
     alt: str
-    """What it shows, for those who cannot see it."""
+    """Alternative text: what the picture shows."""
     caption: str = ""
     """A line below it."""
     kind: str = "image/png"
     """MIME type of `data`."""
     least_px: int = 0
-    """Width below which it scrolls in its own frame instead of shrinking further, pixels."""
+    """Smallest width in pixels; on a narrower page the picture scrolls in its own frame."""
 
     @classmethod
     def from_file(cls, path: Path, alt: str, caption: str = "", least_px: int = 0) -> "Picture":
-        """A picture file; its suffix says what it is."""
+        """Read a picture file; its suffix gives the type."""
         kind = KINDS.get(path.suffix.lower())
         if kind is None:
             raise InputError(f"{path}: suffix '{path.suffix}', expected one of {', '.join(KINDS)}")
@@ -154,7 +154,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures side by side where there is room, below each other where there is not."""
+    """Pictures side by side, or below each other on a narrow page."""
 
     pictures: Sequence[Picture]
     """The pictures, in order."""
@@ -166,12 +166,12 @@ class Gallery:
 
 @dataclass(frozen=True)
 class Section:
-    """A titled piece of the page, listed in its contents."""
+    """A part of the page with a title, listed in the table of contents."""
 
     title: str
     """Heading."""
     parts: Sequence[Part]
-    """What stands in it."""
+    """The parts of the section, in order."""
 
     def to_html(self) -> str:
         inner = "".join(part.to_html() for part in self.parts)
@@ -180,5 +180,5 @@ class Section:
 
 
 def anchor(title: str) -> str:
-    """The name by which the contents point to a section."""
+    """The HTML id of a section, for links from the table of contents."""
     return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())

@@ -1,4 +1,4 @@
-"""How pages look: one column, light or dark as the reader has it, from telephone to desk."""
+"""Style sheet of the pages: one column, light or dark theme, from phone to desktop."""
 
 INK, MUTED, LINE = "#1d2329", "#5c6670", "#d5dade"
 DARK_INK, DARK_MUTED, DARK_LINE = "#e4e8ec", "#9aa5b0", "#38414a"

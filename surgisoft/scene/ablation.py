@@ -9,7 +9,7 @@ heat conduction and no shielding by the plume, and the surface keeps its shape.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,16 +73,20 @@ class Tissue:
 
 
 REACH_WAISTS = 2.3
-"""The beam is followed out to so many 1/e^2 radii; 3e-5 of its power lies beyond."""
+"""The beam is cut off at this many 1/e^2 radii; 3e-5 of its power lies beyond."""
 COARSEST_WAISTS = 0.9
-"""Coarser patches than this share of the beam's 1/e^2 radius would lose energy and are refused."""
+"""Largest sample edge as a share of the beam's 1/e^2 radius; coarser patches would lose energy."""
 STEEPEST_COSINE = 0.1
-"""Faces steeper than this to the beam (84 degrees) may miss the outermost part of it."""
+"""Faces steeper to the beam than this cosine (84 degrees) may miss its outermost part."""
+
+
+Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""New linear colours (N, 3) for faces (N,), points (N, 3) mm and their colours (N, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class AblationState:
-    """What the laser has done so far, for B environments, P samples, N stations. Frame: patch's."""
+    """Dose and ablated areas so far: B environments, P samples, N stations; the patch's frame."""
 
     dose: torch.Tensor
     """(B, P) float32 J/mm^2: radiant exposure of the surface."""
@@ -107,19 +111,19 @@ class AblationState:
 
 
 _SUMS = ("dose", "peak", "band_mm2", "zone_mm2", "zone_j", "delivered_j")
-"""The parts of the state that begin at zero."""
+"""The fields of the state that start at zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class RingReport:
-    """How far the ring is done; (B,) tensors."""
+    """Progress of the cut; (B,) tensors."""
 
     completion: torch.Tensor
-    """0..1: share of the ring that is ablated to the asked depth."""
+    """0..1: share of the ring that is ablated to the required depth."""
     largest_gap_mm: torch.Tensor
-    """Length of the longest stretch that is not (mm)."""
+    """Length of the longest stretch that is not cut (mm)."""
     largest_gap_deg: torch.Tensor
-    """The same as an angle: 360 degrees are the whole ring."""
+    """Length of the longest uncut stretch as an angle: 360 degrees are the whole ring."""
     width_mm: torch.Tensor
     """Mean width of the cut where the ring is cut (mm), within the band; 0 for no cut."""
     healthy_mm2: torch.Tensor
@@ -133,7 +137,7 @@ class RingReport:
 
 
 class AblationMap:
-    """The laser on one patch with one ring or several to choose from; built once, asked often."""
+    """Accumulates the laser's dose on a patch that has one ring or several to choose from."""
 
     def __init__(
         self,
@@ -173,10 +177,16 @@ class AblationMap:
         lengths = [one.ring_length_mm for one in self.patches]
         self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
 
-    def start(self, point_mm, direction, on, ring=None) -> AblationState:
+    def start(
+        self,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        ring: torch.Tensor | None = None,
+    ) -> AblationState:
         """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool.
 
-        ring (B,) int64 says which ring is to be cut; None: the first.
+        ring (B,) int64 is the number of the ring to cut; None: the first.
         """
         count, patch = len(point_mm), self.patch
         sizes = (
@@ -193,11 +203,18 @@ class AblationMap:
         return AblationState(**sums, **self._last(*self._beam(point_mm, direction, on)), ring=ring)
 
     def reset(
-        self, state: AblationState, mask, point_mm, direction, on, in_place=False, ring=None
+        self,
+        state: AblationState,
+        mask: torch.Tensor,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        in_place: bool = False,
+        ring: torch.Tensor | None = None,
     ) -> AblationState:
         """Fresh tissue where mask (B,) is set; the beam and the ring as for `start`.
 
-        With in_place the old state's tensors are given up.
+        With in_place the old state's tensors are overwritten.
         """
         new = self._beam(point_mm, direction, on)
         old = (state.last_point_mm, state.last_direction, state.last_on)
@@ -216,13 +233,20 @@ class AblationMap:
         return AblationState(**sums, **self._last(*beam), ring=torch.where(mask, ring, state.ring))
 
     def advance(
-        self, state: AblationState, point_mm, direction, on, power_w, dt_s: float, in_place=False
+        self,
+        state: AblationState,
+        point_mm: torch.Tensor,
+        direction: torch.Tensor,
+        on: torch.Tensor,
+        power_w: torch.Tensor | float,
+        dt_s: float,
+        in_place: bool = False,
     ) -> AblationState:
         """The state dt_s later, the beam having swept from its last place to this one.
 
         point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
-        (B,), held over the step. Where the beam was on the organ at one end of the step only, half
-        of the step's energy goes there. With in_place the old state's tensors are given up.
+        (B,), constant over the step. If the beam was on the organ at one end of the step only, it
+        receives half of the step's energy. With in_place the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
         power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)
@@ -268,7 +292,7 @@ class AblationMap:
         return dose, peak, band, area, joule
 
     def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
-        """The same on an accelerator: every sample of every environment, a few at a time."""
+        """`_deposit` in torch, for accelerators: every sample, a few environments at a time."""
         points, normals, areas = (t.float() for t in self._samples)
         size = max(1, 8_000_000 // len(points))
         for i in range(0, len(dose), size):
@@ -288,7 +312,7 @@ class AblationMap:
         return dose, peak, band, area, joule
 
     def report(self, state: AblationState) -> RingReport:
-        """How far the ring of each environment is done."""
+        """Progress of the cut in each environment."""
         cut = state.peak >= self.cut_dose
         length = self._ring_mm[state.ring] / self.patch.stations
         gap = longest_run(~cut)
@@ -306,7 +330,7 @@ class AblationMap:
             delivered_j=state.delivered_j,
         )
 
-    def paint(self, state: AblationState, environment: int = 0):
+    def paint(self, state: AblationState, environment: int = 0) -> Paint:
         """For `render`: colours one environment's patch by dose, from blanched to charred."""
         dose = state.dose[environment].detach().cpu().numpy()
         share = np.clip(dose / self.threshold, 0.0, None)
@@ -322,7 +346,14 @@ class AblationMap:
         return recolour
 
 
-def sweep_fluence(began, ended, direction, energy, waist_mm: float, points_mm):
+def sweep_fluence(
+    began: torch.Tensor,
+    ended: torch.Tensor,
+    direction: torch.Tensor,
+    energy: torch.Tensor,
+    waist_mm: float,
+    points_mm: torch.Tensor,
+) -> torch.Tensor:
     """Fluence (B, P) J/mm^2 across the beam at points (P, 3) mm, for a straight sweep.
 
     A Gaussian beam, 2 E / (pi w^2) exp(-2 r^2 / w^2) (Siegman 1986, section 17.1), whose axis moves

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,25 +44,25 @@ from surgisoft.scene.spec import (
 )
 
 FAR_OFF = 20.0
-"""A mesh whose middle lies this many times its size from the origin is moved there."""
+"""A mesh whose middle is farther from the origin than this many times its size is moved there."""
 REPORTED_FROM_MM = 1.0
-"""A lesion that is moved farther than this onto the surface is told so (mm)."""
+"""If a given lesion is moved farther than this onto the surface, the distance is printed (mm)."""
 COARSE_RING = 36
-"""Ring points while mounts are searched."""
-CROSSING = "surfaces cross, the outermost counts; faces buried inside"
-"""How a body is told of whose surface crosses itself."""
+"""Number of ring points during the search for mounts."""
+CROSSING = "the surface intersects itself, only its outermost part counts; faces inside the solid"
+"""Note on a body whose surface intersects itself; the number of faces follows."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked for."""
+    """The request for a new scene, as the user gave it."""
 
     meshes: tuple[Path, ...]
     """Mesh files; the first holds the organ."""
     roles: tuple[str, ...]
     """Role of each file's bodies: organ, keep-out or support."""
     unit: str | None = None
-    """Unit of every file; None: recognised."""
+    """Unit of every file; None: inferred from the size."""
     lesion: tuple[float, float, float] | None = None
     """Point near which the lesion goes, in the first file's own frame and unit."""
     lesion_direction: tuple[float, float, float] | None = None
@@ -78,7 +79,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Closed bodies in mm, and what was done to the files."""
+    """Closed bodies in mm, and the repairs of the files."""
 
     names: tuple[str, ...]
     """Names of the bodies; the first file's come first, largest first."""
@@ -89,11 +90,11 @@ class Prepared:
     holes_mm: tuple[np.ndarray, ...]
     """For each mesh (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
     mm_per_unit: float
-    """Of the first file."""
+    """Millimetres in one unit of the first file."""
     shift_mm: np.ndarray
     """(3,) by which everything was moved (mm)."""
     notes: tuple[str, ...]
-    """What was recognised and repaired, one line each."""
+    """Inferred units and repairs, one line each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +104,9 @@ class Authored:
     scene: Scene
     """The scene; its folder is not yet there."""
     check: SceneCheck
-    """The checker's verdict on it."""
+    """Result of checking it with FCL."""
     notes: tuple[str, ...]
-    """What was recognised, repaired and chosen, one line each."""
+    """Inferred units, repairs and choices, one line each."""
 
 
 _NamedBody = tuple[str, Mesh, np.ndarray]
@@ -113,16 +114,16 @@ _NamedBody = tuple[str, Mesh, np.ndarray]
 
 
 class NoMounts(InputError):
-    """No pair of mounts exists for the lesion; the message says how close it came."""
+    """No pair of mounts was found for the lesion; the message gives the best one and its flaw."""
 
     def __init__(self, message: str, notes: tuple[str, ...] = ()):
-        """`notes` are what was recognised and repaired, which may be why."""
+        """`notes` are the inferred units and repairs, which may be the reason."""
         super().__init__(message)
         self.notes = notes
 
 
 def prepare(request: Request, report: Progress = silent) -> Prepared:
-    """Read and repair every file; an InputError says why one cannot be used."""
+    """Read and repair every file; an InputError gives the reason why one cannot be used."""
     for role in request.roles:
         if role not in ROLES:
             raise unknown_name("role", role, ROLES)
@@ -136,8 +137,8 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     names: list[str] = []
     roles, meshes, holes_mm, scales = [], [], [], []
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
-        tell = partial(_tell, report, i, len(request.meshes), path.name)
-        tell("reading")
+        on_step = partial(_report_step, report, i, len(request.meshes), path.name)
+        on_step("reading")
         parts = read_parts(path)
         corners = np.concatenate([part.vertices[used_indices(part.faces)[0]] for part in parts])
         size = float(np.ptp(corners, axis=0).max())
@@ -145,14 +146,14 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
             raise InputError(f"{path}: all vertices are one point; expected a surface")
         if request.unit is None:
             guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
-            unit, told = guess.unit, guess.sentence
+            unit, unit_note = guess.unit, guess.sentence
         else:
-            unit, told = request.unit, given_unit(size, request.unit)
+            unit, unit_note = request.unit, given_unit(size, request.unit)
         scales.append(MM_PER_UNIT[unit])
         if role == "organ":
-            check_organ_size(path, size * scales[-1], told)
-        notes.append(f"{path.name}: unit {told}")
-        found = _closed_bodies(path, parts, scales[-1], notes, tell)
+            check_organ_size(path, size * scales[-1], unit_note)
+        notes.append(f"{path.name}: unit {unit_note}")
+        found = _closed_bodies(path, parts, scales[-1], notes, on_step)
         found = sorted(found, key=lambda body: -_area(body[1]))
         for i, (name, mesh, hole_mm) in enumerate(found):
             names.append(_free_name(name, names))
@@ -180,12 +181,12 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
     )
 
 
-def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
-    """Every part repaired; where one is beyond repair, all parts taken as one surface.
+def _closed_bodies(path, parts, scale, notes, on_step) -> list[_NamedBody]:
+    """Repair every part; if one cannot be repaired, take all parts as one surface.
 
-    If that is beyond repair too, the broken parts are left out, unless nothing is left.
+    If that cannot be repaired either, the broken parts are left out; an error if nothing is left.
     """
-    found, failures, done = _repaired(path, parts, scale, tell)
+    found, failures, done = _repaired(path, parts, scale, on_step)
     if failures and len(parts) > 1:
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         whole = Part(
@@ -193,7 +194,7 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
             np.concatenate([part.vertices for part in parts]),
             np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
         )
-        together, broken, done_together = _repaired(path, [whole], scale, tell)
+        together, broken, done_together = _repaired(path, [whole], scale, on_step)
         if not broken:
             notes.append(f"{path.name}: its {len(parts)} parts make up one surface")
             found, failures, done = together, [], done_together
@@ -207,25 +208,25 @@ def _closed_bodies(path, parts, scale, notes, tell) -> list[_NamedBody]:
     return found
 
 
-def _tell(report: Progress, number: int, count: int, name: str, what: str) -> None:
-    """What is done to file `number` of `count`; reading takes the first 5 % of the way."""
+def _report_step(report: Progress, number: int, count: int, name: str, what: str) -> None:
+    """Report the step for file `number` of `count`; reading is the first 5 % of the work."""
     report(5.0 * number / count, 100, f"{name}: {what}")
 
 
-def _repaired(path, parts, scale, tell) -> tuple[list[_NamedBody], list[InputError], dict]:
-    """Named closed bodies of the parts, what was beyond repair, and the repairs' counts."""
+def _repaired(path, parts, scale, on_step) -> tuple[list[_NamedBody], list[InputError], dict]:
+    """Named closed bodies of the parts, errors of parts beyond repair, counts of repairs."""
     found, failures = [], []
     done: dict[str, int] = {}
     for part in parts:
         what = str(path) if len(parts) == 1 else f"{path} ({part.name})"
         try:
-            repaired = repair(part.vertices * scale, part.faces, what, tell)
+            repaired = repair(part.vertices * scale, part.faces, what, on_step)
         except InputError as error:
             failures.append(error)
             continue
         for fix in repaired.repairs:
             done[fix.done] = done.get(fix.done, 0) + fix.count
-        tell("looking for buried faces")
+        on_step("looking for faces inside the solid")
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
         name = path.stem if len(parts) == 1 else Path(part.name).stem
@@ -241,7 +242,7 @@ def _area(mesh: Mesh) -> float:
 
 
 def _free_name(name: str, taken: Sequence[str]) -> str:
-    """A legal body name that is not taken."""
+    """A valid body name that is not in use."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
     plain = plain.strip("_")[:50] or "body"
     numbers = iter(range(2, len(taken) + 3))
@@ -252,7 +253,7 @@ def _free_name(name: str, taken: Sequence[str]) -> str:
 
 
 def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
-    """Places for the lesion: the one pointed at, else several good ones."""
+    """Places for the lesion: the one that the request gives, otherwise several good ones."""
     surfaces = [
         OrganSurface(mesh, hole_mm)
         for mesh, hole_mm in zip(prepared.meshes, prepared.holes_mm, strict=True)
@@ -262,10 +263,10 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     ]
     if request.lesion is not None:
         point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
-        said = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
+        given = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
         if prepared.mm_per_unit != 1.0 or prepared.shift_mm.any():
-            said += f" (in the scene {', '.join(f'{x:.4g}' for x in point)} mm)"
-        return [pointed_site(operable, point, request.diameter_mm, said)]
+            given += f" (in the scene {', '.join(f'{x:.4g}' for x in point)} mm)"
+        return [pointed_site(operable, point, request.diameter_mm, given)]
     if request.lesion_direction is not None:
         return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
     return good_sites(surfaces, request.diameter_mm)
@@ -278,15 +279,15 @@ def author(
     name: str,
     report: Progress = silent,
 ) -> Authored:
-    """The whole way from mesh files to a checked scene; nothing is written.
+    """Make and check a scene from mesh files; nothing is written.
 
-    `mounts` gives each tool's arm (name, length, diameter, shaft); its place is found here.
+    `mounts` gives each tool's arm (name, length, diameter, shaft); this function finds its place.
     """
     prepared = prepare(request, report)
     report(5, 100, "meshes read")
     sites = choose_sites(request, prepared)
     report(10, 100, "lesion placed")
-    lacks: list[tuple[float, str]] = []
+    failures: list[tuple[float, str]] = []
     for number, site in enumerate(sites):
         bodies = _bodies(prepared, site)
         engine = BatchedScene(
@@ -295,7 +296,7 @@ def author(
             most_nodes=PLANNING_NODES,
         )
         span = (10 + 80 * number / len(sites), 80 / len(sites))
-        pairs, lack = find_mounts(
+        pairs, shortfall = find_mounts(
             engine,
             reaches,
             _coarse(site.ring),
@@ -312,10 +313,10 @@ def author(
             check = check_scene(scene, reaches)
             if check.good:
                 return Authored(scene, check, (*prepared.notes, *_chosen(scene, check, site)))
-            lacks.append((check.work.covered if check.work else 0.0, sentence(check)))
-        if lack is not None:
-            lacks.append((lack.covered, lack.sentence))
-    best = max(lacks, key=lambda lack: lack[0])[1]
+            failures.append((check.work.covered if check.work else 0.0, sentence(check)))
+        if shortfall is not None:
+            failures.append((shortfall.covered, shortfall.sentence))
+    best = max(failures, key=lambda failure: failure[0])[1]
     where = "the lesion" if len(sites) == 1 else f"any of {len(sites)} places for the lesion"
     raise NoMounts(f"no mounts were found for {where}: {best}", prepared.notes)
 
@@ -367,11 +368,11 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
     return Scene(spec, Path(), bodies)
 
 
-def rounded_mount(position_mm, rotation) -> dict:
-    """A mount's place as the file writes it: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
+def rounded_mount(position_mm: np.ndarray, rotation: np.ndarray) -> dict[str, Any]:
+    """A mount's place, rounded for the file: 0.01 mm, 6 digits of direction, 0.01 degrees of roll.
 
-    position_mm (3,) and rotation (3, 3) of the base frame in the world frame; answers
-    `position_mm`, `direction` and `roll_deg` for `MountSpec`.
+    position_mm (3,) and rotation (3, 3) of the base frame in the world frame. Returns
+    `position_mm`, `direction` and `roll_deg` of a `MountSpec`.
     """
     direction = rotation[:, 2].round(6) + 0.0
     plain = frames.rotation_from_z(direction)
@@ -387,7 +388,7 @@ def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
     assert check.work is not None, "a scene that was chosen has its arms at work"
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
-    moved = f"the point given lies {site.moved_mm:.3g} mm off the surface: moved onto it"
+    moved = f"the given point was {site.moved_mm:.3g} mm off the surface and was moved onto it"
     return [
         *([moved] if site.moved_mm > REPORTED_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
@@ -398,7 +399,7 @@ def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
 
 
 def check_target(folder: Path, force: bool) -> None:
-    """Whether a scene may be written there; --force replaces a scene, nothing else."""
+    """Raise an InputError if a scene cannot be written there; --force replaces scenes only."""
     above = next(place for place in folder.absolute().parents if place.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
@@ -413,7 +414,7 @@ def check_target(folder: Path, force: bool) -> None:
 
 
 def write_scene(scene: Scene, folder: Path, force: bool = False) -> None:
-    """Write meshes and scene.toml: first into a folder beside, then moved there as a whole."""
+    """Write meshes and scene.toml, whole or not at all: a temporary folder is moved there."""
     check_target(folder, force)
     with new_folder(folder) as fresh:
         for body, entry in zip(scene.bodies, scene.spec.bodies, strict=True):

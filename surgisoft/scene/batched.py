@@ -17,10 +17,10 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
-from surgisoft.scene.bvh import build_tree
+from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
 from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
-from surgisoft.scene.field import MOST_NODES, load_field
+from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
 from surgisoft.scene.torch_queries import (
@@ -33,20 +33,20 @@ from surgisoft.scene.torch_queries import (
 ENGINES = ("compiled", "torch")
 """The batched engines: Embree and compiled queries, or torch alone."""
 LONGEST_SEGMENT_MM = 6.0
-"""Longer segments of a centreline are parted before they are held against the bodies (mm)."""
+"""Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
 MOST_PARTS = 256
 """No segment is cut into more parts than this."""
 EXACT_WITHIN_MM = 5.0
-"""Nearer than this, clearances are exact; farther, off by the field's interpolation (mm)."""
+"""Clearances below this are exact; larger ones have the field's interpolation error (mm)."""
 
 
 class BatchedScene:
-    """The bodies of a scene and the arms' radii; built once, asked every step.
+    """Clearances and ray hits for a batch of arms in one scene; built once, queried every step.
 
-    `arms` maps an arm's name to its centrelines (B, K, 3), mm, world frame; any dtype and K. A body
-    moves with `poses`, a mapping from its name to (B, 4, 4) body to world; the others stand where
-    the scene puts them. An environment whose arm is not finite gets nan clearances and misses; the
-    others do not notice.
+    `arms` maps an arm's name to its centrelines (B, K, 3), mm, world frame; any dtype and K.
+    `poses` maps a body's name to (B, 4, 4) body to world; a body without an entry stands where the
+    scene puts it. An environment whose arm is not finite gets nan clearances and missed rays; the
+    other environments are not affected.
     """
 
     def __init__(
@@ -89,8 +89,10 @@ class BatchedScene:
             raise unknown_name("arm", arm, self.radii_mm)
         return self.radii_mm[arm]
 
-    def clearance(self, arms, poses=None) -> BatchClearance:
-        """Signed clearances of every pair; arms name -> (B, K, 3) mm."""
+    def clearance(
+        self, arms: Mapping[str, torch.Tensor], poses: Mapping[str, torch.Tensor] | None = None
+    ) -> BatchClearance:
+        """Signed clearances of every pair; arms name -> (B, K, 3) mm, poses name -> (B, 4, 4)."""
         names = list(arms)
         lines = [_held(arms[name]) for name in names]
         radii = [self.radius_mm(name) for name in names]
@@ -114,7 +116,13 @@ class BatchedScene:
         )
 
     def cast(
-        self, origins_mm, directions, range_mm: float, arms=None, own: str | None = None, poses=None
+        self,
+        origins_mm: torch.Tensor,
+        directions: torch.Tensor,
+        range_mm: float,
+        arms: Mapping[str, torch.Tensor] | None = None,
+        own: str | None = None,
+        poses: Mapping[str, torch.Tensor] | None = None,
     ) -> RayHit:
         """First hits of rays (B, ..., 3), world frame; arms name -> (B, K, 3) stand in the way.
 
@@ -207,15 +215,24 @@ class BatchedScene:
 
 
 class CompiledSurface:
-    """One body's surface on the CPU: compiled clearance, Embree's rays."""
+    """One body's surface on the CPU: compiled clearance queries, rays by Embree."""
 
-    def __init__(self, tree, field, device):
+    def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree, self._field = tree, field
         self._closed = tree.mesh.is_watertight
         self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
-    def clearance(self, lines, given, turn, shift, radius, within, horizon) -> torch.Tensor:
+    def clearance(
+        self,
+        lines: torch.Tensor,
+        given: torch.Tensor,
+        turn: torch.Tensor,
+        shift: torch.Tensor,
+        radius: float,
+        within: float,
+        horizon: float,
+    ) -> torch.Tensor:
         """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
 
         given (K,) bool: the centreline's own points, where depth inside the body counts.
@@ -241,16 +258,18 @@ class CompiledSurface:
         )
         return out
 
-    def first_hit(self, origins, directions, range_mm) -> tuple[torch.Tensor, torch.Tensor]:
+    def first_hit(
+        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
         distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
         return torch.from_numpy(distance), torch.from_numpy(face)
 
 
 def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Arms (B, K, 3) mm with long segments parted, and which points were there before (K',) bool.
+    """Arms (B, K, 3) mm with long segments divided, and which points were given (K',) bool.
 
-    Short segments are what the field bounds well; the parts lie on the segments they came from.
+    The field gives tight bounds on short segments only. The new points lie on the old segments.
     """
     steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
     longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
@@ -267,7 +286,7 @@ def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _held(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensor without gradient, in one piece of memory, single or double precision."""
+    """The tensor without gradient, contiguous, in single or double precision."""
     tensor = tensor.detach()
     if tensor.dtype not in (torch.float32, torch.float64):
         tensor = tensor.float()

@@ -23,7 +23,7 @@ from surgisoft.scene.mesh import Mesh
 
 @compiled
 def clamp01(value):
-    """The value held within 0..1."""
+    """The value clamped to 0..1."""
     return min(max(value, 0.0), 1.0)
 
 
@@ -162,7 +162,7 @@ LEAF_FACES = 4
 """At most this many triangles in a leaf."""
 
 STACK = 64
-"""Boxes that a walk down a tree keeps for later; twice the depth of a tree of 2^31 leaves."""
+"""Size of the stack of boxes in a traversal; twice the depth of a tree of 2^31 leaves."""
 
 
 @compiled
@@ -251,7 +251,7 @@ def triangle(triangles, k):
 def segment_surface_d2(p, q, bound2, triangles, starts, lower, upper, nodes, reach):
     """Squared distance from segment p q to the surface if below bound2, bound2 otherwise.
 
-    `nodes` (STACK,) int64 and `reach` (STACK,) float64 are room to work in.
+    `nodes` (STACK,) int64 and `reach` (STACK,) float64 are working memory.
     """
     low = (min(p[0], q[0]), min(p[1], q[1]), min(p[2], q[2]))
     high = (max(p[0], q[0]), max(p[1], q[1]), max(p[2], q[2]))
@@ -345,7 +345,9 @@ class TriangleTree:
         """What the compiled queries walk: triangles, starts, lower, upper."""
         return self.triangles_mm, self.starts, self.lower, self.upper
 
-    def nearest(self, points_mm, bound_mm: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(
+        self, points_mm: np.ndarray, bound_mm: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Unsigned distance (N,) mm and face (N,) of points (N, 3) mm; bound_mm and -1 beyond."""
         points = np.ascontiguousarray(points_mm, dtype=np.float64)
         distance, place = np.empty(len(points)), np.empty(len(points), np.int64)

@@ -1,12 +1,13 @@
-"""What the endoscope sees of the lesion: in the field of view, in focus, hidden by nothing.
+"""Which points the endoscope sees: inside the field of view, in focus, and not hidden.
 
 A camera looks along its pose's z axis, x to the right and y down in the picture (`frames.look_at`
-makes such poses). The same code serves the checker (numpy) and the batched engine (torch).
+makes such poses). The same code works with FCL (numpy) and with the batched engine (torch).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 
 LIFT_MM = 0.05
-"""Points are looked at this far above their surface, so that it does not hide them (mm)."""
+"""Lines of sight end this far above the surface, so that it does not hide its own points (mm)."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Camera:
     fov_rad: float = math.radians(70.0)
     """Full cone angle of the field of view (rad)."""
     range_mm: tuple[float, float] = (10.0, 100.0)
-    """Least and greatest distance at which the picture is sharp (mm)."""
+    """Smallest and largest distance at which the picture is sharp (mm)."""
 
     def __post_init__(self):
         if not 0.0 < self.fov_rad < math.pi:
@@ -38,7 +39,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera sees of M points; numpy or torch arrays of one leading shape (...)."""
+    """Visibility of M points from a camera; numpy or torch arrays of one leading shape (...)."""
 
     visible: Any
     """(..., M) bool: inside the cone, in range, and nothing in between."""
@@ -54,8 +55,17 @@ class View:
     """(...) mm from the camera to the points' middle."""
 
 
-def view(caster, camera: Camera, pose, points_mm, normals, arms=None, own=None, **where) -> View:
-    """What a camera at pose (..., 4, 4) sees of points (M, 3) or (..., M, 3) mm, world frame.
+def view(
+    caster: Any,
+    camera: Camera,
+    pose: Any,
+    points_mm: Any,
+    normals: Any,
+    arms: Mapping[str, Any] | None = None,
+    own: str | None = None,
+    **where: Any,
+) -> View:
+    """Which points (M, 3) or (..., M, 3) mm a camera at pose (..., 4, 4) sees; world frame.
 
     `caster` casts the lines of sight: a `collision.CollisionChecker` (numpy) or a
     `batched.BatchedScene` (torch, poses (B, 4, 4)). `normals` has the shape of the points. `arms`
@@ -87,7 +97,7 @@ def view(caster, camera: Camera, pose, points_mm, normals, arms=None, own=None, 
 
 
 def _like(pose, array):
-    """The array in the pose's kind, precision and place."""
+    """The array as the same type as the pose, with its precision and device."""
     if isinstance(pose, torch.Tensor):
         return torch.as_tensor(np.array(array) if isinstance(array, np.ndarray) else array).to(pose)
     return np.asarray(array, dtype=np.float64)

@@ -1,6 +1,6 @@
-"""Arms as geometry sees them: a centreline with a radius, a chain of capsules.
+"""The geometric model of an arm: a centreline with a radius, which is a chain of capsules.
 
-Closed forms for capsules against rays and against each other; numpy and torch alike, batched.
+Closed forms for capsules against rays and against each other, batched, for numpy and torch.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.scene.frames import dot, norm, normalise
+from surgisoft.scene.frames import Array, dot, norm, normalise
 
 HORIZON_MM = 60.0
-"""Clearances saturate here in both engines: farther is reported as this far (mm)."""
+"""Clearances saturate at this value in both engines (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmShape:
-    """One arm at one moment: a chain of K - 1 capsules with round ends."""
+    """The shape of one arm at one moment: a chain of K - 1 capsules with round ends."""
 
     centreline_mm: np.ndarray
     """(K, 3) float64, mm, world frame, base to tip."""
@@ -43,7 +43,7 @@ class ArmShape:
 
 @dataclass(frozen=True, eq=False)
 class BatchClearance:
-    """Signed clearances (mm) of a batch, as `collision.Clearance` defines them, saturating."""
+    """Signed clearances (mm) of B environments, as `collision.Clearance` defines them."""
 
     bodies_mm: torch.Tensor
     """(B, A, N) arm by body, in the order of the scene's arms and bodies."""
@@ -65,7 +65,7 @@ class BatchClearance:
 
 
 def self_contact_gap_mm(radius_mm: float) -> float:
-    """Arc length (mm) from which two stretches of one arm can be told to touch.
+    """Arc length (mm) between two parts of one arm beyond which an overlap counts as contact.
 
     A body of radius r cannot bend tighter than a circle of radius r without folding its own inner
     side, and an arc of length s on such a curve has a chord of at least 2 r sin(s / 2 r) (Schur
@@ -74,32 +74,32 @@ def self_contact_gap_mm(radius_mm: float) -> float:
     return math.pi * radius_mm
 
 
-def arc_lengths(centreline_mm):
+def arc_lengths(centreline_mm: Array) -> Array:
     """(..., K) mm along the polyline (..., K, 3), zero at the base."""
     steps = norm(centreline_mm[..., 1:, :] - centreline_mm[..., :-1, :])
     lib = torch if isinstance(steps, torch.Tensor) else np
     return lib.concatenate((lib.zeros_like(steps[..., :1]), lib.cumsum(steps, -1)), -1)
 
 
-def folding_pairs(centreline_mm, radius_mm: float):
+def folding_pairs(centreline_mm: Array, radius_mm: float) -> Array:
     """(..., K-1, K-1) bool: segment pairs i < j far enough apart along the arm to touch."""
     arc = arc_lengths(centreline_mm)
     gap = arc[..., None, :-1] - arc[..., 1:, None]
     return gap >= self_contact_gap_mm(radius_mm)
 
 
-def ray_free_segments(centreline_mm, radius_mm: float):
-    """(..., K-1) bool: segments far enough from the tip to stand in the way of its own beam."""
+def ray_free_segments(centreline_mm: Array, radius_mm: float) -> Array:
+    """(..., K-1) bool: segments far enough from the tip to block the beam that leaves it."""
     arc = arc_lengths(centreline_mm)
     return arc[..., -1:] - arc[..., 1:] >= self_contact_gap_mm(radius_mm)
 
 
-def segment_distance(p1, q1, p2, q2):
+def segment_distance(p1: Array, q1: Array, p2: Array, q2: Array) -> Array:
     """Distance (...) between segments p1 q1 and p2 q2, each (..., 3) mm, broadcast.
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; segments of length zero allowed.
-    The first s is that of the two lines (0 if parallel); one turn of exact line searches after it
-    lands on the box constraints.
+    The first s is that of the two infinite lines (0 if parallel). One exact line search in each of
+    t, s, t then meets the bounds of both segments.
     """
     lib = torch if isinstance(p1, torch.Tensor) else np
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
@@ -115,7 +115,7 @@ def segment_distance(p1, q1, p2, q2):
     return norm(r + s[..., None] * d1 - t[..., None] * d2)
 
 
-def ray_capsule(origin, direction, a, b, radius_mm: float):
+def ray_capsule(origin: Array, direction: Array, a: Array, b: Array, radius_mm: float) -> Array:
     """Distance (...) mm along a unit ray to the capsule a b of radius_mm; inf for a miss.
 
     Origin, direction, a, b: (..., 3) mm, broadcast. Zero when the origin lies inside. The entry
@@ -154,11 +154,17 @@ def ray_capsule(origin, direction, a, b, radius_mm: float):
     return lib.where(inside, 0.0, best)
 
 
-def ray_chain(origin, direction, centreline_mm, radius_mm: float, free=None):
+def ray_chain(
+    origin: Array,
+    direction: Array,
+    centreline_mm: Array,
+    radius_mm: float,
+    free: Array | None = None,
+) -> tuple[Array, Array]:
     """First hit of unit rays (..., 3) on an arm's centreline (..., K, 3): distance, segment.
 
-    Returns (...) mm, inf for a miss, and (...) the segment's index. `free` (..., K-1) bool leaves
-    segments out where it is False (the ones around the beam's own tip).
+    Returns (...) mm, inf for a miss, and (...) the segment's index. Segments where `free`
+    (..., K-1) bool is False are ignored (those near the tip that the beam leaves).
     """
     lib = torch if isinstance(origin, torch.Tensor) else np
     a, b = centreline_mm[..., :-1, :], centreline_mm[..., 1:, :]
@@ -169,7 +175,7 @@ def ray_chain(origin, direction, centreline_mm, radius_mm: float, free=None):
     return lib.amin(t, -1), segment
 
 
-def chain_normal(point_mm, centreline_mm, segment):
+def chain_normal(point_mm: Array, centreline_mm: Array, segment: Array) -> Array:
     """Outward unit normals (..., 3) of a chain at surface points (..., 3) on given segments (...).
 
     The direction from the segment's nearest point; centreline (..., K, 3) mm, segment int.

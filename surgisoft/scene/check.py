@@ -1,4 +1,4 @@
-"""Judge a whole scene with the checker: meshes, lesion, both arms at rest and at work, the view."""
+"""Check a whole scene with FCL: meshes, lesion, both arms at rest and at work, the view."""
 
 from dataclasses import dataclass, replace
 
@@ -32,28 +32,28 @@ from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.spec import TOOLS
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
-"""What a ring point's code means, in the order in which they are looked for."""
+"""Meaning of a ring point's code; a point gets the first that applies after the first entry."""
 PATCH_SHARES = np.linspace(0.1, 1.6, 16)
-"""Circles of the reachability map, in diameters of the lesion."""
+"""Diameters of the reachability map's circles, as shares of the lesion's diameter."""
 
 VIEW_EVERY = 3
-"""The view is looked at with the beam on every third ring point: 15 degrees of the ring."""
+"""The view is checked with the beam on every third ring point: every 15 degrees."""
 PLANNING_NODES = 150_000
-"""Nodes of the distance fields for planning: coarse, since near the surface distances are exact."""
+"""Nodes of the distance fields for planning: few, because distances near surfaces are exact."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the verdict's table."""
+    """One line of the result table."""
 
     what: str
-    """What was looked at."""
+    """What was checked."""
     value: str
     """What was found."""
     wanted: str
-    """What a scene needs."""
+    """The requirement."""
     good: bool
-    """Whether it holds."""
+    """Whether the requirement is met."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,11 @@ class Work:
     reason: np.ndarray
     """(M,) int: index into REASONS of each ring point."""
     cut: RingSolution
-    """The laser arm's solutions around the ring."""
+    """Inverse kinematics of the laser arm around the ring."""
     look: EndoscopePose
     """The endoscope arm turned to the lesion."""
     clearance_mm: np.ndarray
-    """(M,) mm: least clearance of both arms with the beam on each ring point; -1 for contact."""
+    """(M,) mm: smallest clearance of both arms with the beam on each point; -1 for contact."""
     view: np.ndarray
     """(M / VIEW_EVERY,) fraction of the ring in view with the beam on every VIEW_EVERYth point."""
 
@@ -79,21 +79,21 @@ class Work:
 
 @dataclass(frozen=True, eq=False)
 class SceneCheck:
-    """The checker's verdict on a scene."""
+    """Result of checking a scene with FCL."""
 
     findings: tuple[Finding, ...]
-    """The table."""
+    """The result table."""
     work: Work | None
-    """The arms at work; None where the ring does not lie on the organ."""
+    """The arms at work; None if the ring does not lie on the organ."""
 
     @property
     def good(self) -> bool:
-        """Whether every finding holds."""
+        """Whether the scene meets every requirement."""
         return all(finding.good for finding in self.findings)
 
 
 def sentence(check: SceneCheck) -> str:
-    """The verdict in one sentence."""
+    """The result in one sentence."""
     if check.good and check.work is not None:
         return (
             f"The scene is ready: the laser reaches {100 * check.work.covered:.0f} % of the ring, "
@@ -114,7 +114,7 @@ def check_scene(
     reaches: dict[str, ArmReach],
     report: Progress = silent,
 ) -> SceneCheck:
-    """Everything a task relies on, decided by FCL on the meshes themselves.
+    """Check everything that a task relies on, by FCL on the meshes themselves.
 
     `reaches` holds the arms' reach tables by tool.
     """
@@ -123,7 +123,7 @@ def check_scene(
         return SceneCheck(findings, None)
     checker, arms = CollisionChecker(scene.bodies), mounted_arms(scene, reaches)
     work = _work(scene, checker, arms, report)
-    report(len(work.reason) + 1, len(work.reason) + 2, "ways")
+    report(len(work.reason) + 1, len(work.reason) + 2, "paths from rest")
     ways = _way_finding(scene, checker, arms, work)
     return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
 
@@ -131,7 +131,7 @@ def check_scene(
 def _work(
     scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], report: Progress
 ) -> Work:
-    """The laser once around the ring beside the endoscope that looks at it."""
+    """Move the laser once around the ring while the endoscope looks at it."""
     limits, ring = scene.spec.limits, scene.ring
     cut = solve_ring(arms["laser"], ring, scene.spec.laser)
     look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
@@ -146,8 +146,8 @@ def _work(
         hit = checker.cast(cut.lines_mm[i, -1], cut.directions[i], reach_mm, both, own="laser")
         landed[i] = bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[i]) <= LANDED_MM
         report(i + 1, len(shapes) + 2, "ring")
-    # the arm moves on to both neighbours: no point of it is farther than half a step from a shape
-    # looked at, and a step is short beside the arm's own thickness, so that it does not jump
+    # The arm moves to both neighbouring points. No point of it is then farther than half a step
+    # from a checked shape. A step must be short compared with the arm's thickness.
     step = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1))
     close = clearance < np.maximum(limits.clearance_mm, 0.5 * step)
     tests = (~cut.in_reach, cut.steep, ~landed, close, step > 0.5 * radius["laser"])
@@ -182,7 +182,7 @@ def _lesion_finding(scene: Scene) -> Finding:
         try:
             scene.ring_of()
         except InputError:
-            value, lies = f"its ring of {lesion.diameter_mm:g} mm hangs over an edge", False
+            value, lies = f"its ring of {lesion.diameter_mm:g} mm extends over an edge", False
             if lesion.path_mm:
                 away = path_off_mm(scene.organ.world_mesh, lesion)
                 value = f"its path_mm leaves the surface by {away:.3g} mm"
@@ -233,9 +233,9 @@ def _way_finding(
     touching, least, half_step = _ways(checker, arms, work.cut, work.look)
     clearance = scene.spec.limits.clearance_mm
     return Finding(
-        "contacts at rest and on the way",
-        ", ".join(touching) or f"none (least {least:.1f} mm)",
-        f"none, {clearance:g} mm clear",
+        "contacts at rest and on the path",
+        ", ".join(touching) or f"none (closest {least:.1f} mm)",
+        f"none, {clearance:g} mm clearance",
         not touching and least >= max(clearance, half_step),
     )
 
@@ -255,13 +255,13 @@ def _view(
 def _ways(
     checker: CollisionChecker, arms: dict[str, MountedArm], cut: RingSolution, look: EndoscopePose
 ):
-    """Contacts at rest and from rest to the lesion, the endoscope first; least clearance (mm).
+    """Contacts at rest and on the path to the lesion, endoscope first; smallest clearance (mm).
 
-    Also half the largest step (mm): between two of the shapes looked at, no point of an arm is
-    farther than that from one of them, so a greater clearance leaves nothing missed.
+    The third result is half the largest step (mm). Between two checked shapes no point of an arm is
+    farther than that from one of them, so with a larger clearance no contact is missed.
     """
-    scope_way = arms["endoscope"].lines(arms["endoscope"].way(look.commands))[0]
-    laser_way = arms["laser"].lines(arms["laser"].way(cut.centre))[0]
+    scope_way = arms["endoscope"].lines(arms["endoscope"].approach(look.commands))[0]
+    laser_way = arms["laser"].lines(arms["laser"].approach(cut.centre))[0]
     moments = [(laser_way[0], line) for line in scope_way]
     moments += [(line, scope_way[-1]) for line in laser_way]
     touching: dict[str, None] = {}
@@ -280,7 +280,7 @@ def _ways(
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The surface around the lesion as the laser arm meets it."""
+    """Reachability of the surface around the lesion for the laser arm."""
 
     flat_mm: np.ndarray
     """(N, 2) places in the plane of the lesion (mm), its centre at (0, 0)."""

@@ -1,8 +1,9 @@
-"""FCL, the checker: whole-body collision, clearance and the first hit of rays, one moment a call.
+"""The exact collision checker (FCL): whole-body collision, clearance and first hits of rays.
 
-The only file that speaks FCL. FCL works in millimetres throughout: its iterations stop at an
-absolute tolerance. It sees surfaces only, so being inside a closed body is tested apart, by the
-winding number. Poses of many environments at once are the business of `distance` and `rays`.
+No other module imports FCL. `CollisionChecker` takes one pose of the arms per call; `ExactScene`
+gives it the interface of `batched.BatchedScene`. FCL works in millimetres, because its iterations
+stop at an absolute tolerance. FCL knows surfaces only, so the winding number decides whether a
+point is inside a closed body.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import RayHit, Struck, struck_of
 
 PROBE_WIDTH_MM = 1e-3
-"""Width of the sliver that stands for a ray; without width FCL misses one hit in six (mm)."""
+"""Width of the triangle that represents a ray; without it FCL misses one hit in six (mm)."""
 MOST_CONTACTS = 100_000
-"""Upper limit of contacts asked of one FCL query; never reached by a ray or a capsule."""
+"""Upper limit of contacts that one FCL query returns; no ray or capsule reaches it."""
 ROUNDING_MM = 1e-6
-"""Distances below this are rounding: FCL gives some cut surfaces a few 1e-15 instead of 0."""
+"""Distances below this count as 0: FCL returns a few 1e-15 for some intersecting surfaces (mm)."""
 
 _HIT_COLUMNS = (
     (np.int8, ()),
@@ -46,7 +47,7 @@ _HIT_COLUMNS = (
     (np.float64, (3,)),
     (np.float64, ()),
 )
-"""Kind and shape of a `RayHit`'s fields for one ray, in order."""
+"""Data type and shape of a `RayHit`'s fields for one ray, in order."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,11 @@ class Collision:
 
 @dataclass(frozen=True)
 class Clearance:
-    """Signed distances between surfaces (mm); negative is overlap, saturating at the horizon.
+    """Signed distances between surfaces (mm), saturating at the horizon; negative means overlap.
 
-    Against a body: the least of the distance from the centreline to the surface and of the signed
-    distance of the centreline's points (negative inside a closed body), less the radius.
+    Against a body it is the smaller of two values minus the radius: the distance from the
+    centreline to the surface, and the signed distance of the centreline's points (negative inside
+    a closed body).
     """
 
     bodies_mm: Mapping[tuple[str, str], float]
@@ -78,9 +80,9 @@ class Clearance:
     arms_mm: Mapping[tuple[str, str], float]
     """(arm, other arm), each pair once: mm."""
     self_mm: Mapping[str, float]
-    """Arm against itself, between stretches far enough apart along it to touch: mm.
+    """Arm against itself, between parts that are far enough apart along it to touch: mm.
 
-    A straight arm reports the distance to its own next such stretch, (pi - 2) radii or more."""
+    A straight arm reports the distance to the nearest such part, (pi - 2) radii or more."""
 
     @property
     def least_mm(self) -> float:
@@ -89,12 +91,14 @@ class Clearance:
         return min(values, default=float("inf"))
 
 
-def collect_all(first, second, pairs) -> bool:
-    """FCL broad-phase callback: narrow-phase every candidate, keep the hits, never halt.
+def collect_all(
+    first: fcl.CollisionObject, second: fcl.CollisionObject, pairs: list[tuple[int, int]]
+) -> bool:
+    """FCL broad-phase callback that tests every candidate pair and collects those that collide.
 
-    FCL's own default callback stops once `num_max_contacts` is reached over all pairs together
-    and so drops pairs that collide. Pairs are ids of geometries: the objects FCL hands over here
-    are copies.
+    FCL's default callback stops once `num_max_contacts` is reached over all pairs together and so
+    misses pairs that collide. `pairs` receives ids of geometries, because the objects that FCL
+    passes to a callback are copies.
     """
     result = fcl.CollisionResult()
     if fcl.collide(first, second, fcl.CollisionRequest(), result):
@@ -117,7 +121,7 @@ def _placed(geometry, pose: np.ndarray) -> fcl.CollisionObject:
 
 
 class _Chain:
-    """One arm in FCL's terms: capsules for overlap, its bare centreline for distances."""
+    """One arm as FCL objects: capsules for overlap, its bare centreline for distances."""
 
     def __init__(self, name: str, shape: ArmShape):
         self.name, self.shape = name, shape
@@ -136,7 +140,7 @@ class _Chain:
         self.manager.setup()
 
     def line(self, start: int = 0, stop: int | None = None) -> fcl.CollisionObject:
-        """Segments start..stop as a tree of triangles without width, exact for distances."""
+        """Segments start..stop as FCL triangles without width, which give exact distances."""
         points = self.shape.centreline_mm
         index = np.arange(len(points) - 1)[start:stop]
         faces = np.stack((index, index + 1, index + 1), axis=1)
@@ -163,7 +167,7 @@ class _Chain:
         return geometry in self.segment_of
 
     def folds(self) -> list[int]:
-        """Segments that overlap a stretch of the same arm far enough away along it."""
+        """Segments that overlap another part of the arm, far enough away along it to touch."""
         least = self.fold_bounds()
         allowed = np.isfinite(least)
         if least.min() > 2.0 * self.shape.radius_mm:
@@ -188,9 +192,9 @@ def _distance(first: fcl.CollisionObject, second: fcl.CollisionObject) -> float:
 
 
 class CollisionChecker:
-    """Exact geometry of a scene, one pose of the arms a call. Build once for a set of bodies.
+    """Exact collision, clearance and ray queries of a scene (FCL), one pose of the arms per call.
 
-    `arms` is always a mapping from the arm's name to its `ArmShape`.
+    Build it once for a set of bodies. `arms` maps an arm's name to its `ArmShape`.
     """
 
     def __init__(self, bodies: Sequence[Body], horizon_mm: float = HORIZON_MM):
@@ -263,7 +267,7 @@ class CollisionChecker:
         return self._saturated(centre - chain.shape.radius_mm)
 
     def _points_within(self, points: np.ndarray, index: int, uncut: bool) -> np.ndarray:
-        """The centreline points inside a body; one tells for all if the surface cuts none off."""
+        """The centreline points inside a body; `uncut`: the line does not cross its surface."""
         if uncut:
             return points if self.inside(index, points[:1])[0] else points[:0]
         return points[self.inside(index, points)]
@@ -278,8 +282,8 @@ class CollisionChecker:
 
     def cast(
         self,
-        origins_mm,
-        directions,
+        origins_mm: np.ndarray,
+        directions: np.ndarray,
         range_mm: float,
         arms: Mapping[str, ArmShape] | None = None,
         own: str | None = None,
@@ -338,7 +342,7 @@ class CollisionChecker:
 
 
 def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
-    """The sliver that stands for a ray: one long triangle, a micrometre wide."""
+    """A ray as one long triangle, a micrometre wide."""
     across = np.zeros(3)
     across[np.argmin(np.abs(direction))] = 1.0
     side = frames.normalise(frames.cross(direction, across)) * PROBE_WIDTH_MM
@@ -347,7 +351,9 @@ def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
     return fcl.CollisionObject(surface_model(corners, np.array([[0, 1, 2]])))
 
 
-def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
+def ray_triangles(
+    origin: np.ndarray, direction: np.ndarray, triangles_mm: np.ndarray
+) -> np.ndarray:
     """(N,) distances along a ray to triangles (N, 3, 3), inf for a miss; from either side.
 
     Moeller & Trumbore 1997; a hit on an edge belongs to the triangle within rounding.
@@ -368,13 +374,19 @@ def ray_triangles(origin, direction, triangles_mm) -> np.ndarray:
 
 
 class ExactScene:
-    """What `batched.BatchedScene` answers, asked of FCL; bodies stand where the scene puts them.
+    """Clearances and ray hits by FCL with the interface of `batched.BatchedScene`.
 
-    Arms map a name to centrelines (B, K, 3) mm, world frame. An environment whose arm or ray is
-    not finite gets nan clearances and misses.
+    FCL evaluates one environment after the other. Bodies stand where the scene puts them. `arms`
+    maps a name to centrelines (B, K, 3) mm, world frame. An environment whose arm or ray is not
+    finite gets nan clearances and missed rays.
     """
 
-    def __init__(self, bodies: Sequence[Body], radii_mm: Mapping[str, float], device="cpu"):
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        radii_mm: Mapping[str, float],
+        device: str | torch.device = "cpu",
+    ):
         self.bodies, self.radii_mm = tuple(bodies), dict(radii_mm)
         self.device = torch.device(device)
         self.checker = CollisionChecker(self.bodies)
@@ -392,15 +404,25 @@ class ExactScene:
         found = np.full((len(first), len(names) * (len(self.bodies) + 1) + len(pairs)), np.nan)
         for row, shapes in zip(found, self._shapes(arms), strict=True):
             if shapes is not None:
-                said = self.checker.clearance(shapes)
-                bodies = [said.bodies_mm[name, body.name] for name in names for body in self.bodies]
-                row[:] = [*bodies, *(said.arms_mm[p] for p in pairs), *said.self_mm.values()]
+                exact = self.checker.clearance(shapes)
+                row[:] = [
+                    *(exact.bodies_mm[name, body.name] for name in names for body in self.bodies),
+                    *(exact.arms_mm[pair] for pair in pairs),
+                    *exact.self_mm.values(),
+                ]
         values = torch.as_tensor(found, dtype=first.dtype, device=self.device)
         sizes = (len(names) * len(self.bodies), len(pairs), len(names))
         bodies, apart, own = values.split(sizes, 1)
         return BatchClearance(bodies.unflatten(1, (len(names), len(self.bodies))), apart, own)
 
-    def cast(self, origins_mm, directions, range_mm: float, arms=None, own: str | None = None):
+    def cast(
+        self,
+        origins_mm: torch.Tensor,
+        directions: torch.Tensor,
+        range_mm: float,
+        arms: Mapping[str, torch.Tensor] | None = None,
+        own: str | None = None,
+    ) -> RayHit:
         """First hits of rays (B, ..., 3), world frame, as a `RayHit` of (B, ...) tensors."""
         origins, aims = _numpy(origins_mm), _numpy(directions)
         shapes = self._shapes(arms or {}) if arms else [{}] * len(origins)
@@ -437,7 +459,7 @@ def _numpy(tensor: torch.Tensor) -> np.ndarray:
 
 
 def _missed(origins: np.ndarray, aims: np.ndarray, range_mm: float) -> RayHit:
-    """Rays (..., 3) that meet nothing, finite even where they are not."""
+    """Missed rays (..., 3) with finite fields, also where origin or direction is not finite."""
     shape, none = origins.shape[:-1], np.full(origins.shape[:-1], -1, np.int32)
     zero = np.zeros(shape)
     end = np.nan_to_num(origins + range_mm * aims, nan=0.0, posinf=0.0, neginf=0.0)

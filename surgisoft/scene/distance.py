@@ -1,8 +1,8 @@
-"""Whole-body clearance for many environments at once, exact where it matters.
+"""Whole-body clearance for many environments at once, compiled for the CPU.
 
-Compiled for the CPU; on an accelerator `torch_bvh` gives the same answers. Two steps per arm and
-body: the distance field bounds the arm's clearance from below, and only an arm that may be nearer
-than `exact_within_mm` has its segments measured against the triangles themselves.
+`torch_queries` gives the same results on an accelerator. There are two steps for each arm and body:
+the distance field gives a lower bound of the arm's clearance; only if that is below
+`exact_within_mm` are the segments measured against the triangles.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ def _crossings(p, q, triangles, starts, lower, upper):
 
 @compiled
 def _is_inside(p, distance, values, origin, cell, tree):
-    """Whether p, at a known distance from a closed surface, is inside: the nearest node's side.
+    """Whether p, at a known distance from a closed surface, is inside.
 
-    The node is on the same side if it is nearer to p than the surface; otherwise the faces
-    between the two are counted.
+    The nearest node of the field is on the same side if it is nearer to p than the surface is.
+    Otherwise the faces between the two are counted.
     """
     i = round((p[0] - origin[0]) / cell)
     j = round((p[1] - origin[1]) / cell)
@@ -104,10 +104,11 @@ def _gap(p, q):
 
 @compiled
 def _line_bounds(line, given, values_at, lows, values, origin, cell, band, slack):
-    """Field values at the points, least possible values per segment; the least of each (mm).
+    """Smallest field value at the points, and the smallest lower bound of any segment (mm).
 
-    line: (K, 3) in the body's frame; fills values_at (K,) and lows (K - 1,). On a segment of
-    length L between field values u and v no distance is below (u + v - L) / 2 less the slack.
+    line: (K, 3) in the body's frame; fills values_at (K,) and the bounds lows (K - 1,). On a
+    segment of length L between field values u and v every distance is at least
+    (u + v - L) / 2 - slack.
     """
     estimate, lowest = math.inf, math.inf
     for k in range(len(line)):
@@ -128,7 +129,7 @@ def _exact(
 ):
     """Least of the centreline's distance to the surface and its points' signed distances (mm).
 
-    `best` is an upper bound of it to begin with. The segment that may come nearest goes first.
+    `best` is an upper bound to start with. The segment with the smallest lower bound goes first.
     """
     count = len(lows)
     first = int(np.argmin(lows))

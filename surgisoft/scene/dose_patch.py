@@ -1,8 +1,8 @@
-"""The stretch of the organ's surface around the lesion on which the laser's dose is kept.
+"""The part of the organ's surface around the lesion on which the laser's dose is stored.
 
-The mesh's own faces are far coarser than a beam, so the faces near the ring are cut into small
-triangles; each keeps the dose at its centroid. With edges up to `SPACING_WAISTS` of the beam's
-1/e^2 radius a Gaussian is summed to better than 1 % wherever it lands.
+The mesh's faces are far coarser than a beam, so the faces near the ring are divided into small
+triangles, each of which stores the dose at its centroid. With edges up to `SPACING_WAISTS` of the
+beam's 1/e^2 radius, the sum over a Gaussian is accurate to 1 % wherever the beam lands.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ LESION, RING, HEALTHY = 0, 1, 2
 SPACING_WAISTS = 0.75
 """Longest edge of a sample as a share of the beam's 1/e^2 radius."""
 LEAST_FACING = -0.2
-"""Faces turned away from the ring's own normal by more than this cosine are the far side."""
+"""Faces whose normal has a smaller cosine to the ring's normal are on the organ's far side."""
 SEAM_FINER = 4.0
-"""Faces that run into the solid are cut so many times finer, as a sample counts whole or not."""
+"""Factor by which faces that run into the solid are divided finer: samples count whole or not."""
 MOST_SAMPLES = 400_000
-"""A patch that would need more samples than this is refused."""
+"""A patch that needs more samples than this is an error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +86,8 @@ def cut_patch(
     """The patch of a closed ring (M, 3) mm with outward normals (M, 3) about centre_mm (3,).
 
     Samples have edges of at most spacing_mm; the ring is the band of width band_mm along its path,
-    parted into stations of about station_mm; the patch reaches margin_mm beyond the path, and all
-    over the inside. Where the surface crosses itself, what lies inside the solid is left out.
+    divided into stations of about station_mm. The patch covers the inside of the ring and reaches
+    margin_mm beyond it. Where the surface crosses itself, the part inside the solid is left out.
     """
     ring = (ring_mm, ring_normals, centre_mm)
     return cut_patches(mesh, (ring,), spacing_mm, band_mm, margin_mm, station_mm)[0]
@@ -101,9 +101,10 @@ def cut_patches(
     margin_mm: float = 4.0,
     station_mm: float = 0.5,
 ) -> tuple[DosePatch, ...]:
-    """One patch for each ring (points, normals, centre), on samples that they all share.
+    """One patch for each ring (points, normals, centre); all patches share the same samples.
 
-    As `cut_patch`; the rings lie near one another and have as many stations as the longest one.
+    The other arguments are those of `cut_patch`. The rings lie near one another; each has as many
+    stations as the longest one.
     """
     rings = [
         (np.asarray(ring, float), np.asarray(normals, float), np.asarray(centre, float))
@@ -148,7 +149,7 @@ def cut_patches(
 
 @dataclass(frozen=True, eq=False)
 class _Zoned:
-    """Samples as one ring sees them."""
+    """Samples in the coordinates of one ring."""
 
     along: np.ndarray
     offset: np.ndarray
@@ -170,7 +171,7 @@ def _zoned(mesh, points, faces, ring, band, margin) -> _Zoned:
 
 
 def _faces_near(mesh: Mesh, ring: np.ndarray, reach: float, centre: np.ndarray) -> np.ndarray:
-    """Faces within reach of the centre that hang together with those under the ring."""
+    """Faces within reach of the centre that are connected to those under the ring."""
     corners = mesh.triangles_mm
     size = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
     middles = corners.mean(axis=1)
@@ -192,7 +193,7 @@ def _faces_near(mesh: Mesh, ring: np.ndarray, reach: float, centre: np.ndarray) 
 
 
 def _exposed(mesh: Mesh, faces: np.ndarray, spacing: float, reach: float, centre: np.ndarray):
-    """As `_subdivide`, without what lies buried; finer on faces that are buried in part."""
+    """Samples of `_subdivide` outside the solid; finer on faces that lie partly inside it."""
     samples = _subdivide(mesh, faces, spacing, reach, centre)
     hidden = buried(mesh, samples[0], mesh.face_normals[samples[1]])
     if hidden.any():

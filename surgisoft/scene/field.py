@@ -1,9 +1,10 @@
-"""A distance field of a closed or open mesh on a grid, kept on disk by the mesh's content hash.
+"""A distance field of a closed or open mesh on a grid, cached on disk by the mesh's content hash.
 
-Nodes within a band of the surface hold the exact distance, negative inside a closed mesh; nodes
-beyond it hold the distance to a face that is nearest to a node close by: never too small, and known
-to be no less than the band. Between nodes the trilinear value is off by at most `slack_mm`. So the
-field bounds every distance from below; where that is not enough, `distance` asks the tree.
+Nodes within a band around the surface hold the exact distance, negative inside a closed mesh.
+Nodes beyond the band hold the distance to the face that is nearest to a neighbouring node: this is
+never too small, and never below the band. Between nodes the trilinear value is off by at most
+`slack_mm`. So the field gives a lower bound of every distance; where that is not enough, `distance`
+queries the tree.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from surgisoft.scene.bvh import TriangleTree, build_tree, point_surface, point_t
 from surgisoft.scene.mesh import Mesh
 
 FORMAT = 1
-"""Version of the file's meaning; files of another version are left alone."""
+"""Version of the file format; files of another version are ignored."""
 MOST_NODES = 2_000_000
 """The grid is coarsened until it has no more nodes than this."""
 FINEST_CELL_MM = 0.5
 """The grid is never finer than this (mm)."""
 STRIDE = 4
-"""Every so many nodes in each direction the distance is exact however far the surface is."""
+"""At every STRIDE-th node in each direction the distance is exact, however far the surface is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,9 @@ class DistanceField:
     def slack_mm(self) -> float:
         """Largest error of the trilinear value (mm).
 
-        A distance changes by no more than the way to each node, and the weighted mean of those
-        ways is largest at a cell's centre: half its diagonal. Plus float32 rounding.
+        A distance differs from that at a node by no more than the distance to the node. The
+        weighted mean of those distances is largest at a cell's centre, where it is half the
+        diagonal; float32 rounding adds 1e-4 mm.
         """
         return 0.5 * math.sqrt(3.0) * self.cell_mm + 1e-4
 
@@ -67,7 +69,10 @@ def _node(origin, cell, i, j, k):
 
 @compiled
 def _coarse(distance, face, origin, cell, triangles, starts, lower, upper):
-    """Exact distance and nearest face of every node of a grid, each bounded by its neighbour's."""
+    """Exact distance and nearest face of every node of a coarse grid.
+
+    The face found for the node before gives an upper bound that speeds up the search.
+    """
     _, ny, nz = distance.shape
     for i in range(distance.shape[0]):
         last = -1
@@ -109,7 +114,7 @@ def _fine(values, first, distance, face, origin, cell, band, triangles, starts, 
 
 
 def _unsigned(shape, origin, cell: float, band_mm: float, tree: TriangleTree) -> np.ndarray:
-    """Distances (X, Y, Z) float32 mm at the nodes, slabs shared out over the threads."""
+    """Distances (X, Y, Z) float32 mm at the nodes; threads compute one slab each."""
     values = np.empty(shape, np.float32)
     coarse = np.empty([(n - 1) // STRIDE + 2 for n in shape])
     face = np.empty(coarse.shape, np.int32)
@@ -130,9 +135,9 @@ def _unsigned(shape, origin, cell: float, band_mm: float, tree: TriangleTree) ->
 
 @compiled
 def _edge_side(ay, az, by, bz, y, z):
-    """On which side of the projected edge a..b the point y, z lies; the same for b..a but sign.
+    """On which side of the projected edge a..b the point y, z lies; b..a gives the opposite sign.
 
-    Ends are put in one order first, so two faces that share an edge round alike.
+    The ends are sorted first, so that two faces that share an edge round equally.
     """
     if ay < by or (ay == by and az < bz):
         return (by - ay) * (z - az) - (bz - az) * (y - ay)
@@ -141,10 +146,10 @@ def _edge_side(ay, az, by, bz, y, z):
 
 @compiled
 def _wind(counts, origin, cell, triangles):
-    """Add to counts[i, j, k] the signed crossings that a walk along +x meets before node i.
+    """Add to counts[i, j, k] the signed crossings along +x between node i - 1 and node i.
 
-    Every triangle is projected on the yz plane and met by the rows of nodes it covers. A row that
-    grazes an edge belongs to one of the two faces there, as their half-planes round alike.
+    Every triangle is projected on the yz plane and intersected with the rows of nodes it covers. A
+    row that grazes an edge counts for exactly one of the two faces, as their edges round equally.
     """
     nx, ny, nz = counts.shape
     for f in range(len(triangles)):
@@ -191,7 +196,7 @@ def build_field(
     most_nodes: int = MOST_NODES,
     tree: TriangleTree | None = None,
 ) -> DistanceField:
-    """The field of a mesh, reaching margin_mm beyond its box; an open mesh gets no inside."""
+    """The field of a mesh, reaching margin_mm beyond its box; unsigned if the mesh is open."""
     origin, cell, shape = _grid(mesh, margin_mm, most_nodes)
     tree = tree or build_tree(mesh)
     values = _unsigned(tuple(shape), origin, cell, band_mm, tree)
@@ -204,7 +209,7 @@ def build_field(
 
 
 def cache_folder() -> Path:
-    """Where fields are kept: `surgisoft/fields` in the user's cache folder (XDG)."""
+    """The folder that caches fields: `surgisoft/fields` in the user's cache folder (XDG)."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "surgisoft" / "fields"
 
@@ -217,9 +222,9 @@ def load_field(
     tree: TriangleTree | None = None,
     folder: Path | None = None,
 ) -> DistanceField:
-    """The field of a mesh from the disk, built and kept there if it is not or not whole.
+    """The field of a mesh from the cache on disk; built and stored if it is absent or damaged.
 
-    A folder that cannot be written costs the build each time and nothing else.
+    If the folder cannot be written, the field is built each time.
     """
     if not (margin_mm > 0.0 and band_mm > 0.0):
         raise InputError(f"field margin {margin_mm} mm, band {band_mm} mm: expected more than 0")

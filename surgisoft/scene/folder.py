@@ -1,4 +1,4 @@
-"""A scene folder opened: the file's values, the meshes in their places, the ring on the organ."""
+"""An opened scene folder: the values of its file, the meshes in place, the ring on the organ."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from surgisoft.scene.spec import FILE, LesionSpec, SceneSpec, load_spec, spec_pa
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene with its meshes read; world frame, mm."""
+    """A scene with its meshes in memory; world frame, mm."""
 
     spec: SceneSpec
     """The values of `scene.toml`."""
@@ -37,14 +37,14 @@ class Scene:
         return self.ring_of()
 
     def ring_of(self, **count: int) -> Ring:
-        """The lesion's path with `count` points; an InputError where it does not lie."""
+        """The lesion's path with `count` points; an InputError if it does not lie on the organ."""
         try:
             return lesion_ring(self.organ.world_mesh, self.spec.lesion, **count)
         except InputError as error:
             raise InputError(f"{self.folder / FILE}: {error}") from None
 
     def with_lesion(self, lesion: LesionSpec) -> "Scene":
-        """The same scene with another lesion on the same organ."""
+        """A copy of the scene with another lesion on the same organ."""
         return replace(self, spec=replace(self.spec, lesion=lesion))
 
     @cached_property
@@ -57,7 +57,7 @@ class Scene:
 
 
 def open_scene(path: str | Path) -> Scene:
-    """Open a scene folder (or its scene.toml); what is missing or bad is one line."""
+    """Open a scene folder (or its scene.toml); an InputError names what is missing or bad."""
     spec = load_spec(path)
     folder = spec_path(path).parent
     where, bodies = read_toml(spec_path(path))[1] / "bodies", []

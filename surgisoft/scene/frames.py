@@ -1,18 +1,23 @@
-"""Rigid poses and rotations, for numpy arrays and torch tensors alike.
+"""Rigid poses and rotations for numpy arrays and torch tensors.
 
 A pose is a (..., 4, 4) matrix that maps points of its own frame into its parent's frame:
 `p_parent = pose @ p_own`. World frame: z up, millimetres.
-Every function returns the kind it was given (numpy stays numpy, torch keeps dtype and device).
+Every function returns the type it was given: numpy stays numpy, torch keeps dtype and device.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
+Array = Any
+"""A numpy array or a torch tensor; every function returns the type that it is given."""
+
 
 def _library(array):
-    """numpy or torch, whichever the array belongs to."""
+    """The library of the array: numpy or torch."""
     return torch if isinstance(array, torch.Tensor) else np
 
 
@@ -25,30 +30,30 @@ def _as_arrays(*values):
     return [np.asarray(v, dtype=np.float64) for v in values]
 
 
-def norm(vector):
+def norm(vector: Array) -> Array:
     """Euclidean length of (..., 3) vectors: (...)."""
     return _library(vector).sqrt(dot(vector, vector))
 
 
-def normalise(vector):
+def normalise(vector: Array) -> Array:
     """Unit vectors along (..., 3) vectors; a zero vector stays zero."""
     length = norm(vector)[..., None]
     return vector / (length + (length == 0))
 
 
-def cross(a, b):
+def cross(a: Array, b: Array) -> Array:
     """Cross product of (..., 3) vectors, broadcast."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     return _library(a).stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -1)
 
 
-def dot(a, b):
+def dot(a: Array, b: Array) -> Array:
     """Dot product of (..., 3) vectors, broadcast: (...)."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-def pose_from(rotation, position_mm):
+def pose_from(rotation: Array, position_mm: Array) -> Array:
     """Pose (..., 4, 4) from a rotation (..., 3, 3) and a position (..., 3) in mm."""
     rotation, position_mm = _as_arrays(rotation, position_mm)
     lib = _library(rotation)
@@ -61,12 +66,12 @@ def pose_from(rotation, position_mm):
     return lib.concatenate((top, bottom), -2)
 
 
-def identity():
+def identity() -> np.ndarray:
     """The pose that changes nothing: (4, 4) float64."""
     return np.eye(4)
 
 
-def compose(*poses):
+def compose(*poses: Array) -> Array:
     """Product of poses (..., 4, 4), outermost first: compose(world_b, b_c) is world_c."""
     arrays = _as_arrays(*poses)
     result = arrays[0]
@@ -75,27 +80,27 @@ def compose(*poses):
     return result
 
 
-def invert(pose):
+def invert(pose: Array) -> Array:
     """Inverse of rigid poses (..., 4, 4): transposed rotation, rotated negative position."""
     (pose,) = _as_arrays(pose)
     rotation = _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
     return pose_from(rotation, -(rotation @ pose[..., :3, 3:])[..., 0])
 
 
-def apply(pose, points_mm):
+def apply(pose: Array, points_mm: Array) -> Array:
     """Points (..., N, 3) mm of the pose's own frame, in its parent's frame; pose (..., 4, 4)."""
     pose, points_mm = _as_arrays(pose, points_mm)
     turned = points_mm @ _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
     return turned + pose[..., None, :3, 3]
 
 
-def rotate(pose, vectors):
+def rotate(pose: Array, vectors: Array) -> Array:
     """Directions (..., N, 3) of the pose's own frame, in its parent's frame; pose (..., 4, 4)."""
     pose, vectors = _as_arrays(pose, vectors)
     return vectors @ _library(pose).swapaxes(pose[..., :3, :3], -1, -2)
 
 
-def rotation_from_z(z_axis, roll_rad=0.0):
+def rotation_from_z(z_axis: Array, roll_rad: Array = 0.0) -> Array:
     """Rotation (..., 3, 3) with third column z_axis (..., 3), turned by roll_rad (...) about it.
 
     At roll 0 the x axis is the parent's x axis projected into the plane across z (the parent's y
@@ -115,13 +120,13 @@ def rotation_from_z(z_axis, roll_rad=0.0):
     return lib.stack((c * x + s * y, c * y - s * x, z * lib.ones_like(c)), -1)
 
 
-def pose_from_z(position_mm, z_axis, roll_rad=0.0):
-    """Pose (..., 4, 4) at position_mm (..., 3) with its z along z_axis (..., 3), see above."""
+def pose_from_z(position_mm: Array, z_axis: Array, roll_rad: Array = 0.0) -> Array:
+    """Pose (..., 4, 4) at position_mm (..., 3) z along z_axis (..., 3), see rotation_from_z."""
     position_mm, z_axis, roll_rad = _as_arrays(position_mm, z_axis, roll_rad)
     return pose_from(rotation_from_z(z_axis, roll_rad), position_mm)
 
 
-def look_at(eye_mm, target_mm, up=(0.0, 0.0, 1.0)):
+def look_at(eye_mm: Array, target_mm: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:
     """Camera pose (..., 4, 4) at eye_mm (..., 3): z looks at target_mm, x right, y down the image.
 
     `up` (..., 3) is the direction that appears upwards. Looking along `up` itself, the parent's x
@@ -137,10 +142,10 @@ def look_at(eye_mm, target_mm, up=(0.0, 0.0, 1.0)):
     return pose_from(lib.stack((x, cross(z, x), z), -1), eye_mm)
 
 
-def rotation_from_axis_angle(axis, angle_rad):
+def rotation_from_axis_angle(axis: Array, angle_rad: Array) -> Array:
     """Rotation (..., 3, 3) by angle_rad (...) about axis (..., 3) (Rodrigues 1840).
 
-    For batches in torch; `scipy.spatial.transform` does the same for numpy alone.
+    It serves batches in torch; `scipy.spatial.transform` has this for numpy only.
     """
     axis, angle_rad = _as_arrays(axis, angle_rad)
     lib = _library(axis)
@@ -152,7 +157,7 @@ def rotation_from_axis_angle(axis, angle_rad):
     return c * rows + s * turned + (1.0 - c) * u[..., None] * u[..., None, :]
 
 
-def angle_between(a, b):
+def angle_between(a: Array, b: Array) -> Array:
     """Angle in rad between (..., 3) vectors, exact near 0 and pi (Kahan 2006: atan2 form)."""
     a, b = _as_arrays(a, b)
     return _library(a).arctan2(norm(cross(a, b)), dot(a, b))

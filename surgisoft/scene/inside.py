@@ -45,10 +45,10 @@ def _solid_angles(points, triangles, out):
 
 
 def winding_numbers(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
-    """(N,) how often the mesh winds about points (N, 3) mm of its own frame: 1 inside, 0 outside.
+    """Winding numbers (N,) of the mesh about points (N, 3) mm, its own frame: 1 inside, 0 outside.
 
-    Cost grows with points times faces; exact to rounding for any closed mesh, also where several
-    closed sheets overlap.
+    The cost grows with points times faces. The result is exact to rounding for any closed mesh,
+    also where several closed surfaces overlap.
     """
     points = np.ascontiguousarray(points_mm, dtype=np.float64)
     out = np.empty(len(points))
@@ -57,11 +57,11 @@ def winding_numbers(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
 
 
 ABOVE_MM = 1e-3
-"""Points are asked about this far outside their own sheet (mm); crossings are parted by it too."""
+"""Rays start this far outside the surface, and this far behind each crossing (mm)."""
 TILTS = ((0.0, 0.0), (0.23, 0.11), (-0.17, 0.19))
-"""Rays leave at these slopes to the normal; two of three must agree: one may meet an edge."""
+"""Slopes of the three rays to the normal. Two must agree, because one may meet an edge."""
 MOST_CROSSINGS = 64
-"""A ray that crosses more sheets than this is no longer followed."""
+"""A ray is not followed beyond this many crossings."""
 
 
 def buried(mesh: Mesh, points_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -107,7 +107,7 @@ def buried_faces(mesh: Mesh) -> int:
 
 
 def points_inside(mesh: Mesh, points_mm: np.ndarray) -> np.ndarray:
-    """(N,) bool: points (N, 3) mm in a closed mesh's own frame that it encloses; open: never."""
+    """(N,) bool: whether a closed mesh encloses points (N, 3) mm, its own frame; open: False."""
     inside = np.zeros(len(points_mm), dtype=bool)
     if not mesh.is_watertight:
         return inside

@@ -19,9 +19,9 @@ from surgisoft.scene.rays import EmbreeSurface
 from surgisoft.scene.spec import LesionSpec
 
 RING_POINTS = 72
-"""Points on a ring unless asked otherwise: every 5 degrees, 0.87 mm apart on 20 mm."""
+"""Default number of ring points: every 5 degrees, 0.87 mm apart on a ring of 20 mm."""
 STEEPEST = 0.25
-"""Least cosine between the lesion's and a ring point's normal (75.5 degrees)."""
+"""Smallest cosine between the lesion's and a ring point's normal (75.5 degrees)."""
 ON_SURFACE_MM = 0.5
 """A lesion's centre or path farther than this from the surface is an error (mm)."""
 
@@ -75,7 +75,7 @@ def closest_in_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarra
 
 
 def patch_normal(mesh: Mesh, centre_mm: np.ndarray, face: int, radius_mm: float) -> np.ndarray:
-    """(3,) mean outward normal, by area, of the faces within `radius_mm` that face like `face`."""
+    """(3,) area-weighted mean normal of the faces within `radius_mm` on the side of `face`."""
     middles = mesh.triangles_mm.mean(axis=1)
     reach = np.linalg.norm(middles - centre_mm, axis=1) <= radius_mm
     alike = mesh.face_normals @ mesh.face_normals[face] > 0.0
@@ -87,10 +87,10 @@ def patch_normal(mesh: Mesh, centre_mm: np.ndarray, face: int, radius_mm: float)
 def circle_on(
     mesh: Mesh, centre_mm: np.ndarray, face: int, diameter_mm: float, count: int = RING_POINTS
 ) -> Ring | None:
-    """The circle of `diameter_mm` about a surface point, laid down along the patch's normal.
+    """The circle of `diameter_mm` about a surface point, projected along the patch's normal.
 
-    Each point of the flat circle drops to the surface nearest to the circle's plane that faces its
-    way. None where it hangs over an edge, a face is steeper than 75 degrees, or the path jumps.
+    Each point of the flat circle moves along the normal to the nearest surface that faces outwards.
+    None if the circle extends over an edge, a face is steeper than 75 degrees, or the path jumps.
     """
     radius = 0.5 * diameter_mm
     normal = patch_normal(mesh, centre_mm, face, radius)
@@ -144,7 +144,7 @@ def _cross2(p, q):
 
 
 def lesion_ring(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> Ring:
-    """The lesion's path on the organ's mesh (world frame); an InputError where it cannot lie."""
+    """The lesion's path on the organ's mesh (world frame); an InputError if it does not fit."""
     centre = np.asarray(lesion.centre_mm)
     on_surface, face = nearest_on_surface(mesh, centre[None])
     off = float(np.linalg.norm(on_surface[0] - centre))
@@ -159,27 +159,27 @@ def lesion_ring(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> Rin
     ring = circle_on(mesh, on_surface[0], int(face[0]), lesion.diameter_mm, count)
     if ring is None:
         raise InputError(
-            f"a ring of {lesion.diameter_mm:g} mm does not lie on '{lesion.body}' about "
-            f"{tuple(centre.round(3).tolist())}: it hangs over an edge; choose a flatter place or "
-            "a smaller diameter"
+            f"a ring of {lesion.diameter_mm:g} mm does not fit on '{lesion.body}' about "
+            f"{tuple(centre.round(3).tolist())}: it extends over an edge; choose a flatter place "
+            "or a smaller diameter"
         )
     return ring
 
 
 def path_slack_mm(lesion: LesionSpec) -> float:
-    """How far the lesion's own path may leave the surface (mm)."""
+    """Largest distance of the user's own path from the surface that is accepted (mm)."""
     return max(ON_SURFACE_MM, 0.1 * lesion.diameter_mm)
 
 
 def path_off_mm(mesh: Mesh, lesion: LesionSpec, count: int = RING_POINTS) -> float:
-    """How far the lesion's own path, resampled, leaves the mesh's surface (world frame, mm)."""
+    """Largest distance of the user's own path, resampled, from the mesh's surface (mm)."""
     path = _resampled(lesion, count)
     points, _ = nearest_on_surface(mesh, path)
     return float(np.linalg.norm(points - path, axis=1).max())
 
 
 def _resampled(lesion: LesionSpec, count: int) -> np.ndarray:
-    """(count, 3) points evenly along the lesion's own closed path (mm)."""
+    """(count, 3) points, evenly spaced along the user's own closed path (mm)."""
     corners = np.array([*lesion.path_mm, lesion.path_mm[0]])
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
     places = np.linspace(0.0, along[-1], count, endpoint=False)
@@ -187,7 +187,7 @@ def _resampled(lesion: LesionSpec, count: int) -> np.ndarray:
 
 
 def _path_ring(mesh, lesion, centre, face, count) -> Ring:
-    """The user's own path, evenly resampled along its length and laid on the surface."""
+    """The user's own path, resampled evenly along its length and projected on the surface."""
     path = _resampled(lesion, count)
     points, faces = nearest_on_surface(mesh, path)
     off = np.linalg.norm(points - path, axis=1)
@@ -201,16 +201,22 @@ def _path_ring(mesh, lesion, centre, face, count) -> Ring:
 
 
 TRIED = 400
-"""Surface points drawn for the choice of a lesion."""
+"""Surface points sampled for the choice of a lesion."""
 OPEN_CONE_RAD = np.radians(60.0)
 """Half angle of the cone above a place that should be open to the outside (rad)."""
 SITES = 6
-"""Places handed on for the search of mounts."""
+"""Number of places that are passed to the search for mounts."""
 
+MOST_RINGS = 80
+"""Most places, best first, at which a ring is tried."""
+SITES_APART = 1.5
+"""Smallest distance between two places, in diameters of the ring."""
+OPEN_WEIGHT, FLAT_WEIGHT, TOP_WEIGHT = 2.0, 2.0, 0.7
+"""Weights, chosen by hand, of a place's quality: openness, flatness (0 to 1), upward normal."""
 QUICK_RING = 12
-"""Ring points that are tried before the whole ring, when a diameter that fits is sought."""
+"""Ring points that are tried before the whole ring in the search for a diameter that fits."""
 FAR_POINT_MM = 20.0
-"""A point farther than this from every surface is a slip, not a place on it (mm)..."""
+"""A given point farther than this from every surface is an error (mm) ..."""
 SMALL_HOLE = 0.1
 """A hole up to this share of the ring's diameter is a flaw of the mesh. A wider one is an opening
 of the organ (a vessel, a bowel), and the faces that close it are no tissue."""
@@ -248,15 +254,15 @@ class Site:
     ring: Ring
     """The ring about it."""
     moved_mm: float = 0.0
-    """How far it lies from the point that was pointed at (mm)."""
+    """Distance from the point that the user gave (mm)."""
 
 
 def pointed_site(
-    bodies: list[OrganSurface], point_mm: np.ndarray, diameter_mm: float, said: str | None = None
+    bodies: list[OrganSurface], point_mm: np.ndarray, diameter_mm: float, given: str | None = None
 ) -> Site:
-    """The surface point nearest to `point_mm` (3,), on whichever body it lies.
+    """The site at the surface point, of any body, that is nearest to `point_mm` (3,).
 
-    An InputError where none is near; `said` is the point as the user wrote it.
+    An InputError if no surface is near; `given` is the point as the user wrote it.
     """
     nearest = [nearest_on_surface(body.mesh, point_mm[None]) for body in bodies]
     away = [float(np.linalg.norm(points[0] - point_mm)) for points, _ in nearest]
@@ -264,9 +270,9 @@ def pointed_site(
     points, faces = nearest[body]
     most = max(FAR_POINT_MM, FAR_POINT * float(np.ptp(bodies[body].mesh.bounds_mm, axis=0).max()))
     if away[body] > most:
-        said = said or f"the point {tuple(point_mm.round(3).tolist())} mm"
+        given = given or f"the point {tuple(point_mm.round(3).tolist())} mm"
         raise InputError(
-            f"{said} lies {away[body]:.4g} mm from the nearest surface; expected at most "
+            f"{given} lies {away[body]:.4g} mm from the nearest surface; expected at most "
             f"{most:.4g} mm: give it in the first file's own frame and unit, or check --unit"
         )
     site = _with_ring(bodies, body, points[0], int(faces[0]), diameter_mm)
@@ -274,10 +280,10 @@ def pointed_site(
 
 
 def directed_site(bodies: list[OrganSurface], direction: np.ndarray, diameter_mm: float) -> Site:
-    """Where a ray from outside along -direction (3,) through the largest body's middle lands.
+    """The site where a ray from outside along -direction (3,) meets the largest body.
 
-    Where it passes through without touching (a ring's hole), the surface point that lies farthest
-    out in that direction.
+    The ray runs through the middle of the body's bounding box. If it misses (a torus), the site is
+    the surface point farthest out in that direction.
     """
     away = frames.normalise(np.asarray(direction, dtype=float))
     mesh = bodies[0].mesh
@@ -305,9 +311,9 @@ def _with_ring(bodies, body, point, face, diameter_mm) -> Site:
         )
     if ring is None:
         fits = _largest_fitting(surface.mesh, point, face, diameter_mm)
-        advice = f"a ring of {fits:.0f} mm does" if fits >= 1.0 else "no ring does"
+        advice = f"a ring of {fits:.0f} mm fits" if fits >= 1.0 else "no ring fits"
         raise InputError(
-            f"a ring of {diameter_mm:g} mm does not lie on the surface at "
+            f"a ring of {diameter_mm:g} mm does not fit on the surface at "
             f"{place} mm ({advice}); choose another place or --diameter"
         )
     return Site(body, point, ring)
@@ -327,9 +333,9 @@ def _largest_fitting(mesh, point, face, diameter_mm) -> float:
 
 
 def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
-    """Places on the largest body that are open to the outside, even and on top, best first.
+    """Sites on the largest body that are open to the outside, flat and on top, best first.
 
-    Points are drawn evenly over the surface (the same ones each time). Openness is the fraction of
+    Points are sampled evenly over the surface, with a fixed seed. Openness is the fraction of
     a cone of rays that leave without touching any body. No place lies on faces that close an
     opening of the file.
     """
@@ -340,10 +346,11 @@ def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
     normals = mesh.face_normals[faces]
     openness = _openness([body.mesh for body in bodies], points, normals)
     evenness = _evenness(mesh, points, normals, 0.5 * diameter_mm)
-    quality = 2.0 * openness + 2.0 * evenness + 0.7 * normals[:, 2]
+    quality = OPEN_WEIGHT * openness + FLAT_WEIGHT * evenness + TOP_WEIGHT * normals[:, 2]
     sites: list[Site] = []
-    for i in np.argsort(-quality, kind="stable")[:80]:
-        if any(np.linalg.norm(points[i] - site.point_mm) < 1.5 * diameter_mm for site in sites):
+    for i in np.argsort(-quality, kind="stable")[:MOST_RINGS]:
+        apart = [float(np.linalg.norm(points[i] - site.point_mm)) for site in sites]
+        if min(apart, default=np.inf) < SITES_APART * diameter_mm:
             continue
         ring = circle_on(mesh, points[i], int(faces[i]), diameter_mm)
         if ring is not None and not surface.is_lid(ring.faces, diameter_mm).any():
@@ -354,17 +361,17 @@ def good_sites(bodies: list[OrganSurface], diameter_mm: float) -> list[Site]:
         size = np.ptp(mesh.bounds_mm, axis=0)
         best = np.argsort(-quality, kind="stable")[:SITES]
         fits = max(_largest_fitting(mesh, points[i], int(faces[i]), diameter_mm) for i in best)
-        advice = f"a ring of {fits:g} mm does" if fits else "no smaller one does"
+        advice = f"a ring of {fits:g} mm fits" if fits else "no smaller one fits"
         raise InputError(
-            f"no ring of {diameter_mm:g} mm lies on a body of "
-            f"{' x '.join(f'{s:.3g}' for s in size)} mm ({advice}): it hangs over an edge or the "
-            "surface is too rough; give a smaller --diameter or the right --unit"
+            f"no ring of {diameter_mm:g} mm fits on a body of "
+            f"{' x '.join(f'{s:.3g}' for s in size)} mm ({advice}): it extends over an edge or the "
+            "surface is too rough; check --unit, or give a smaller --diameter"
         )
     return sites
 
 
 def _drawn(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """TRIED surface points (T, 3) and their faces, evenly over the area."""
+    """TRIED surface points (T, 3) mm and their faces, evenly distributed over the area."""
     rng = np.random.default_rng(0)
     share = np.cumsum(mesh.face_areas_mm2)
     picks = (np.arange(TRIED) + rng.random(TRIED)) / TRIED * share[-1]
@@ -377,7 +384,7 @@ def _drawn(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _openness(bodies, points, normals, rays: int = 48) -> np.ndarray:
-    """(T,) fraction of a cone of rays about each normal that meet no body."""
+    """(T,) fraction of the rays in a cone about each normal that meet no body."""
     k = np.arange(rays) + 0.5
     cosine = 1.0 - (1.0 - np.cos(OPEN_CONE_RAD)) * k / rays
     turn = np.pi * (1.0 + np.sqrt(5.0)) * k
@@ -409,17 +416,17 @@ def _evenness(mesh, points, normals, radius) -> np.ndarray:
 
 
 TRIES = 20
-"""Places drawn for each lesion that is wanted before it is given up."""
+"""Places tried for each lesion before the variation is given up."""
 
 
 def lesions_like(
     mesh: Mesh, lesion: LesionSpec, count: int, shift_mm: float, size: float
 ) -> tuple[LesionSpec, ...]:
-    """`count` lesions on the organ's mesh (world frame), the same ones each time.
+    """`count` random variations of a lesion on the organ's mesh (world frame), with a fixed seed.
 
-    Centres lie evenly within shift_mm of the lesion's own, along the surface; diameters are even
-    within the share `size` of its own (0.1: from 90 to 110 %). With both 0 there is the own one
-    only.
+    Centres are uniform within shift_mm of the lesion's centre, along the surface. Diameters are
+    uniform within the share `size` of its diameter (0.1: 90 to 110 %). With both at 0 the result is
+    the lesion itself.
     """
     if shift_mm == 0.0 and size == 0.0:
         return (lesion,)
@@ -448,5 +455,5 @@ def lesions_like(
             return tuple(found)
     raise InputError(
         f"only {len(found)} of {count} lesions up to {shift_mm:g} mm aside and {100 * size:g} % "
-        f"larger lie on '{lesion.body}'; expected a smaller spread or a flatter place"
+        f"larger fit on '{lesion.body}'; use a smaller spread or a flatter place"
     )

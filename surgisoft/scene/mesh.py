@@ -99,7 +99,7 @@ class Mesh:
 
     @cached_property
     def is_watertight(self) -> bool:
-        """Whether every edge lies between exactly two faces that run it in opposite directions."""
+        """Whether every edge lies between exactly two faces with opposite senses."""
         directed = self._directed_edges.astype(np.int64)
         count = len(self.vertices_mm)
         forward = np.sort(directed[:, 0] * count + directed[:, 1])
@@ -121,19 +121,19 @@ class Mesh:
         digest.update(self.faces.astype("<i4").tobytes())
         return digest.hexdigest()
 
-    def transformed(self, pose) -> Mesh:
+    def transformed(self, pose: np.ndarray) -> Mesh:
         """The same mesh moved by a pose (4, 4): vertices in the pose's parent frame."""
         return Mesh(frames.apply(pose, self.vertices_mm), self.faces)
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body of the scene: a mesh, where it stands, and what touching it means."""
+    """A rigid body of the scene: a mesh, its pose, and its role."""
 
     name: str
     """Unique among the scene's bodies."""
     role: str
-    """organ (what the laser is meant for), keep-out or support."""
+    """organ (the laser's target), keep-out (must not be touched) or support."""
     mesh: Mesh
     """The surface, mm, in the body's own frame."""
     pose: np.ndarray = field(default_factory=frames.identity)
@@ -157,9 +157,10 @@ class Body:
 
 
 def used_indices(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The indices that occur, rising (U,), and `index` (any shape) numbered by their place there.
+    """The distinct indices, ascending (U,), and `index` (any shape) renumbered by rank among them.
 
-    For indices of vertices or labels: whole numbers from 0, not many more than there are.
+    Like `numpy.unique(return_inverse=True)`, which takes seconds for a million faces because it
+    hashes. The indices are whole numbers from 0, with a maximum not far above their count.
     """
     flags = np.zeros(int(index.max(initial=-1)) + 1, dtype=bool)
     flags[index] = True
@@ -170,9 +171,10 @@ def used_indices(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def equal_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (N, K) that are equal, one group each: first row (G,), group (N,), size (G,).
+    """Groups of equal rows (N, K): index of the first row (G,), group (N,) of each row, size (G,).
 
-    Groups rise with their rows, first column first, as `numpy.unique(axis=0)` has them.
+    The groups are in the order of `numpy.unique(axis=0)`, which is slower because it compares row
+    by row.
     """
     order = np.lexsort(rows.T[::-1])
     ranked = rows[order]

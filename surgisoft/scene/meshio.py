@@ -1,4 +1,4 @@
-"""Mesh files: read STL, OBJ, PLY, OFF and GLB, tell the unit, write exact PLY."""
+"""Mesh files: read STL, OBJ, PLY, OFF and GLB, infer the unit of length, write exact PLY."""
 
 import struct
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from surgisoft.scene.mesh import Mesh, used_indices
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
 PLAUSIBLE_MM = (20.0, 600.0)
-"""Largest side of an organ or of an organ phantom: from a gland to a whole abdomen (mm)."""
+"""Plausible largest side of an organ or an organ phantom: from a gland to a whole abdomen (mm)."""
 ABSURD = 10.0
-"""Organs this many times smaller or larger than that are refused, others outside it told."""
+"""Factor below or above the plausible range at which a size is an error, not only a warning."""
 TYPICAL_MM = 180.0
 """Largest side of a liver (mm), Gray's Anatomy, 42nd ed., chapter 67: 15 to 20 cm across."""
 
@@ -34,7 +34,7 @@ class Part:
 
 
 def read_parts(path: str | Path) -> tuple[Part, ...]:
-    """All triangle meshes of a file in its own unit and frame."""
+    """All triangle meshes of a file, in the file's unit and frame."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: there is no such file; expected a mesh")
@@ -60,7 +60,7 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
 
 
 def _check_stl(path: Path) -> None:
-    """A binary STL that is shorter than its own count, or neither binary nor text STL."""
+    """Raise for a binary STL shorter than its own count, and for a file that is no STL at all."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(84)
@@ -79,7 +79,7 @@ def _check_stl(path: Path) -> None:
 
 
 def _check_text_stl(path: Path, size: int) -> None:
-    """A text STL that ends before its last line."""
+    """Raise for a text STL that ends before its last line."""
     with path.open("rb") as file:
         file.seek(max(0, size - 1024))
         tail = file.read().lower()
@@ -123,7 +123,7 @@ def _load(path: Path) -> tuple[list[Part], int]:
 
 
 def _checked(path: Path, part: Part) -> Part:
-    """The part, unless its numbers cannot be a mesh."""
+    """The part itself; an InputError if its numbers cannot be a mesh."""
     if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
         raise InputError(
             f"{path}: a face names vertex {part.faces.max()} of {len(part.vertices)}; "
@@ -140,12 +140,12 @@ def _checked(path: Path, part: Part) -> Part:
 
 @dataclass(frozen=True)
 class UnitGuess:
-    """The unit of a file's coordinates and why."""
+    """The inferred unit of a file's coordinates, and the reason for it."""
 
     unit: str
     """`mm`, `cm` or `m`."""
     sentence: str
-    """Why, for the user."""
+    """The reason, as printed for the user."""
 
     @property
     def mm(self) -> float:
@@ -154,10 +154,10 @@ class UnitGuess:
 
 
 def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
-    """The unit that gives the file's largest side `size` the size of an organ.
+    """Infer the unit of a file from its largest side `size`, which should be that of an organ.
 
-    Where two units do, mm is taken (metres for glTF, whose standard says so); where none does, the
-    one that comes nearest to a liver.
+    If two units fit, mm is preferred (metres for glTF, whose standard prescribes them). If none
+    fits, the unit is chosen that comes nearest to a liver.
     """
     low, high = PLAUSIBLE_MM
     fits = [unit for unit, mm in MM_PER_UNIT.items() if low <= size * mm <= high]
@@ -166,43 +166,43 @@ def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
         unit = next(unit for unit in preferred if unit in fits)
         other = [u for u in fits if u != unit]
         doubt = (
-            f"; {other[0]} would give {size * MM_PER_UNIT[other[0]]:.4g} mm (--unit {other[0]})"
+            f"; {other[0]} would give {size * MM_PER_UNIT[other[0]]:.4g} mm, use --unit {other[0]}"
             if other
             else ""
         )
-        return UnitGuess(unit, f"{unit}: {size:.4g} {unit} across is an organ's size{doubt}")
+        return UnitGuess(unit, f"{unit} (inferred: the mesh is {size:.4g} {unit} across{doubt})")
     unit = min(MM_PER_UNIT, key=lambda u: abs(np.log(size * MM_PER_UNIT[u] / TYPICAL_MM)))
     return UnitGuess(
         unit,
-        f"{unit}, in doubt: no unit gives {size:.4g} an organ's size of {low:g} to {high:g} mm; "
-        f"in {unit} it is {size * MM_PER_UNIT[unit]:.4g} mm (--unit says it)",
+        f"{unit} (uncertain: the mesh would be {size * MM_PER_UNIT[unit]:.4g} mm across; organs "
+        f"measure {low:g} to {high:g} mm, which no unit gives; check with --unit)",
     )
 
 
 def given_unit(size: float, unit: str) -> str:
-    """What to say of a file whose largest side is `size` in the unit the user told.
+    """The line that reports the unit which the user gave, for a largest side of `size` units.
 
-    A warning where that is not an organ's size, with the units that would give one.
+    It is a warning if that is not an organ's size, with the units that would give one.
     """
     (low, high), mm = PLAUSIBLE_MM, size * MM_PER_UNIT[unit]
     if low <= mm <= high:
-        return f"{unit}, as told"
+        return f"'{unit}' as given"
     fits = [u for u, scale in MM_PER_UNIT.items() if low <= size * scale <= high]
-    advice = "".join(f"; in {u} it is {size * MM_PER_UNIT[u]:.4g} mm (--unit {u})" for u in fits)
+    advice = "".join(f"; --unit {u} would give {size * MM_PER_UNIT[u]:.4g} mm" for u in fits)
     return (
-        f"{unit}, as told, in doubt: {mm:.4g} mm across is not an organ's size of {low:g} to "
-        f"{high:g} mm{advice}"
+        f"'{unit}' was given, but the mesh would be {mm:.4g} mm across; organs measure {low:g} to "
+        f"{high:g} mm; check --unit{advice}"
     )
 
 
-def check_organ_size(path: str | Path, size_mm: float, told: str) -> None:
-    """An InputError for an organ so far from any organ's size that its unit must be wrong."""
+def check_organ_size(path: str | Path, size_mm: float, unit: str) -> None:
+    """Raise an InputError for a size so far from any organ's that the unit must be wrong.
+
+    `unit` is the line that reports the unit, with the size and the range of organs.
+    """
     low, high = PLAUSIBLE_MM
     if not low / ABSURD <= size_mm <= high * ABSURD:
-        raise InputError(
-            f"{path}: the organ would be {size_mm:.4g} mm across; expected {low:g} to {high:g} mm "
-            f"(unit {told})"
-        )
+        raise InputError(f"{path}: unit {unit}")
 
 
 def write_ply(mesh: Mesh, path: str | Path) -> None:
@@ -220,7 +220,7 @@ def write_ply(mesh: Mesh, path: str | Path) -> None:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """A mesh file in mm as one mesh, unchanged; the counterpart of `write_ply` and of repairs."""
+    """Read a mesh file in mm as one mesh, without repairs; the counterpart of `write_ply`."""
     parts = read_parts(path)
     starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     return Mesh(

@@ -14,9 +14,9 @@ from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim
 from surgisoft.scene.spec import CameraSpec, LaserSpec, MountSpec
 
 LANDED_MM = 0.3
-"""A ray reaches a point of the surface if it ends this near (mm): half the laser's spot."""
+"""The beam hits a point of the surface if it ends this near (mm): half the laser's spot."""
 APPROACH_STEPS = 24
-"""Steps in which the way from rest to the lesion is looked at."""
+"""Steps in which the path from rest to the lesion is checked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class MountedArm:
     """An arm at its mount."""
 
     reach: ArmReach
-    """What the arm can do, base frame."""
+    """Shapes that the arm can take, base frame."""
     pose: np.ndarray
     """(4, 4) base frame to world frame, mm."""
     shaft_mm: float
@@ -32,11 +32,11 @@ class MountedArm:
 
     @classmethod
     def at(cls, mount: MountSpec, reach: ArmReach) -> "MountedArm":
-        """The arm where the scene file puts it."""
+        """The arm at the mount that the scene file defines."""
         return cls(reach, mount.pose(), mount.shaft_mm)
 
     def lines(self, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Centrelines (M, K or K + 1, 3) mm from the shaft's end, tip directions (M, 3); world."""
+        """Centrelines (M, K or K + 1, 3) mm with the shaft, tip directions (M, 3); world frame."""
         line, direction = self.reach.shapes(commands)
         return placed(line, self.pose, self.shaft_mm), frames.rotate(self.pose, direction)
 
@@ -44,14 +44,14 @@ class MountedArm:
         """World points (M, 3) mm in the base frame."""
         return frames.apply(frames.invert(self.pose), points_mm)
 
-    def way(self, commands: np.ndarray) -> np.ndarray:
+    def approach(self, commands: np.ndarray) -> np.ndarray:
         """Commands (APPROACH_STEPS, P) in a straight line from rest to `commands` (P,)."""
         share = np.linspace(0.0, 1.0, APPROACH_STEPS)[:, None]
         return (1.0 - share) * self.reach.rest + share * commands
 
 
 def placed(lines_mm: np.ndarray, poses: np.ndarray, shaft_mm: float) -> np.ndarray:
-    """Centrelines (..., K, 3) of the base frame in the world, with the shaft's far end in front."""
+    """Centrelines (..., K, 3) mm from base to world frame, starting at the shaft's far end."""
     if shaft_mm > 0.0:
         end = np.zeros_like(lines_mm[..., :1, :])
         end[..., 2] = -shaft_mm
@@ -61,10 +61,13 @@ def placed(lines_mm: np.ndarray, poses: np.ndarray, shaft_mm: float) -> np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class RingSolution:
-    """The laser arm around the ring, M points; commands of points it cannot reach are its best."""
+    """Inverse kinematics of the laser arm for M ring points.
+
+    For a point out of reach the commands are those that come nearest.
+    """
 
     centre: np.ndarray
-    """(P,) commands with the beam on the lesion's centre, the start of every other solution."""
+    """(P,) commands with the beam on the lesion's centre; initial guess for all ring points."""
     commands: np.ndarray
     """(M, P) commands with the beam on each ring point."""
     lines_mm: np.ndarray
@@ -84,7 +87,7 @@ class RingSolution:
 
 
 def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
-    """Solve the laser arm for every ring point, all from the solution at the lesion's centre."""
+    """Solve the inverse kinematics of the laser arm for every ring point."""
     start = nearest_commands(arm.reach, arm.inward(ring.centre_mm[None]), laser.standoff_mm)
     centre = solve_aim(arm.reach, arm.inward(ring.centre_mm[None]), start).commands[0]
     count = len(ring.points_mm)
@@ -110,7 +113,7 @@ class EndoscopePose:
     """The endoscope arm turned to the lesion."""
 
     commands: np.ndarray
-    """(P,) commands with the camera's axis on the lesion's centre, or as near as it comes."""
+    """(P,) commands with the camera's axis on, or nearest to, the lesion's centre."""
     line_mm: np.ndarray
     """(K, 3) centreline, world frame, shaft included."""
     direction: np.ndarray
@@ -124,7 +127,7 @@ class EndoscopePose:
 
 
 def look_at_lesion(arm: MountedArm, ring: Ring, camera: CameraSpec) -> EndoscopePose:
-    """Bend the endoscope arm until its axis runs through the lesion's centre."""
+    """Solve the endoscope arm so that the camera's axis runs through the lesion's centre."""
     target = arm.inward(ring.centre_mm[None])
     aimed = solve_aim(arm.reach, target, nearest_commands(arm.reach, target, camera.range_mm))
     line, direction = arm.lines(aimed.commands)

@@ -33,20 +33,52 @@ from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec
 BENDS_RAD = np.radians([0.0, 25.0, 50.0])
 """How far the arm is bent when it looks at the lesion's centre (rad)."""
 ROLLS = 8
-"""Sides to which a bent arm's base may lie, seen along the beam."""
+"""Number of directions from the beam in which the base of a bent arm is placed."""
 MOST_EVALUATED = 240
-"""How many mounts of each kind are judged on the whole ring."""
+"""Number of mounts of each arm that are evaluated on the ring."""
 ROUNDS, TRIES = 3, 60
-"""How often, and at how many mounts each, the search goes on around the best when none will do."""
+"""Rounds of local search, and mounts per round, if no candidate is sufficient."""
 NEAR_RAD, NEAR_MM = np.radians(12.0), 6.0
-"""How far from the best such a mount is tried at first: about the lesion (rad), along it (mm)."""
+"""Spread of the local search in its first round: about the lesion (rad), along the beam (mm)."""
+
+
+@dataclass(frozen=True)
+class ScoreWeights:
+    """Weights in the score of a mount: covering the ring decides, the others rank what covers it.
+
+    The weights were chosen by hand.
+    """
+
+    covered: float = 100.0
+    """Fraction of the ring that the laser can cut, or that the endoscope sees without contact."""
+    clearance: float = 1.0
+    """Smallest clearance as a share of COMFORT_MM, from -1 to 1."""
+    above: float = 0.7
+    """Vertical component of the unit vector from the lesion to the base."""
+    incidence_per_rad: float = 1.0
+    """Cost of the beam's mean angle to the surface's normal."""
+    spare: float = 0.5
+    """Median distance of the commands from their limits, as a share of their range."""
+    standoff: float = 2.0
+    """Cost of the largest deviation from the middle of the allowed standoff, as a share of it."""
+    axis_error_per_rad: float = 2.0
+    """Cost of the angle between the camera's axis and the lesion's centre."""
+    distance: float = 0.3
+    """Cost of the deviation from the middle of the camera's range, as a share of it."""
+    slant_per_rad: float = 0.5
+    """Cost of the angle between the camera's axis and the lesion's normal."""
+    ports: float = 3.0
+    """Distance between the shafts of a pair as a share of PORTS_MM, at most 1."""
+
+
+WEIGHTS = ScoreWeights()
 COMFORT_MM = 10.0
-"""Clearance beyond this is worth nothing more (mm)."""
+"""Clearance beyond this does not improve the score (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LaserSite:
-    """A laser mount judged on the ring."""
+    """A laser mount, evaluated on the ring."""
 
     arm: MountedArm
     """Reach, pose and shaft."""
@@ -59,29 +91,29 @@ class LaserSite:
     good: np.ndarray
     """(M,) bool: the point can be cut."""
     least_mm: float
-    """Least clearance over the ring, the rest and the way between (mm)."""
+    """Smallest clearance over the ring, at rest and on the path between (mm)."""
     score: float
     """Higher is better."""
 
 
 @dataclass(frozen=True, eq=False)
 class EndoscopeSite:
-    """An endoscope mount judged alone."""
+    """An endoscope mount, evaluated without the laser arm."""
 
     arm: MountedArm
     """Reach, pose and shaft."""
     look: EndoscopePose
     """The arm turned to the lesion."""
     visible: np.ndarray
-    """(M,) bool: ring points in the picture and not hidden by a body."""
+    """(M,) bool: ring points inside the picture that no body hides."""
     least_mm: float
-    """Least clearance at rest, on the way and at the lesion (mm)."""
+    """Smallest clearance at rest, on the path and at the lesion (mm)."""
     score: float
     """Higher is better."""
 
 
 def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int) -> np.ndarray:
-    """(D, 3) unit vectors at each tilt from `normal`, `turns` of them around; tilt 0 once."""
+    """(D, 3) unit vectors: `turns` of them around `normal` for each tilt; for tilt 0 one."""
     frame = frames.rotation_from_z(normal)
     around = 2.0 * np.pi * np.arange(turns) / turns
     rows = []
@@ -95,7 +127,7 @@ def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int
 
 
 def working_shapes(reach: ArmReach) -> np.ndarray:
-    """Rows of the reach table bent about as much as `BENDS_RAD`, else as near to rest as can be."""
+    """Rows of the reach table whose bend is nearest to each of `BENDS_RAD`, closest to rest."""
     bend = np.arccos(np.clip(reach.tip_direction[:, 2], -1.0, 1.0))
     away = np.linalg.norm((reach.commands - reach.rest) / reach.span, axis=1)
     slack = np.radians(2.0)
@@ -107,8 +139,10 @@ def working_shapes(reach: ArmReach) -> np.ndarray:
     return np.unique(rows)
 
 
-def mount_poses(reach: ArmReach, centre_mm, outward: np.ndarray, distances_mm) -> np.ndarray:
-    """(C, 4, 4) bases from which a working shape looks at `centre_mm` along -outward (D, 3)."""
+def mount_poses(
+    reach: ArmReach, centre_mm: np.ndarray, outward: np.ndarray, distances_mm: np.ndarray
+) -> np.ndarray:
+    """(C, 4, 4) base poses at which a working shape points at `centre_mm` along -outward (D, 3)."""
     poses = []
     for row in working_shapes(reach):
         tip = frames.pose_from_z(reach.centreline_mm[row, -1], reach.tip_direction[row])
@@ -130,7 +164,7 @@ def laser_sites(
     shaft_mm: float,
     report: Progress,
 ) -> list[LaserSite]:
-    """Laser mounts, best first; also those that cover only part of the ring."""
+    """Laser mounts, best first, including those that cover only part of the ring."""
     low, high = laser.standoff_mm
     tilts = np.radians([0.0, 15.0, 30.0, 45.0])
     distances = low + (high - low) * np.array([0.4, 0.6, 0.8])
@@ -138,27 +172,27 @@ def laser_sites(
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
     poses = _standing(engine, "laser", reach, poses, shaft_mm, limits, ring)
 
-    def judge(pose: np.ndarray) -> LaserSite:
+    def evaluate(pose: np.ndarray) -> LaserSite:
         return _evaluate_laser(engine, MountedArm(reach, pose, shaft_mm), ring, laser, limits)
 
-    return _best_first(judge, poses, ring, lambda site: site.good.all(), report, "laser mounts")
+    return _best_first(evaluate, poses, ring, lambda site: site.good.all(), report, "laser mounts")
 
 
-def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -> list:
-    """Judge every pose; while none is enough, try around the best ones. Best first.
+def _best_first(evaluate, poses, ring: Ring, sufficient, report: Progress, note: str) -> list:
+    """Evaluate every pose, best first; while none is sufficient, search around the best ones.
 
-    The tries around a pose turn it about the lesion and move it along the line of sight, at random
-    but the same each time.
+    The local search rotates a pose about the lesion and moves it along the line of sight, at random
+    with a fixed seed.
     """
     rng = np.random.default_rng(0)
     total = len(poses) + ROUNDS * TRIES
     sites = []
     for i, pose in enumerate(poses):
-        sites.append(judge(pose))
+        sites.append(evaluate(pose))
         report(i + 1, total, note)
     for number in range(ROUNDS):
         sites.sort(key=lambda site: -site.score)
-        if enough(sites[0]):
+        if sufficient(sites[0]):
             break
         spread = NEAR_RAD / (number + 1)
         for i in range(TRIES):
@@ -169,15 +203,15 @@ def _best_first(judge, poses, ring: Ring, enough, report: Progress, note: str) -
             pose[:3, :3] = turn @ pose[:3, :3]
             pose[:3, 3] = ring.centre_mm + turn @ (pose[:3, 3] - ring.centre_mm)
             pose[:3, 3] += NEAR_MM / (number + 1) * rng.normal() * away
-            sites.append(judge(pose))
+            sites.append(evaluate(pose))
             report(len(poses) + number * TRIES + i + 1, total, note)
     return sorted(sites, key=lambda site: -site.score)
 
 
 def _standing(engine, tool, reach, poses, shaft_mm, limits, ring) -> np.ndarray:
-    """Poses whose arm is clear at rest, those nearest to the middle first, at most MOST_EVALUATED.
+    """Poses whose arm has clearance at rest, those from above first; at most MOST_EVALUATED.
 
-    When none is clear the ones that come nearest to it are kept, to tell how close they come.
+    If none has, the poses with the largest clearance are kept, so that the error can report it.
     """
     rest, _ = reach.shapes(reach.rest[None])
     lines = placed(np.tile(rest, (len(poses), 1, 1)), poses, shaft_mm)
@@ -193,10 +227,10 @@ def _standing(engine, tool, reach, poses, shaft_mm, limits, ring) -> np.ndarray:
 
 def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limits: LimitsSpec):
     cut = solve_ring(arm, ring, laser)
-    way, _ = arm.lines(arm.way(cut.centre))
+    way, _ = arm.lines(arm.approach(cut.centre))
     lines = torch.from_numpy(np.concatenate((cut.lines_mm, way)))
-    answer = engine.clearance({"laser": lines})
-    clearance = torch.minimum(answer.bodies_mm.amin((1, 2)), answer.self_mm.amin(1)).numpy()
+    found = engine.clearance({"laser": lines})
+    clearance = torch.minimum(found.bodies_mm.amin((1, 2)), found.self_mm.amin(1)).numpy()
     count = len(ring.points_mm)
     hit = engine.cast(
         torch.from_numpy(cut.lines_mm[:, -1]),
@@ -214,12 +248,12 @@ def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limit
     spare = np.min(np.abs(cut.commands[:, None] - arm.reach.bounds) / arm.reach.span, axis=(1, 2))
     base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
     score = (
-        100.0 * good.mean()
-        + min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
-        - cut.incidence_rad.mean()
-        + 0.7 * base[2]
-        + 0.5 * np.median(spare)
-        - 2.0
+        WEIGHTS.covered * good.mean()
+        + WEIGHTS.clearance * min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
+        - WEIGHTS.incidence_per_rad * cut.incidence_rad.mean()
+        + WEIGHTS.above * base[2]
+        + WEIGHTS.spare * np.median(spare)
+        - WEIGHTS.standoff
         * np.abs(cut.standoff_mm - 0.5 * sum(laser.standoff_mm)).max()
         / (laser.standoff_mm[1] - laser.standoff_mm[0])
     )
@@ -244,47 +278,49 @@ def endoscope_sites(
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
     poses = _standing(engine, "endoscope", reach, poses, shaft_mm, limits, ring)
 
-    def judge(pose: np.ndarray) -> EndoscopeSite:
+    def evaluate(pose: np.ndarray) -> EndoscopeSite:
         return _evaluate_endoscope(engine, MountedArm(reach, pose, shaft_mm), ring, camera, limits)
 
-    def enough(site: EndoscopeSite) -> bool:
+    def sufficient(site: EndoscopeSite) -> bool:
         return sees(site, limits)
 
-    return _best_first(judge, poses, ring, enough, report, "endoscope mounts")
+    return _best_first(evaluate, poses, ring, sufficient, report, "endoscope mounts")
 
 
 def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
-    """Whether the endoscope sees enough of the ring without touching anything."""
-    return bool(site.visible.mean() >= limits.view_fraction and site.score > 50.0)
+    """Whether the endoscope sees enough of the ring and keeps its clearance."""
+    # without clearance the coverage does not count, and the score stays far below
+    clear = site.score > 0.5 * WEIGHTS.covered
+    return bool(site.visible.mean() >= limits.view_fraction and clear)
 
 
 def _evaluate_endoscope(
     engine, arm: MountedArm, ring: Ring, camera: CameraSpec, limits: LimitsSpec
 ):
     look = look_at_lesion(arm, ring, camera)
-    way, _ = arm.lines(arm.way(look.commands))
-    answer = engine.clearance({"endoscope": torch.from_numpy(way)})
-    least = float(min(answer.bodies_mm.min(), answer.self_mm.min()))
+    way, _ = arm.lines(arm.approach(look.commands))
+    found = engine.clearance({"endoscope": torch.from_numpy(way)})
+    least = float(min(found.bodies_mm.min(), found.self_mm.min()))
     needed = max(limits.clearance_mm, 0.5 * np.linalg.norm(np.diff(way, axis=0), axis=-1).max())
     pose = torch.from_numpy(look.pose[None])
     visible = view(engine, camera.camera(), pose, ring.points_mm, ring.normals).visible[0].numpy()
     base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
     middle = 0.5 * (camera.range_mm[0] + camera.range_mm[1])
     score = (
-        100.0 * visible.mean() * (least >= needed)
-        + min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
-        - 2.0 * look.axis_error_rad
-        - 0.3 * abs(look.distance_mm - middle) / middle
-        + 0.7 * base[2]
-        - 0.5 * frames.angle_between(-look.direction, ring.normal)
+        WEIGHTS.covered * visible.mean() * (least >= needed)
+        + WEIGHTS.clearance * min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
+        - WEIGHTS.axis_error_per_rad * look.axis_error_rad
+        - WEIGHTS.distance * abs(look.distance_mm - middle) / middle
+        + WEIGHTS.above * base[2]
+        - WEIGHTS.slant_per_rad * frames.angle_between(-look.direction, ring.normal)
     )
     return EndoscopeSite(arm, look, visible, least, float(score))
 
 
 LASERS, LOOKS = 12, 40
-"""How many of the best mounts of each kind are tried together."""
+"""Number of the best laser and endoscope mounts that are paired."""
 PORTS_MM = 100.0
-"""Shafts farther apart than two ports in an abdominal wall gain nothing more (mm)."""
+"""Distance of two ports in an abdominal wall; a larger one does not improve the score (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +328,7 @@ class Shortfall:
     """Why no pair of mounts was found, and how close the best came."""
 
     sentence: str
-    """For the user."""
+    """The reason, as printed for the user."""
     covered: float
     """Fraction of the ring that the best laser mount can cut."""
     viewed: float
@@ -308,7 +344,7 @@ class Pair:
     look: EndoscopeSite
     """The endoscope's."""
     view: float
-    """Least fraction of the ring in view while the laser goes round."""
+    """Smallest fraction of the ring in view while the laser goes round."""
     score: float
     """Higher is better."""
 
@@ -330,9 +366,9 @@ def find_mounts(
     shafts_mm: dict[str, float],
     report: Progress = silent,
 ) -> tuple[list[Pair], Shortfall | None]:
-    """Pairs of mounts, best first; or none and what was lacking.
+    """Pairs of mounts, best first; or no pair, and the reason.
 
-    The ring may be coarse here; `check` confirms the chosen pair on the whole of it.
+    The ring may be coarse here; `check` confirms the chosen pair on all its points.
     """
     lasers = laser_sites(engine, reaches["laser"], ring, laser, limits, shafts_mm["laser"], report)
     looks = endoscope_sites(
@@ -369,23 +405,24 @@ def _spread(sites: list, count: int) -> list:
 
 
 def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
-    """Pairs that leave each other room and the ring in view, best first."""
+    """Pairs whose arms keep their clearance and the ring in view, best first."""
     pairs = []
     for laser in lasers:
         work = np.concatenate(
-            (laser.arm.lines(laser.arm.way(laser.cut.centre))[0], laser.cut.lines_mm)
+            (laser.arm.lines(laser.arm.approach(laser.cut.centre))[0], laser.cut.lines_mm)
         )
         for look in looks:
             radii = laser.arm.reach.radius_mm + look.arm.reach.radius_mm
-            way = look.arm.lines(look.arm.way(look.look.commands))[0]
+            way = look.arm.lines(look.arm.approach(look.look.commands))[0]
             turned = arms_apart_mm(work, np.tile(look.look.line_mm, (len(work), 1, 1)), radii)
             resting = arms_apart_mm(np.tile(work[:1], (len(way), 1, 1)), way, radii)
             apart = float(min(turned.min(), resting.min()))
             steps = [np.linalg.norm(np.diff(a, axis=0), axis=-1).max() for a in (work, way)]
             if apart < max(limits.clearance_mm, 0.5 * max(steps)):
                 continue
-            score = laser.score + look.score + min(apart, COMFORT_MM) / COMFORT_MM
-            score += 3.0 * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
+            score = laser.score + look.score
+            score += WEIGHTS.clearance * min(apart, COMFORT_MM) / COMFORT_MM
+            score += WEIGHTS.ports * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
             pairs.append(Pair(laser, look, float(look.visible.mean()), score))
     pairs.sort(key=lambda pair: -pair.score)
     seen_pairs = []
@@ -399,7 +436,7 @@ def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
 
 
 def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
-    """Distance of the two shafts where they are nearest: at their bases or at their far ends."""
+    """Smaller of the distances between the bases and between the shafts' far ends (mm)."""
     ends = [
         np.array([arm.pose[:3, 3] - s * arm.pose[:3, 2] for s in (0.0, arm.shaft_mm)])
         for arm in (first, second)
@@ -408,9 +445,13 @@ def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
 
 
 def least_view(
-    engine, look: EndoscopePose, laser_lines_mm, ring: Ring, camera: CameraSpec
+    engine: BatchedScene,
+    look: EndoscopePose,
+    laser_lines_mm: np.ndarray,
+    ring: Ring,
+    camera: CameraSpec,
 ) -> float:
-    """Least fraction of the ring in view while the laser arm stands at each of its lines."""
+    """Smallest fraction of the ring in view with the laser arm at each of its centrelines."""
     poses = torch.from_numpy(np.tile(look.pose, (len(laser_lines_mm), 1, 1)))
     arms = {"laser": torch.from_numpy(laser_lines_mm)}
     views = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, arms)
@@ -424,12 +465,14 @@ def _laser_shortfall(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> s
         f"hit at more than {laser.max_incidence_deg:g} degrees": cut.in_reach & cut.steep,
         "hidden from the beam": cut.in_reach & ~best.landed,
     }
-    said = [f"{100 * bad.mean():.0f} % {why}" for why, bad in reasons.items() if bad.any()]
+    shown = [f"{100 * bad.mean():.0f} % {why}" for why, bad in reasons.items() if bad.any()]
     if best.least_mm < limits.clearance_mm:
-        said.append(f"least clearance {best.least_mm:.1f} mm of {limits.clearance_mm:g} mm")
+        shown.append(
+            f"smallest clearance {best.least_mm:.1f} mm, {limits.clearance_mm:g} mm required"
+        )
     return (
         f"no mount lets the laser cut the whole ring: the best covers "
-        f"{100 * best.good.mean():.0f} % ({', '.join(said) or 'the arm would have to jump'})"
+        f"{100 * best.good.mean():.0f} % ({', '.join(shown) or 'the arm would have to jump'})"
     )
 
 

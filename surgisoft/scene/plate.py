@@ -15,7 +15,7 @@ AROUND = 720
 
 @dataclass(frozen=True)
 class SlottedPlate:
-    """A round plate, level, with equal slots that run outwards from its middle."""
+    """A round horizontal plate with equal slots that run outwards from its middle."""
 
     slots: int = 3
     """Number of slots, evenly about the middle, the first along x."""

@@ -1,8 +1,8 @@
-"""Rays against the scene: what a beam or a line of sight meets first.
+"""Rays through the scene: what a laser beam or a line of sight meets first.
 
-`RayHit` is the answer of both engines: the checker in `collision`, the batched one in `batched`.
-Here are the parts of the latter that run on the CPU: Embree names the face, float64 arithmetic
-says where on it, and a compiled closed form meets the arms.
+Both engines return a `RayHit`: the exact one in `collision`, the batched one in `batched`. The rest
+of this module is the batched engine's part on the CPU: Embree finds the face, float64 arithmetic
+the point on it, and compiled closed forms the hits on arms.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ STRUCK_BY_ROLE = {
 
 
 def struck_of(body: Body) -> Struck:
-    """What a ray reports that meets this body."""
+    """The `Struck` value of a ray that hits this body."""
     return STRUCK_BY_ROLE[body.role]
 
 
@@ -66,23 +66,23 @@ class RayHit:
     """(...) rad in 0..pi/2 between the ray and the surface's normal; 0 for a miss."""
 
     @property
-    def on_organ(self):
-        """(...) bool: the ray lands on the organ with nothing before it."""
+    def on_organ(self) -> Any:
+        """(...) bool: the ray hits the organ first."""
         return self.struck == int(Struck.ORGAN)
 
     @property
-    def missed(self):
+    def missed(self) -> Any:
         """(...) bool: nothing within the range."""
         return self.struck == int(Struck.NOTHING)
 
     @property
-    def blocked(self):
-        """(...) bool: something that is not the organ stands first on the ray."""
+    def blocked(self) -> Any:
+        """(...) bool: the ray hits something other than the organ first."""
         return self.struck > int(Struck.ORGAN)
 
 
 class EmbreeSurface:
-    """First hits of many rays on one mesh, in the mesh's own frame."""
+    """First hits of many rays on one mesh by Embree, in the mesh's own frame."""
 
     def __init__(self, mesh: Mesh):
         self._triangles = mesh.triangles_mm
@@ -95,12 +95,14 @@ class EmbreeSurface:
         """Pickle the mesh: Embree's scene cannot be pickled, so a copy builds its own."""
         return type(self), (self._mesh,)
 
-    def first_hit(self, origins_mm, directions, range_mm) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (N,) mm and faces (N,) of unit rays (N, 3) float64; the range and -1 to miss.
+    def first_hit(
+        self, origins_mm: np.ndarray, directions: np.ndarray, range_mm: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (N,) mm and faces (N,) of unit rays (N, 3) float64; range and -1 for a miss.
 
-        Embree works in float32; the distance is taken again in float64 in the plane of the face it
-        names. Rays that are not finite miss. A ray aimed at a mesh vertex to the last bit may slip
-        through it (4 in 1,000 such rays; none of 40,000 random ones); the checker does not.
+        Embree works in float32, so the distance is computed again in float64 in the plane of the
+        face. Rays that are not finite miss. A ray aimed exactly at a mesh vertex may pass through
+        it (4 in 1,000 such rays; none of 40,000 random ones); FCL does not have this flaw.
         """
         finite = np.isfinite(origins_mm).all(axis=1) & np.isfinite(directions).all(axis=1)
         origins = np.where(finite[:, None], origins_mm - self._middle, 1e6)
@@ -121,9 +123,9 @@ class EmbreeSurface:
 
 @compiled
 def _plane_hits(origins, directions, triangles, rays, faces, coarse):
-    """Distances (M,) along the rays named to the planes of their faces, mm.
+    """Distances (M,) mm along rays number `rays` to the planes of their faces.
 
-    A face seen edge on keeps Embree's own distance.
+    For a face seen edge-on the result is Embree's own distance.
     """
     out = np.empty(len(rays))
     for m in range(len(rays)):
@@ -183,8 +185,8 @@ def _capsule_entry(origin, d, a, b, radius):
 def rays_to_chains(origins, directions, lines, radius, gap, distance, segment):
     """First hits of rays (B, R, 3) on arms (B, K, 3), mm, into distance, segment (B, R).
 
-    Only hits nearer than what `distance` holds count; segments with less than `gap` mm of arm
-    between them and the tip are left out (a negative gap keeps all).
+    Only hits nearer than the given `distance` count. Segments within `gap` mm of arc from the tip
+    are ignored (a negative gap ignores none).
     """
     segments = lines.shape[1] - 1
     halves = np.empty(segments)

@@ -1,6 +1,6 @@
-"""What an arm can reach, as a table of sampled shapes, and how it aims at points.
+"""The shapes that an arm can take, as a sampled table, and inverse kinematics on that table.
 
-Geometry only: the table comes from any arm model, sampled over a grid of its commands.
+This module is geometry only. The table is sampled from any arm model over a grid of its commands.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 
 ROUNDS = 12
-"""Newton steps when aiming; a smooth arm needs three or four."""
+"""Most Gauss-Newton steps of the inverse kinematics; a smooth arm needs three or four."""
 AIMED_MM = 0.02
-"""The beam counts as on its target when it passes this near (mm)."""
+"""The tool's axis counts as on its target if it passes this near (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +23,11 @@ class ArmReach:
     """Shapes of one arm over a regular grid of commands, base frame (z along the arm at rest)."""
 
     axes: tuple[np.ndarray, ...]
-    """P rising arrays: the commands along each axis of the grid, any unit."""
+    """P ascending arrays: the commands along each axis of the grid, any unit."""
     centreline_mm: np.ndarray
     """(N, K, 3) mm, base to tip; N = product of the axes' lengths, last axis running fastest."""
     tip_direction: np.ndarray
-    """(N, 3) unit vectors in which the tool looks."""
+    """(N, 3) unit vectors along the tool's axis."""
     rest: np.ndarray
     """(P,) commands at rest."""
     radius_mm: float
@@ -82,7 +82,7 @@ class ArmReach:
         return np.concatenate((flat, self.tip_direction), axis=1)
 
     def _blend(self, table: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Multilinear interpolation of table rows at commands (M, P), held within the grid."""
+        """Multilinear interpolation of table rows at commands (M, P), clipped to the grid."""
         low, part = [], []
         for axis, value in zip(self.axes, commands.T, strict=True):
             cell = np.clip(np.searchsorted(axis, value, side="right") - 1, 0, len(axis) - 2)
@@ -109,7 +109,7 @@ class ArmReach:
 
 @dataclass(frozen=True, eq=False)
 class AimSolution:
-    """Commands that bring the tool's axis onto points."""
+    """Result of the inverse kinematics: commands that point the tool's axis at targets."""
 
     commands: np.ndarray
     """(M, P) commands within the arm's range."""
@@ -120,7 +120,7 @@ class AimSolution:
 
     @property
     def on_target(self) -> np.ndarray:
-        """(M,) bool."""
+        """(M,) bool: the axis passes through the target, which lies ahead of the tip."""
         return (self.miss_mm <= AIMED_MM) & (self.ahead_mm > 0.0)
 
 
@@ -133,10 +133,12 @@ def _miss(reach: ArmReach, commands: np.ndarray, targets_mm: np.ndarray):
 
 
 def solve_aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> AimSolution:
-    """Bend the arm until its axis runs through targets (M, 3) mm, base frame.
+    """Inverse kinematics: commands at which the tool's axis runs through targets (M, 3) mm.
+
+    Targets are in the base frame.
 
     Damped Gauss-Newton from commands `start` (M, P), smallest change of commands first (Nocedal &
-    Wright, 2006, section 10.3), held within the arm's range. M arms are solved at once.
+    Wright, 2006, section 10.3), clipped to the arm's range. M arms are solved at once.
     """
     commands = np.clip(start, *reach.bounds)
     count = commands.shape[1]
@@ -171,12 +173,14 @@ def solve_aim(reach: ArmReach, targets_mm: np.ndarray, start: np.ndarray) -> Aim
 
 
 def _smallest_change(jacobian: np.ndarray, miss: np.ndarray) -> np.ndarray:
-    """(M, P) least change that undoes misses (M, 3), by damped normal equations."""
+    """(M, P) smallest change that removes misses (M, 3), by damped normal equations."""
     gram = jacobian @ np.swapaxes(jacobian, 1, 2) + 1e-3 * np.eye(3)
     return -(np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(gram, miss[:, :, None]))[:, :, 0]
 
 
-def nearest_commands(reach: ArmReach, targets_mm: np.ndarray, range_mm) -> np.ndarray:
+def nearest_commands(
+    reach: ArmReach, targets_mm: np.ndarray, range_mm: tuple[float, float]
+) -> np.ndarray:
     """Commands (M, P) of the sampled shapes whose axes pass nearest to targets (M, 3), base frame.
 
     Among those within 2 mm more of the nearest, the one closest to rest; the target must lie

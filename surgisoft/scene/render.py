@@ -1,7 +1,7 @@
-"""The endoscope's picture by ray casting: shaded bodies, arms, the beam and what it has burnt.
+"""The endoscope's picture by ray casting: shaded bodies, arms, the beam and the burnt tissue.
 
-One ray a pixel: Embree meets the bodies, closed forms meet the arms; then everything is lit by a
-lamp beside the lens. The picture is round, as wide as the field of view; its corners are black.
+Each pixel is one ray: Embree finds the hits on bodies, closed forms those on arms. A lamp beside
+the lens lights the scene. The picture is round, as wide as the field of view, with black corners.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BEAM_COLOUR = (0.15, 1.0, 0.35)
 BEAM_RADIUS_MM = 0.4
 """Half-width of the beam's glow in the picture (mm)."""
 BACKGROUND = (0.020, 0.008, 0.007)
-"""Linear colour where no ray meets anything: the dark of the body's cavity."""
+"""Linear colour where a ray meets nothing: the dark of the body's cavity."""
 SHARP_COSINE = 0.8
 """Corners whose vertex normal is farther from the face's than this stay sharp (37 degrees)."""
 LAMP_HALF_MM = 70.0
@@ -39,7 +39,7 @@ LAMP_HALF_MM = 70.0
 
 
 class Renderer:
-    """Pictures of a fixed set of bodies; built once, a picture a call."""
+    """Renders pictures of a fixed set of bodies; built once, one picture per call."""
 
     def __init__(self, bodies: Sequence[Body], camera: Camera, width: int = 160, height: int = 120):
         meshes = [body.world_mesh for body in bodies]
@@ -125,7 +125,7 @@ class Renderer:
         colour[drawn] = ARM_COLOUR
 
     def _developed(self, rays, distance, normal, colour, beam) -> np.ndarray:
-        """Light, gloss and the film's response: linear colours to (H, W, 3) uint8."""
+        """Apply light, gloss and gamma: linear colours to (H, W, 3) uint8."""
         facing = np.abs(frames.dot(normal, rays))
         lamp = 1.0 / (1.0 + (distance / LAMP_HALF_MM) ** 2)
         gloss = 0.35 * facing**40
@@ -151,7 +151,7 @@ def pixel_rays(camera: Camera, width: int, height: int) -> tuple[np.ndarray, np.
 
 
 def corner_normals(mesh: Mesh) -> np.ndarray:
-    """(F, 3, 3) unit normals to shade by: the vertex's own, the face's where the edge is sharp."""
+    """(F, 3, 3) unit normals for shading: the vertex's, or the face's at a sharp edge."""
     smooth = mesh.vertex_normals[mesh.faces]
     flat = np.broadcast_to(mesh.face_normals[:, None], smooth.shape)
     return np.where(frames.dot(smooth, flat)[..., None] > SHARP_COSINE, smooth, flat)

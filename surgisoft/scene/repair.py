@@ -1,7 +1,7 @@
-"""Repair triangle soups into closed, outward-wound bodies, and say what was done.
+"""Repair triangle soups into closed bodies with outward normals, and count the repairs.
 
-The order matters: vertices are joined first, then faces are cleaned, wound alike, holes closed,
-bodies turned outwards, and what lies inside another body is taken out.
+The order matters: vertices are joined first, then faces are cleaned and wound consistently, holes
+are closed, bodies are turned outwards, and bodies inside other bodies are removed.
 """
 
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Mesh, equal_rows, used_indices
 
 JOIN = (1e-7, 1e-6, 1e-5, 1e-4, 5e-4)
-"""Distances at which vertices are joined, tried in turn until the surface closes (of its size)."""
+"""Distances, relative to the size, at which vertices are joined; tried until the surface closes."""
 SPECK = 0.01
-"""A closed piece smaller than this fraction of the whole size is dirt, not a body."""
+"""A closed piece smaller than this fraction of the whole size is a speck and is removed."""
 OPEN_SPECK = 0.1
-"""The same for a piece that is open, and so no body anyhow."""
+"""An open piece smaller than this fraction of the whole size is a speck and is removed."""
 HOLE = 0.3
-"""A hole wider than this fraction of its body is no longer guessed shut."""
+"""A hole wider than this fraction of its body is an error and is not closed."""
 MOST_BODIES = 16
-"""More separate bodies than this in one part are not a scene but a broken file."""
+"""Largest number of separate bodies in one part; more mean a broken file."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +33,21 @@ class Repair:
     """One kind of repair."""
 
     done: str
-    """What was done, for the user."""
+    """What was done, as printed for the user."""
     count: int
     """How often."""
 
 
 @dataclass(frozen=True, eq=False)
 class Repaired:
-    """Closed bodies, largest first, and what it took."""
+    """Closed bodies, largest first, and the repairs that were needed."""
 
     bodies: tuple[Mesh, ...]
     """Closed meshes, wound outwards."""
     holes_mm: tuple[np.ndarray, ...]
     """For each body (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
     repairs: tuple[Repair, ...]
-    """What was done; empty when nothing had to be."""
+    """Kinds of repairs with their counts; empty if none was needed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,26 +61,29 @@ class _Shell:
 
 
 def repair(
-    vertices: np.ndarray, faces: np.ndarray, what: str, tell: Callable[[str], None] = lambda _: None
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    what: str,
+    on_step: Callable[[str], None] = lambda _: None,
 ) -> Repaired:
     """Closed bodies from vertices (V, 3) mm and faces (F, 3); `what` names them in errors.
 
-    `tell` is called with what is being done, as this takes seconds for a million faces.
+    `on_step` is called with the name of each step, because a million faces take seconds.
     """
     used, _ = used_indices(faces)
     size = float(np.ptp(vertices[used], axis=0).max())
     if size == 0.0:
         raise InputError(f"{what}: all vertices are one point; expected a surface")
     log: dict[str, int] = {}
-    tell("joining corners")
+    on_step("joining corners")
     vertices, faces = _join(vertices, faces, size, log)
     vertices, faces = _unbranch(vertices, faces)
     vertices, faces = _drop_specks(vertices, faces, size, log)
     if len(faces) < 4:
         raise InputError(f"{what}: {len(faces)} faces enclose nothing; expected a closed body")
-    tell("winding faces alike")
+    on_step("winding faces alike")
     faces = _wind_alike(faces, what, log)
-    tell("closing holes")
+    on_step("closing holes")
     vertices, faces, hole_mm = _close_holes(vertices, faces, what, log)
     shells = _outward(vertices, faces, hole_mm, log)
     if not all(shell.mesh.is_watertight for shell in shells):
@@ -111,7 +114,7 @@ def _is_flat(mesh: Mesh, size: float) -> bool:
 
 
 def _join(vertices, faces, size, log):
-    """Join vertices as little as it takes to close the surface: none, equal ones, near ones."""
+    """Join vertices no more than needed to close the surface: none, equal ones, near ones."""
     used, faces = used_indices(faces)
     vertices = vertices[used]
     first, same, _ = equal_rows(vertices)
@@ -187,7 +190,7 @@ def _open_edges(faces) -> int:
 
 
 def _pairs(faces, vertices=None):
-    """Half-edges (P, 2) that meet, numbered 3 * face + corner, and whether both run alike (P,).
+    """Half-edges (P, 2) that meet, numbered 3 * face + corner; (P,) whether they have one sense.
 
     Edges with two faces; with `vertices`, also those with more, resolved by `_around_edge`.
     """
@@ -208,7 +211,7 @@ def _pairs(faces, vertices=None):
 
 
 def _around_edge(vertices, faces, half_edges, forward):
-    """Pairs (P, 2) of an edge's half-edges with solid between them, as the faces' winding says.
+    """Pairs (P, 2) of an edge's half-edges with solid between them, by the faces' winding.
 
     Seen along the edge, a face that runs it forwards has its solid at smaller angles, one that
     runs it backwards at greater ones; in order of angle the two must alternate (Gueziec et al.,
@@ -244,7 +247,7 @@ def _linked(pairs, count):
 
 
 def _unbranch(vertices, faces):
-    """Where surfaces share an edge or only a vertex, give each its own vertices."""
+    """Give each surface its own vertices where surfaces share an edge or only a vertex."""
     pairs, alike = _pairs(faces, vertices)
     face, corner = np.divmod(pairs, 3)
     after = 3 * face + (corner + 1) % 3
@@ -260,7 +263,7 @@ def _unbranch(vertices, faces):
 
 
 def _drop_specks(vertices, faces, size, log):
-    """Leave out loose pieces too small for a body; open ones count as such up to a larger size."""
+    """Remove loose pieces that are too small for a body; see `SPECK` and `OPEN_SPECK`."""
     if not len(faces):
         return vertices, faces
     label = _components(faces)
@@ -278,10 +281,10 @@ def _drop_specks(vertices, faces, size, log):
 
 
 def _wind_alike(faces, what, log):
-    """Turn faces so that neighbours run their common edge in opposite directions.
+    """Reverse faces so that neighbours traverse their common edge in opposite directions.
 
-    Each face appears twice in a graph, as it is and turned; neighbours that fit are joined. The
-    two copies of a surface come out apart, unless it has only one side.
+    Each face appears twice in a graph, as it is and reversed; neighbours that fit are joined. The
+    two copies of a surface are separate components unless it has only one side.
     """
     count = len(faces)
     pairs, alike = _pairs(faces)
@@ -303,7 +306,7 @@ def _wind_alike(faces, what, log):
 
 
 def _boundary_loops(faces):
-    """Closed loops of boundary edges as vertex lists, run against the faces."""
+    """Closed loops of boundary edges as vertex lists, opposite to the faces' winding."""
     directed = np.stack((faces, np.roll(faces, -1, axis=1)), axis=-1).reshape(-1, 2)
     key = np.sort(directed, axis=1) @ [faces.max() + 1, 1]
     _, first, count = np.unique(key, return_index=True, return_counts=True)
@@ -350,7 +353,7 @@ def _close_holes(vertices, faces, what, log):
         if width > HOLE * size:
             raise InputError(
                 f"{what}: a hole {width:.3g} mm wide in a surface of {size:.3g} mm is too large "
-                f"to guess shut (up to {100 * HOLE:.0f} %); expected a closed body"
+                f"to close (up to {100 * HOLE:.0f} %); expected a closed body"
             )
         if len(loop) == 3:
             new_faces.append(np.array([loop]))

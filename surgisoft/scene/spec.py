@@ -1,7 +1,7 @@
 """The scene file `scene.toml` as frozen dataclasses: bodies, lesion, mounts, laser, camera.
 
-Lengths are in mm, times in s. Angles are in degrees in the file (the field's name says so) and in
-radians everywhere else. World frame: z up. An arm's base frame: z along the arm at rest.
+Lengths are in mm, times in s. Angles are in degrees in the file, where the field's name ends in
+`_deg`, else in radians. World frame: z up. An arm's base frame: z along the arm at rest.
 """
 
 import re
@@ -20,15 +20,15 @@ from surgisoft.scene.mesh import ROLES
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 SCENES = (_PACKAGE if (_PACKAGE / "scenes").is_dir() else _PACKAGE.parent) / "scenes"
-"""Their folder: in the installed package, or beside it in a checkout."""
+"""Folder of the packaged scenes: in the installed package, or beside it in a checkout."""
 PHANTOM = SCENES / "phantom_liver"
-"""The liver phantom."""
+"""Folder of the liver phantom."""
 
 
 def packaged_scene(path: str | Path) -> Path:
-    """The folder of a packaged scene for its name, where nothing of that name exists here.
+    """The folder of the packaged scene of that name; any other path unchanged.
 
-    Any other path is returned as it is.
+    A file or folder of that name in the working directory has precedence.
     """
     path = Path(path)
     named = len(path.parts) == 1 and not path.exists()
@@ -86,7 +86,7 @@ MeshPath = Annotated[
 
 @dataclass(frozen=True)
 class BodySpec:
-    """One closed mesh that stands still in the scene."""
+    """One closed mesh that does not move."""
 
     name: Name
     """Name of the body, unique in the scene."""
@@ -107,7 +107,7 @@ class BodySpec:
 
 @dataclass(frozen=True)
 class LesionSpec:
-    """What is to be cut around."""
+    """The lesion: the laser cuts along a ring around it."""
 
     body: Name
     """The organ that carries the lesion."""
@@ -121,14 +121,14 @@ class LesionSpec:
 
 @dataclass(frozen=True)
 class MountSpec:
-    """Where one arm is fixed, and what it carries."""
+    """The mount of one arm, and the tool that the arm carries."""
 
     tool: Annotated[str, _one_of(TOOLS)]
     """`laser` or `endoscope`; a scene has one of each."""
     position_mm: Point
     """Centre of the arm's base, world frame (mm)."""
     direction: Direction
-    """Where the arm points at rest, world frame; any length."""
+    """Direction of the arm at rest, world frame; any length."""
     roll_deg: Angle = 0.0
     """Turn of the arm about its own axis (degrees)."""
     arm: Annotated[str, Rule("an arm model's name or folder", bool)] = "default"
@@ -163,9 +163,9 @@ class LaserSpec:
     ] = 9.0
     """Absorption by the tissue, 1/mm; liver: 0.745 of water's 12.4 at 1940 nm, Segelstein 1981."""
     standoff_mm: Range = (20.0, 60.0)
-    """Least and greatest distance from the tip to the tissue (mm)."""
+    """Smallest and largest distance from the tip to the tissue (mm)."""
     max_incidence_deg: Annotated[float, _between(0.0, 89.0, "degrees")] = 60.0
-    """Greatest angle between the beam and the surface's normal (degrees)."""
+    """Largest angle between the beam and the surface's normal (degrees)."""
 
 
 @dataclass(frozen=True)
@@ -175,23 +175,23 @@ class CameraSpec:
     fov_deg: Annotated[float, _between(1.0, 179.0, "degrees")] = 70.0
     """Full cone angle of the round field of view (degrees)."""
     range_mm: Range = (10.0, 100.0)
-    """Least and greatest distance at which the picture is sharp (mm)."""
+    """Smallest and largest distance at which the picture is sharp (mm)."""
 
     def camera(self) -> Camera:
-        """The camera that looks, in radians."""
+        """The camera with its angle in radians."""
         return Camera(float(np.radians(self.fov_deg)), self.range_mm)
 
 
 @dataclass(frozen=True)
 class LimitsSpec:
-    """What every task on this scene has to keep."""
+    """Limits that hold for every task in this scene."""
 
     clearance_mm: Distance = 1.0
-    """Least distance between an arm's skin and any body or the other arm (mm)."""
+    """Smallest distance between an arm's skin and any body or the other arm (mm)."""
     time_s: Annotated[float, Rule("a time above 0 s", lambda t: 0.0 < t <= 1e6)] = 60.0
     """Time for the whole ring (s)."""
     view_fraction: Annotated[float, _between(0.0, 1.0, "")] = 0.95
-    """Least fraction of the ring that the endoscope must see."""
+    """Smallest fraction of the ring that the endoscope must see."""
 
 
 @dataclass(frozen=True)
@@ -233,9 +233,9 @@ def spec_path(path: str | Path) -> Path:
 
 
 def load_spec(path: str | Path) -> SceneSpec:
-    """Read `scene.toml`, a folder that holds one, or a packaged scene by its name.
+    """Read a `scene.toml`, given as the file, its folder, or the name of a packaged scene.
 
-    Every bad field is an error of one line.
+    A bad field is an InputError with file, line and field.
     """
     path = packaged_scene(path)
     if not path.exists():
@@ -257,7 +257,7 @@ def save_spec(spec: SceneSpec, path: str | Path) -> None:
 
 
 def _check_whole(spec: SceneSpec, where: Where) -> None:
-    """What only several fields together can break."""
+    """Check the conditions that involve several fields."""
     seen: set[str] = set()
     for i, body in enumerate(spec.bodies):
         if body.name in seen:

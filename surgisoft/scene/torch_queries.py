@@ -16,18 +16,19 @@ import torch
 
 from surgisoft.scene.bvh import TriangleTree
 from surgisoft.scene.capsules import arc_lengths, ray_chain, segment_distance
+from surgisoft.scene.field import DistanceField
 from surgisoft.scene.frames import cross, dot, norm
 
 LEVELS_A_STEP = 3
-"""Tree levels that one step goes down."""
+"""Tree levels that one step descends."""
 QUERIES_AT_ONCE = 16_384
-"""Queries that go down together; more are taken in turns to bound the memory."""
+"""Queries that descend the tree together; larger batches are split to bound the memory."""
 
 
 class TorchTree:
     """A `TriangleTree` on a device."""
 
-    def __init__(self, tree: TriangleTree, device):
+    def __init__(self, tree: TriangleTree, device: str | torch.device):
         self.leaves = len(tree.starts) - 1
         self.depth = self.leaves.bit_length() - 1
         self.lower = torch.as_tensor(tree.lower, device=device)
@@ -112,7 +113,9 @@ class TorchTree:
             0, query, (t <= 1.0).long()
         )
 
-    def first_hit(self, origin, direction, reach):
+    def first_hit(
+        self, origin: torch.Tensor, direction: torch.Tensor, reach: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """First faces on rays (N, 3), distances up to reach (N,): (distance, face), -1 for none."""
         parts = [
             self._first_hit(*part)
@@ -150,7 +153,7 @@ class TorchTree:
         return t[met], query[met], place[met]
 
 
-def line_triangle(p, d, corners):
+def line_triangle(p: torch.Tensor, d: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     """(N,) t where p + t d meets triangles (N, 3, 3), inf for a miss (Moeller & Trumbore 1997)."""
     a, b, c = corners.unbind(1)
     e1, e2, s = b - a, c - a, p - a
@@ -165,7 +168,7 @@ def line_triangle(p, d, corners):
     return torch.where(hit, dot(e2, k) * inverse, math.inf)
 
 
-def point_triangle_d2(p, corners):
+def point_triangle_d2(p: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     """(N,) squared distance of points (N, 3) to triangles (N, 3, 3).
 
     The plane's where the foot is inside, otherwise the nearest edge's (Ericson 2005, 5.1.5).
@@ -182,7 +185,7 @@ def point_triangle_d2(p, corners):
     return torch.where(over, dot(s, normal).square() / safe, beside)
 
 
-def segment_triangle_d2(p, q, corners):
+def segment_triangle_d2(p: torch.Tensor, q: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     """(N,) squared distance of segments p q (N, 3) to triangles (N, 3, 3) (Ericson 5.1.10)."""
     a, b, c = corners.unbind(1)
     best = torch.minimum(point_triangle_d2(p, corners), point_triangle_d2(q, corners))
@@ -193,13 +196,13 @@ def segment_triangle_d2(p, q, corners):
 
 
 PAIRS_AT_ONCE = 4_000_000
-"""Segment pairs that are measured together; larger batches are taken in turns."""
+"""Segment pairs that are evaluated together; larger batches are split to bound the memory."""
 
 
 class TorchSurface:
-    """One body's surface on a device: its field, its tree, its normals."""
+    """One body's surface on a device: its distance field, tree and normals."""
 
-    def __init__(self, tree, field, device):
+    def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree = TorchTree(tree, device)
         self._closed = tree.mesh.is_watertight
         self._values = torch.as_tensor(field.values_mm, device=device)
@@ -207,7 +210,9 @@ class TorchSurface:
         self._field = field
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
-    def first_hit(self, origins, directions, range_mm) -> tuple[torch.Tensor, torch.Tensor]:
+    def first_hit(
+        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
         finite = origins.isfinite().all(1) & directions.isfinite().all(1)
         reach = torch.where(finite, float(range_mm), -1.0).to(origins.dtype)
@@ -215,7 +220,16 @@ class TorchSurface:
         distance, face = self._tree.first_hit(o, d, reach)
         return torch.where(face >= 0, distance, float(range_mm)), face
 
-    def clearance(self, lines, given, turn, shift, radius, within, horizon) -> torch.Tensor:
+    def clearance(
+        self,
+        lines: torch.Tensor,
+        given: torch.Tensor,
+        turn: torch.Tensor,
+        shift: torch.Tensor,
+        radius: float,
+        within: float,
+        horizon: float,
+    ) -> torch.Tensor:
         """(B,) mm: signed clearance of arms (B, K, 3), world frame, from the surface.
 
         given (K,) bool: the centreline's own points, where depth inside the body counts.
@@ -264,7 +278,7 @@ class TorchSurface:
         flips = self._tree.crossings(p[unsure], q[unsure]) % 2 == 1
         return inside.index_put((unsure,), inside[unsure] != flips)
 
-    def field_at(self, points):
+    def field_at(self, points: torch.Tensor) -> torch.Tensor:
         """Trilinear value (...) mm of the field at points (..., 3), inf outside the grid."""
         shape = torch.tensor(self._values.shape, device=points.device)
         x = (points - self._origin) / self._field.cell_mm
@@ -292,7 +306,9 @@ def _in_turns(function, count: int, pairs: int, *tensors):
     return torch.cat(parts) if parts else tensors[0].new_empty(0)
 
 
-def chains_apart_torch(first, second, radii: float, horizon: float):
+def chains_apart_torch(
+    first: torch.Tensor, second: torch.Tensor, radii: float, horizon: float
+) -> torch.Tensor:
     """(B,) clearance (mm) between arms (B, K, 3) and (B, M, 3); radii is their sum."""
 
     def measure(one, two):
@@ -304,7 +320,9 @@ def chains_apart_torch(first, second, radii: float, horizon: float):
     return (_in_turns(measure, len(first), pairs, first, second) - radii).clamp(max=horizon)
 
 
-def chains_folded_torch(lines, radius: float, gap: float, horizon: float):
+def chains_folded_torch(
+    lines: torch.Tensor, radius: float, gap: float, horizon: float
+) -> torch.Tensor:
     """(B,) clearance (mm) of arms (B, K, 3) to themselves beyond `gap` mm of arc."""
 
     def measure(line):
@@ -319,7 +337,14 @@ def chains_folded_torch(lines, radius: float, gap: float, horizon: float):
     return (_in_turns(measure, len(lines), pairs, lines) - 2.0 * radius).clamp(max=horizon)
 
 
-def rays_to_chains_torch(origins, directions, lines, radius: float, gap: float, best):
+def rays_to_chains_torch(
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    lines: torch.Tensor,
+    radius: float,
+    gap: float,
+    best: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
     """First hits of rays (B, R, 3) on arms (B, K, 3) below `best` (B, R): distance, segment."""
 
     def measure(o, d, line):

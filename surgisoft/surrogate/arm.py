@@ -1,4 +1,4 @@
-"""What one arm is (`ArmSpec`) and where it stands (`ArmState`)."""
+"""Specification (`ArmSpec`) and state (`ArmState`) of an arm."""
 
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ class ArmSpec:
     unit: str = "kPa"
     """Unit of the actuation: kPa, psi, deg, mm, V, norm."""
     actuation: str = "measured"
-    """Which actuation the model takes: `measured` or `commanded`."""
+    """Which actuation is the model's input: `measured` or `commanded`."""
     band: tuple[float, ...] = ()
     """Half width of the dead band of the direction of change in each chamber, in `unit`."""
     idle: tuple[float | None, ...] = ()
@@ -34,7 +34,7 @@ class ArmSpec:
     diameter_mm: float | None = None
     """Outer diameter, mm."""
     gravity: tuple[float, float, float] | None = None
-    """Unit vector of weight in the base frame, where the recordings say it."""
+    """Unit vector along the weight, base frame; None where the recordings do not state it."""
     temperature_C: float | None = None
     """Mean temperature of the room where the recordings were made, degrees Celsius, if known."""
 

@@ -43,7 +43,7 @@ class Backbone:
         )
 
     def to(self, device) -> "Backbone":
-        """This backbone on another device."""
+        """Copy of the backbone on another device."""
         return Backbone(self.position.to(device), self.derivative.to(device))
 
     def centreline(self, key_points: Tensor) -> Tensor:

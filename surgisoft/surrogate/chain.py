@@ -1,9 +1,9 @@
 """The chain of the arm model: line, chambers, direction, material, network, body, sensor.
 
 `Chain.walk` is the one place where a signal passes through these links. What happens in a link
-depends on the mode of the walk: one time step (`Stepping`), a whole recording (`Scanning`), an arm
-without history (`Resting`), an arm that has stood for a while (`Standing`), or memories that are
-given (`Holding`). First-order sensitivities use the signals that a scan has recorded.
+depends on the mode: one time step (`Stepping`), a whole recording (`Scanning`), an arm without
+history (`Resting`), an arm that was held for a while (`Standing`), or given memories (`Holding`).
+First-order sensitivities use the signals that a scan has recorded.
 """
 
 from collections.abc import Callable
@@ -20,18 +20,18 @@ from surgisoft.surrogate.networks import RecurrentArm
 from surgisoft.surrogate.scan import direction_scan, direction_step
 
 STOOD_S = 10.0
-"""Time for which an arm has stood where a run begins away from rest, s."""
+"""Time for which an arm is assumed to have been held where a run begins away from rest, s."""
 NETWORK = "network"
 """Key of a recurrent network's state in `ArmState.memory`."""
 
 
 class Link(NamedTuple):
-    """One place of the chain."""
+    """One place of the chain: an effect, the chambers or the network."""
 
     stage: str
     """Stage of an effect, `chambers` or `network`."""
     name: str
-    """Name of the effect in its model; of the other two the stage."""
+    """Name of the effect in its model; `chambers` or `network` for the other two."""
     part: Effect | nn.Module | None = None
     """The effect, or the network, that acts there."""
 
@@ -45,12 +45,12 @@ BEHIND: dict[str, tuple[Stage, ...]] = {
     "body": ("body", "sensor"),
     "sensor": ("sensor",),
 }
-"""Stages whose last signal so far is the one behind a link of each kind."""
+"""Stages whose output is the signal behind a link of each kind, until a later link replaces it."""
 
 
 @dataclass(eq=False)
 class Signal:
-    """What a walk carries from link to link. Leading shape (B,) of a step, (R, T) of a scan."""
+    """The signal between two links. Leading shape (B,) of a step, (R, T) of a scan."""
 
     value: Tensor
     """(..., m) actuation in front of the network, (..., n, 3) key points in mm behind it."""
@@ -62,28 +62,29 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class Taps:
-    """What was seen along a walk; leading shape (B,) of one instant, (R, T) of a scan."""
+    """Signals and memories recorded along the chain; leading shape (B,) of one instant, (R, T) of a
+    scan."""
 
     pressure: Tensor
     """(..., m) chamber pressure, behind the line effects, in the arm's unit."""
     direction: Tensor
     """(..., m) direction of change."""
     memory: dict[str, Tensor]
-    """(..., ...) memory of each effect that the walk has passed."""
+    """(..., ...) memory of each effect that the signal has passed."""
     behind: dict[Stage, Tensor]
-    """Signal behind the effects of each stage that the walk has passed: (..., m) actuation in the
+    """Signal behind the effects of each stage that it has passed: (..., m) actuation in the
     arm's unit behind `line` and `material`, (..., n, 3) key points in mm behind `body` and
     `sensor`. An effect that is added to a stage sees it."""
 
 
 class Resting:
-    """Mode: an arm without history at a constant actuation."""
+    """Chain mode for an arm without history at a constant actuation."""
 
     def __init__(self):
         self.memory: dict[str, Tensor] = {}
 
     def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
-        """(B, m) no direction yet."""
+        """(B, m) zeros: no chamber has a direction yet."""
         return torch.zeros_like(chamber)
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
@@ -101,10 +102,10 @@ class Resting:
 
 
 class Stepping:
-    """Mode: one time step of a batch of arms."""
+    """Chain mode for one time step of a batch of arms."""
 
     def __init__(self, state: ArmState, context: Context):
-        """state: before the step; context: duration of the step and temperature."""
+        """state: arms before the step; context: duration of the step and temperature."""
         self.anchor, self.last = state.anchor, state.direction
         self.memory, self.context = dict(state.memory), context
 
@@ -131,25 +132,26 @@ class Stepping:
 
 
 class Standing(Stepping):
-    """Mode: arms that came straight from rest and have stood for STOOD_S.
+    """Chain mode for arms that came straight from rest and were held for STOOD_S.
 
     Lags and oscillations in front of and behind the material have died away; the material and a
     recurrent network have followed for that time.
     """
 
     def __init__(self, state: ArmState):
-        """state: arms at rest."""
+        """state: arms at rest, before they are held at another actuation."""
         super().__init__(state, Context(state.pressure.new_full((len(state.pressure),), STOOD_S)))
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
-        """Signal behind an effect that has settled, or whose material has followed."""
+        """Signal behind an effect: a material effect has followed, any other has reached steady
+        state."""
         if link.stage == "material":
             return super().effect(link, signal)
         self.memory[link.name] = link.part.rest(signal.value)
         return link.part.apply(signal.value, self.memory[link.name])
 
     def network(self, link: Link, signal: Signal) -> Tensor:
-        """(B, n, 3) key points in mm; a recurrent network's own state stays that of rest."""
+        """(B, n, 3) key points in mm; the state of a recurrent network stays that of rest."""
         if not isinstance(link.part, RecurrentArm):
             return link.part(signal.value, signal.direction)
         hidden = link.part.advance(self.memory[NETWORK], signal.value, signal.direction)
@@ -157,7 +159,7 @@ class Standing(Stepping):
 
 
 class Scanning:
-    """Mode: every row of a history at once."""
+    """Chain mode for every row of a history at once."""
 
     def __init__(
         self,
@@ -166,10 +168,13 @@ class Scanning:
         rows: Callable[[Tensor], Tensor] | None = None,
         direction: Tensor | None = None,
     ):
-        """start: (R, ...) memory of each effect before the first row; context: (R, T) times and
-        temperatures; rows: picks the rows (S, ...) of a (R, T, ...) tensor that the network and
-        all effects behind it compute, which must then have no memory (None: every row);
-        direction: (R, T, m) of change where it is known, as in a window of a longer scan."""
+        """Set where the scan starts and which rows it computes.
+
+        start: (R, ...) memory of each effect before the first row; context: (R, T) times and
+        temperatures; rows: picks the rows (S, ...) of a (R, T, ...) tensor that the network and all
+        effects behind it compute, which must then have no memory (None: every row); direction: (R,
+        T, m) direction of change where it is known, as in a window of a longer scan.
+        """
         self.start, self.context, self.rows, self.given = start, context, rows, direction
         self.memory: dict[str, Tensor] = {}
 
@@ -206,7 +211,7 @@ class Scanning:
 
 
 class Holding:
-    """Mode: memories are given, as those of rows of an earlier scan."""
+    """Chain mode with given memories, for example those of rows of an earlier scan."""
 
     def __init__(self, memory: dict[str, Tensor]):
         self.memory = memory
@@ -224,7 +229,7 @@ Mode = Resting | Stepping | Standing | Scanning | Holding
 
 
 class Chain:
-    """The links of one arm model and the ways to walk them. Holds references, owns nothing."""
+    """The links of one arm model and the modes to pass them. Holds references, owns nothing."""
 
     def __init__(
         self,
@@ -235,9 +240,12 @@ class Chain:
         still: Tensor,
         idle: Tensor,
     ):
-        """effects: in the order of the stages. By chamber, (m,), in the arm's unit: rest, the
-        actuation at rest; band, half width of the direction's dead band; still, which chambers
-        never moved, and idle, where those stood."""
+        """Order the links of a network and its effects.
+
+        effects: in the order of the stages. Each (m,) in the arm's unit: rest, the actuation at
+        rest; band, half width of the direction's dead band; still, which chambers never moved;
+        idle, their actuation.
+        """
         self.net, self.rest, self.band, self.still, self.idle = network, rest, band, still, idle
         links = [Link(effect.stage, name, effect) for name, effect in effects.items()]
         behind = next((i for i, e in enumerate(links) if e.stage in ("body", "sensor")), len(links))
@@ -258,9 +266,10 @@ class Chain:
         links: tuple[Link, ...] | None = None,
         behind: dict[Stage, Tensor] | None = None,
     ) -> Signal:
-        """Carry a signal through links of the chain (default: all); returns what comes out.
+        """Pass a signal through links of the chain (default: all); returns the signal behind the
+        last.
 
-        behind: is filled with the signal behind each stage that the walk has passed.
+        behind: is filled with the signal behind each stage that was passed.
         """
         for link in self.links if links is None else links:
             if link is CHAMBERS_LINK:
@@ -291,10 +300,10 @@ class Chain:
     def standing(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
         """Arms before the first row of runs that begin at `pressure` (R, m), and their signals.
 
-        An arm that begins away from rest is taken to have come straight from rest and to have
-        stood for STOOD_S. The signals are those behind each stage, (R, m) for line and material,
-        (R, n, 3) in mm for body and sensor; behind the material that of rest, because an effect
-        that is added there starts from rest too (`first_memory`).
+        An arm that begins away from rest is assumed to have come straight from rest and to have
+        been held for STOOD_S. The signals are those behind each stage, (R, m) for line and
+        material, (R, n, 3) in mm for body and sensor; behind the material that of rest, because an
+        effect that is added there starts from rest too (`first_memory`).
         """
         state, taps = self.at_rest(self.rest.expand(len(pressure), -1), taps=True)
         seen = taps.behind
@@ -333,9 +342,9 @@ class Chain:
         return ArmState(pressure, mode.anchor, signal.direction, mode.memory), signal.value
 
     def scan(self, history: History, first: Tensor, links: tuple[Link, ...] | None = None) -> Taps:
-        """What every stage sees in each row of a history whose runs begin at `first`, (R, m).
+        """Signals and memories in each row of a history whose runs begin at `first`, (R, m).
 
-        links: those to walk; default all.
+        links: the links to pass; default all.
         """
         mode = Scanning(self.standing(first)[0].memory, context_of(history))
         behind = {}
@@ -350,7 +359,7 @@ class Chain:
         return self.walk(Signal(pressure, pressure, direction), Holding(memory), self.static).value
 
     def around(self, name: str, taps: Taps) -> tuple[Tensor, Tensor]:
-        """(..., m) actuation in front of and behind a material effect along an earlier walk."""
+        """(..., m) actuation in front of and behind a material effect, from the taps of a scan."""
         place = next(i for i, link in enumerate(self.static) if link.name == name)
         mode = Holding(taps.memory)
         start = Signal(taps.pressure, taps.pressure, taps.direction)
@@ -383,7 +392,7 @@ class Chain:
 
         at: (S, m) actuation or (S, n, 3) key points, mm, that the effect sees; memory: (S, ...)
         its memory; slope: (S, n, 3, m) `network_slope` on those rows, which line and material
-        effects act through. Effects behind the effect are taken to hand the change on as it is.
+        effects act through. Effects behind the effect are assumed to pass the change on unchanged.
         """
         changes = effect.sensitivities(at, memory)
         if effect.stage in ("line", "material"):
@@ -392,10 +401,10 @@ class Chain:
 
 
 class RepeatedScan:
-    """`repeated()` is the prediction (S, n, 3) in mm while parameters of some effects change.
+    """Prediction (S, n, 3) in mm, by calling, while parameters of some effects change.
 
-    What stands before the first link that may change is computed once. Memories follow every row;
-    the network, and effects behind it unless one of them remembers, compute the looked-at rows
+    Links in front of the first one that may change are computed once. Memories follow every row;
+    the network, and effects behind it unless one of them has memory, compute the requested rows
     alone. Autograd runs through parameters that require it.
     """
 
@@ -407,9 +416,12 @@ class RepeatedScan:
         keys: set[str],
         rows: Callable[[Tensor], Tensor],
     ):
-        """first: (R, m) actuation at which each run begins; keys: names of the effects whose
-        parameters change (empty: those of the network); rows: picks the looked-at rows (S, ...)
-        of a (R, T, ...) tensor."""
+        """Compute the signal in front of the first link whose parameters change.
+
+        first: (R, m) actuation at which each run begins; keys: names of the effects whose
+        parameters change (empty: those of the network); rows: picks the requested rows (S, ...) of
+        a (R, T, ...) tensor.
+        """
         self.chain, self.history, self.rows = chain, history, rows
         self.first_pressure = first
         # Runs that begin alike have one memory before their first row.
@@ -427,7 +439,7 @@ class RepeatedScan:
         return points if self.thin else self.rows(points)
 
     def mode(self) -> Scanning:
-        """The scan from the memories before the first row that the present parameters give."""
+        """A scan from the memories before the first row, for the present parameters."""
         runs = self.history.runs
         start = self.chain.standing(self.first)[0].memory
         start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}

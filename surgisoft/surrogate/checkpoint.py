@@ -1,4 +1,4 @@
-"""A model is a folder: `config.json` and `weights.safetensors`. Opening one runs no code of it."""
+"""Model folders: `config.json` and `weights.safetensors`. Opening one runs no code of it."""
 
 import json
 import os
@@ -29,7 +29,7 @@ DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "def
 """Name and folder of the arm that comes with the package."""
 
 OWN_FILES = ("config.json", "weights.safetensors", "report.json", KNOWN_ERROR)
-"""What a model's folder is made of; a replaced model leaves other files where they are."""
+"""Files of a model's folder. Replacing a model leaves all other files in place."""
 
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
@@ -47,7 +47,7 @@ def _network_config(network) -> dict:
 
 
 def _validation_config(validation: Validation) -> dict:
-    """A validation as it stands in the file: what is not known is left out."""
+    """JSON form of a validation, without the values that are not known."""
     known = {name: value for name, value in asdict(validation).items() if value is not None}
     return known if validation.rmse_mm is not None else {}
 
@@ -67,15 +67,19 @@ def _opened(
 
 
 def claim_folder(folder: str | Path, force: bool = False) -> Path:
-    """The folder to write to, which must be free or may be replaced; nothing is touched yet."""
+    """Check that a folder can be written: free, or replaceable with `force`; changes nothing.
+
+    Raises InputError where the folder is not writable, is in use, or holds something else than a
+    model.
+    """
     folder = Path(folder)
     above = next(parent for parent in folder.absolute().parents if parent.exists())
     if not above.is_dir() or not os.access(above, os.W_OK):
-        raise InputError(f"{folder}: cannot be written, {above} is no writable folder")
+        raise InputError(f"{folder}: cannot be written because {above} is not a writable folder")
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not force):
         raise InputError(f"{folder}: already there; choose another name or pass --force")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "config.json").is_file():
-        raise InputError(f"{folder}: holds something that is no model; choose another name")
+        raise InputError(f"{folder}: holds files that are not a model; choose another name")
     return folder
 
 
@@ -86,10 +90,10 @@ def save_model(
     force: bool = False,
     known: KnownError | None = None,
 ) -> None:
-    """Write the model whole or not at all.
+    """Write a model to a folder, completely or not at all.
 
-    `report` (JSON-able) and the training residuals are kept beside it: `known`, or without that
-    those of the model itself.
+    report: JSON-able, stored beside the model; known: training residuals to store (default: those
+    of the model). Raises InputError where the folder cannot be written (`claim_folder`).
     """
     known = model.training_residuals if known is None else known
     folder = claim_folder(folder, force)
@@ -115,7 +119,7 @@ def save_model(
 
 
 def _place(folder: str | Path) -> Path:
-    """A model's folder; that of the embedded arm for its name."""
+    """Folder of a model; for the name `default`, that of the embedded arm."""
     folder = Path(folder)
     return DEFAULT_FOLDER if str(folder) == DEFAULT and not folder.exists() else folder
 
@@ -125,13 +129,14 @@ def load_model(
     device: str | torch.device = "cpu",
     effect_files: Iterable[str | Path] = (),
 ) -> ArmModel:
-    """The model in a folder, ready to evaluate; bit-equal to what was saved.
+    """The model in a folder, ready to evaluate; bit-equal to the saved one.
 
     `default`, where there is no such folder, is the arm that comes with the package. A model that
     is open already is returned as it is.
 
     effect_files: files of user-defined effects that the model may hold. They are run, so name only
-    files that you trust.
+    files that you trust. Raises InputError where the folder holds no model, a damaged one, or one
+    that needs an effect file that was not named.
     """
     register_effect_files(effect_files)
     if isinstance(folder, ArmModel):
@@ -139,7 +144,7 @@ def load_model(
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
-            f"{folder}: no arm model there (config.json missing); make one with 'surgisoft fit'"
+            f"{folder}: no arm model there (config.json is missing); make one with 'surgisoft fit'"
         )
     try:
         config = json.loads((folder / "config.json").read_text())
@@ -187,7 +192,7 @@ def load_model(
 
 
 def load_known_error(folder: str | Path) -> KnownError | None:
-    """The training residuals in a model's folder; None where they were not kept."""
+    """The training residuals in a model's folder; None where the folder has none."""
     try:
         return KnownError.load(_place(folder))
     except Exception as error:

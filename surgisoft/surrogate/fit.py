@@ -56,7 +56,7 @@ MOST_ROWS = 4000
 
 @dataclass(frozen=True)
 class ChamberExcitation:
-    """How one chamber was moved."""
+    """How one chamber was moved in the recordings."""
 
     chamber: int
     """Number of the chamber, from 1."""
@@ -74,11 +74,11 @@ class ChamberExcitation:
 
     @property
     def minor_loops(self) -> bool:
-        """Whether reversals inside the range were seen, beside sweeps through all of it."""
+        """Whether the chamber reversed inside its range, and not only at the ends."""
         return self.direction and self.inner >= LEAST_INNER
 
-    def complaint(self) -> str:
-        """Why direction or memory is not supported; empty if both are."""
+    def unsupported(self) -> str:
+        """Why the data does not support direction or memory of the chamber; empty if it does."""
         if self.minor_loops:
             return ""
         if self.reversals < LEAST_REVERSALS:
@@ -99,7 +99,7 @@ class ChamberExcitation:
 def excitation(
     history: History, low: Tensor, high: Tensor, band: Tensor
 ) -> list[ChamberExcitation]:
-    """What a history excites, one answer a chamber; low, high, band (m,) in the arm's unit."""
+    """Excitation of each chamber in a history; low, high, band (m,) in the arm's unit."""
     rest = torch.zeros_like(low).clamp(low, high)
     _, direction = direction_scan(history.pressure, band, rest)
     pressure = history.rows(history.pressure)
@@ -107,7 +107,7 @@ def excitation(
     scaled = ((pressure - low) / span).double().numpy()
     sign = history.rows(direction).numpy()
     contrast = _contrast(scaled, sign)
-    answer = []
+    chambers = []
     for chamber in range(history.chambers):
         sweeps = [
             _sweeps(
@@ -118,7 +118,7 @@ def excitation(
         ]
         shares = np.concatenate(sweeps) / float(span[chamber])
         inner = (shares > INNER[0]) & (shares < INNER[1])
-        answer.append(
+        chambers.append(
             ChamberExcitation(
                 chamber=chamber + 1,
                 contrast=float(contrast[chamber]),
@@ -126,7 +126,7 @@ def excitation(
                 inner=float(inner.mean()) if len(shares) else 0.0,
             )
         )
-    return answer
+    return chambers
 
 
 def _contrast(scaled: np.ndarray, sign: np.ndarray) -> np.ndarray:
@@ -158,22 +158,22 @@ def _signed(pieces: list[np.ndarray], direction: np.ndarray):
 
 INPUTS = ("pressure", "pressure+direction")
 SIMPLE_SHARE = 0.2
-"""Share of the epochs for a stage that only prepares the next, or comes after an effect."""
+"""Share of the epochs for a stage that precedes others, or comes after an effect."""
 EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
 STILL_SHARE = 0.15
-"""Share of its range that a chamber has to move, or the fit notes that it did not."""
+"""Share of its range that a chamber has to move; below it the fit adds a note."""
 LEAST_BLOCKS = 5
-"""Fewest blocks of held-out time that can decide whether a stage is kept."""
+"""Fewest blocks of held-out time for a significance test of a stage."""
 LARGEST_MM = 1e5
-"""Largest coordinate that is taken for a measurement, mm."""
+"""Largest coordinate that is accepted as a measurement, mm."""
 LEAST_ROWS = 30
 """Fewest rows with key points that a fit accepts."""
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to fit."""
+    """Settings of a fit."""
 
     network: str = "haw_nn"
     """`haw_nn`, `constant_curvature` or `recurrent`."""
@@ -189,7 +189,7 @@ class FitConfig:
     """Most epochs of a stage without memory; stages that others follow, or with memory, have a
     share of them."""
     batch: int = 512
-    """Rows a step."""
+    """Rows per step."""
     learning_rate: float = 3e-3
     """Adam's largest learning rate; it falls along a cosine."""
     seed: int = 0
@@ -200,34 +200,45 @@ class FitConfig:
 
 @dataclass
 class StageReport:
-    """One stage of the growth."""
+    """Result of one stage of the forward selection."""
 
     name: str
+    """`pressure`, `direction`, the name of an effect, or that of a baseline."""
     valid_rmse_mm: float
+    """Held-out RMSE with the stage, mm."""
     epochs: int
+    """Number of epochs trained."""
     seconds: float
+    """Duration, s."""
     kept: bool
+    """Whether the stage was accepted."""
     reason: str = ""
+    """Why the stage was rejected; empty if it was accepted."""
     simpler_rmse_mm: float | None = None
     """Held-out RMSE of the simpler model trained just as long, mm."""
 
 
 @dataclass
 class FitResult:
-    """A fitted model and how it came about."""
+    """A fitted model and the record of its fit."""
 
     model: ArmModel
+    """The fitted model."""
     stages: list[StageReport]
+    """Stages of the forward selection, in order."""
     excitation: list[ChamberExcitation]
+    """Excitation of each chamber in the training data."""
     warnings: list[str]
+    """Notes to the user: unsupported inputs, chambers that did not move."""
     seconds: float
+    """Duration of the fit, s."""
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
     known: KnownError | None = None
-    """Training residuals: those on the rows that the model was fitted to and validated on."""
+    """Residuals on the rows that the model was fitted to and validated on."""
 
     def report(self) -> dict:
-        """What happened, for a JSON file beside the model."""
+        """Record of the fit, for a JSON file beside the model."""
         return {
             "stages": [asdict(stage) for stage in self.stages],
             "excitation": [asdict(chamber) for chamber in self.excitation],
@@ -240,7 +251,7 @@ class FitResult:
         }
 
     def lines(self) -> list[str]:
-        """What happened, for a person."""
+        """Record of the fit as lines of text for a person."""
         lines = [
             f"{stage.name:20s} held-out RMSE {stage.valid_rmse_mm:8.4f} mm  "
             f"{stage.epochs:4d} epochs {stage.seconds:6.1f} s  "
@@ -267,7 +278,12 @@ Progress = Callable[[str, int, int, float], None]
 def fit(
     train: History, valid: History | None, spec: ArmSpec, config: FitConfig, progress=None
 ) -> FitResult:
-    """Fit a model to `train`; choose by `valid`, or by held-out rows of `train` without it."""
+    """Fit a model to `train`; select stages by `valid`, or by held-out rows of `train` without it.
+
+    progress: called as `Progress` describes. Raises InputError where the recordings cannot be
+    fitted (too few rows, missing key points, values out of range) or the configuration names
+    something unknown.
+    """
     _check(train, valid, spec, config)
     start = time.perf_counter()
     torch.manual_seed(config.seed)
@@ -278,20 +294,20 @@ def fit(
     if config.network == "recurrent":
         _fit_recurrent(data, spec, config, result, progress)
     else:
-        judged = excitation(data.judge, low, high, band)
-        support = _Support(result.excitation, all(chamber.minor_loops for chamber in judged))
+        validated = excitation(data.validation, low, high, band)
+        support = _Support(result.excitation, all(chamber.minor_loops for chamber in validated))
         names = _stages(config)
-        grown = [name for name in names if _possible(result, name, config, support)]
+        grown = [name for name in names if _supported(result, name, config, support)]
         for name in grown:
             candidate = _grow(result.model, name, spec, config, support, train)
             epochs = _stage_epochs(name, grown, config)
             _stage(candidate, name, epochs, config, data, result, progress)
-        rows = data.judging_rows(result.model)
+        rows = data.validation_rows(result.model)
         result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
-    validation = replace(result.model.validation, noise_mm=data.judge.noise_mm)
+    validation = replace(result.model.validation, noise_mm=data.validation.noise_mm)
     result.model.validation = validation
     if not math.isfinite(validation.rmse_mm):
-        raise InputError("the fit did not come to a finite error; check the recordings' key points")
+        raise InputError("the fit did not reach a finite error; check the recordings' key points")
     for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
             result.warnings.append(f"key point {number} is missing in all held-out rows")
@@ -307,10 +323,10 @@ def _still_chambers(train: History, spec: ArmSpec) -> list[str]:
     pressure = train.rows(train.pressure)
     moved = (pressure.amax(0) - pressure.amin(0)).tolist()
     return [
-        f"chamber {number} hardly moved ({came:.3g} {spec.unit} in all): "
-        "what it does cannot be learned from these recordings"
-        for number, (came, span) in enumerate(zip(moved, spec.span, strict=True), 1)
-        if came < STILL_SHARE * span
+        f"chamber {number} hardly moved ({moved_by:.3g} {spec.unit} in all): "
+        "its influence cannot be learned from these recordings"
+        for number, (moved_by, span) in enumerate(zip(moved, spec.span, strict=True), 1)
+        if moved_by < STILL_SHARE * span
     ]
 
 
@@ -340,12 +356,12 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
                 f"fit without it, then 'surgisoft amend --effect {name}' adds it"
             )
     if config.effects and config.network != "haw_nn":
-        raise InputError(f"effects are for haw_nn; the {config.network} baseline takes none")
+        raise InputError(f"effects need the network haw_nn; the {config.network} baseline has none")
     for history in (train, valid):
         if history is None:
             continue
         if not torch.isfinite(history.pressure).all():
-            raise InputError("an actuation is beyond all measure; check the recordings for it")
+            raise InputError("an actuation is not a finite number; check the recordings")
         if float(history.key_points.nan_to_num().abs().max()) > LARGEST_MM:
             raise InputError(
                 f"a key point lies farther than {LARGEST_MM:g} mm from the base; check the "
@@ -373,7 +389,7 @@ def _stages(config: FitConfig) -> list[str]:
 
 
 def _stage_epochs(name: str, stages: list[str], config: FitConfig) -> int:
-    """Epochs of a stage: the last has most, those that lead to it few."""
+    """Epochs of a stage: most for the last stage, few for those before it."""
     share = 1.0
     if name in config.effects:
         share = EFFECT_SHARE
@@ -387,7 +403,7 @@ class _Support:
     """Which inputs the recordings support."""
 
     chambers: list[ChamberExcitation]
-    judged_inside: bool
+    minor_loops_validated: bool
     """Whether the validation data reverses inside the range in every chamber."""
 
     def use(self, name: str) -> Tensor:
@@ -396,14 +412,14 @@ class _Support:
         A memory needs inner reversals to be learned. A direction that was only seen in full
         sweeps may still be right: validation data with inner reversals decides.
         """
-        lenient = name == "direction" and self.judged_inside
+        lenient = name == "direction" and self.minor_loops_validated
         return torch.tensor(
             [float(x.direction if lenient else x.minor_loops) for x in self.chambers]
         )
 
 
-def _possible(result: FitResult, name: str, config: FitConfig, support: _Support) -> bool:
-    """Whether the recordings support a stage in any chamber; notes those that they do not."""
+def _supported(result: FitResult, name: str, config: FitConfig, support: _Support) -> bool:
+    """Whether the recordings support a stage in any chamber; notes the unsupported chambers."""
     if name in ("pressure", "constant curvature") or not config.check_excitation:
         return True
     if name != "direction" and not hypothesis_of(known_effects()[name]).needs_reversals:
@@ -411,12 +427,12 @@ def _possible(result: FitResult, name: str, config: FitConfig, support: _Support
     use = support.use(name)
     for chamber, used in zip(support.chambers, use, strict=True):
         if not used:
-            result.warnings.append(f"{name} left out for {chamber.complaint()}")
+            result.warnings.append(f"{name} left out for {chamber.unsupported()}")
     return bool(use.any())
 
 
 def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, train) -> ArmModel:
-    """The model with one stage more, the same function as before."""
+    """The model with one stage more and an unchanged prediction."""
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     if name == "pressure":
         network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
@@ -438,9 +454,9 @@ def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, tr
 def _stage(
     candidate, name: str, epochs: int, config, data: Data, result: FitResult, progress
 ) -> None:
-    """Train one stage and keep it if held-out data rewards it.
+    """Train one stage and accept it if it lowers the held-out error significantly.
 
-    It is compared with the simpler model trained for the same number of epochs, so that a gain must
+    The comparison is with the simpler model trained for as many epochs, so that a gain must
     come from the addition and not from the training.
     """
     begin = time.perf_counter()
@@ -452,7 +468,7 @@ def _stage(
         train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
         before = _square(simpler, data)
         simpler_rmse = math.sqrt(float(before.sum(-1).nanmean()))
-        kept, reason = _better(before, after, data.judging_rows(simpler).block)
+        kept, reason = _better(before, after, data.validation_rows(simpler).block)
         if not kept:
             result.warnings.append(f"{name} left out: {reason}")
         result.model = simpler
@@ -466,14 +482,14 @@ def _stage(
 
 def _square(model: ArmModel, data: Data) -> Tensor:
     """(S, n, 3) squared error in mm^2 on the validation rows; NaN where missing."""
-    rows = data.judging_rows(model)
+    rows = data.validation_rows(model)
     return (model_rows(model, rows) - rows.target).square()
 
 
 def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:
     """Whether the squared error (S, n, 3) fell beyond chance, with its blocks as the samples.
 
-    One-sided at 2.5 % by Student's t over the blocks: with few blocks the bar is high.
+    One-sided test at 2.5 % by Student's t over the blocks: with few blocks the threshold is high.
     """
     gain = (before - after).nanmean(dim=(1, 2)).nan_to_num()
     blocks = int(block.max()) + 1

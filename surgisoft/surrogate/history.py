@@ -1,4 +1,4 @@
-"""Actuation and key points over time, as tensors: what models are fitted to and validated on."""
+"""Histories: actuation and key points over time, as tensors to fit and validate models."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from surgisoft.errors import InputError
 
 @dataclass(frozen=True)
 class History:
-    """Runs of equal (padded) length. Rows with `valid` false are padding."""
+    """Measured runs of equal (padded) length. Rows with `valid` false are padding."""
 
     t_s: Tensor
     """(R, T) float64, seconds since the start of each run's recording."""
@@ -19,7 +19,7 @@ class History:
     key_points: Tensor
     """(R, T, n, 3) float32, mm, base frame; NaN where missing and in the padding."""
     valid: Tensor
-    """(R, T) bool."""
+    """(R, T) bool: the row was measured, and is no padding."""
     noise: tuple[float, ...] | None = None
     """Standard deviation of the measured actuation at rest, one a chamber, if known."""
     temperature_C: Tensor | None = None
@@ -58,7 +58,7 @@ class History:
         return index[self.valid]
 
     def select(self, runs: Tensor) -> "History":
-        """Only the given runs, (k,) indices."""
+        """A history of the given runs, (k,) indices."""
         length = int(self.valid[runs].sum(1).max())
         return History(
             self.t_s[runs, :length],
@@ -72,7 +72,7 @@ class History:
         )
 
     def to(self, device) -> "History":
-        """This history on another device."""
+        """Copy of the history on another device."""
         return History(
             self.t_s.to(device),
             self.pressure.to(device),

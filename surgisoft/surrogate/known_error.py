@@ -1,8 +1,9 @@
-"""Where a network is known to be off: its residual on a sample of the rows that it was fitted to.
+"""Training residuals: where a fitted model is known to be off.
 
-The validated error says how large the network's own error is; these rows say where it is which.
-A later residual that differs from them at like actuation is no error of the network: something has
-changed since (the conditioning of Kennedy & O'Hagan 2001 on what is known already).
+The validated error states how large the model's error is; its residuals on a sample of the rows of
+its fit state at which actuation. A later residual that differs from them at like actuation is no
+error of the model: the arm or its setup has changed since (conditioning on known discrepancies,
+Kennedy & O'Hagan 2001).
 """
 
 from collections.abc import Iterable
@@ -17,14 +18,14 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
 FILE = "known_error.safetensors"
-"""Its name in a model's folder."""
+"""Name of the file in a model's folder."""
 ROWS = 1500
-"""Most rows that are kept."""
+"""Largest number of rows that are stored."""
 
 
 @dataclass(frozen=True, eq=False)
 class KnownError:
-    """A model's residual on rows of its own fit."""
+    """Residuals of a model on rows of its fit."""
 
     actuation: Tensor
     """(S, m) actuation, in the arm's unit."""
@@ -36,7 +37,7 @@ class KnownError:
     @classmethod
     @torch.no_grad()
     def of(cls, model: ArmModel, histories: Iterable[History], rows: int = ROWS) -> "KnownError":
-        """At most `rows` measured rows of some histories, evenly thinned."""
+        """Residuals on at most `rows` measured rows of some histories, evenly thinned."""
         parts = []
         for history in histories:
             residual = history.rows(history.key_points - model.predict(history))
@@ -48,12 +49,12 @@ class KnownError:
         return cls(*(part[::step].float().contiguous() for part in whole))
 
     def save(self, folder: Path) -> None:
-        """Write it into a model's folder."""
+        """Write the residuals into a model's folder."""
         (folder / FILE).write_bytes(save(asdict(self)))
 
     @classmethod
     def load(cls, folder: Path) -> "KnownError | None":
-        """What a model's folder says; None where it says nothing."""
+        """The residuals in a model's folder; None where the folder has none."""
         if not (folder / FILE).is_file():
             return None
         return cls(**load_file(folder / FILE))

@@ -21,7 +21,7 @@ AWAY_SHARE = 0.15
 share of its range."""
 
 Network = HawNN | ConstantCurvature | RecurrentArm
-"""What may stand in the middle of the chain."""
+"""Networks that the chain may have."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Validation:
 
 
 class ArmModel(nn.Module):
-    """Batched, differentiable arm: `step` advances worlds, `predict` takes whole recordings.
+    """Batched, differentiable arm: `step` advances simulated arms, `predict` a whole recording.
 
-    Both walk the same `Chain` and agree.
+    Both pass signals through the same `Chain` and agree.
     """
 
     training_residuals: "KnownError | None" = None
-    """Residuals of the model on rows of its own fit; None where they are not known."""
+    """Residuals of the model on rows of its fit; None where they are not known."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class ArmModel(nn.Module):
         rest_mm: Tensor | None = None,
         validation: Validation | None = None,
     ):
-        """`rest_mm` (n, 3): key points at rest, mm, base frame."""
+        """rest_mm: (n, 3) key points at rest, mm, base frame."""
         super().__init__()
         effects = effects or {}
         order = sorted(effects, key=lambda name: STAGES.index(effects[name].stage))
@@ -99,12 +99,12 @@ class ArmModel(nn.Module):
 
     @property
     def chain(self) -> Chain:
-        """The links of this model."""
+        """The chain of this model's links."""
         return Chain(self.network, self.effects, self.rest, self.band, self.still, self.idle)
 
     @property
     def facts(self) -> ArmFacts:
-        """What effects may know of this arm, on the CPU."""
+        """The properties of this arm that effects may use, on the CPU."""
         return arm_facts(self.spec, self.rest_mm)
 
     def stage(self, stage: Stage) -> list[tuple[str, Effect]]:
@@ -113,7 +113,7 @@ class ArmModel(nn.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether the network itself has a state."""
+        """Whether the network has a state of its past."""
         return isinstance(self.network, RecurrentArm)
 
     def backbone(self, samples: int = 21, degree: int = 3) -> Backbone:
@@ -146,9 +146,9 @@ class ArmModel(nn.Module):
     def first_state(self, pressure: Tensor) -> ArmState:
         """(R) arms before the first row of runs that begin at `first_pressure`, (R, m).
 
-        The recording does not tell how such an arm came there. The arm is taken to have come
-        straight from rest and to have stood for `STOOD_S`: lags and oscillations have died away,
-        the material remembers.
+        A recording does not state what happened before. The arm is assumed to have come straight
+        from rest and to have been held for `STOOD_S`: lags and oscillations have died away, the
+        material remembers.
         """
         return self.chain.standing(pressure)[0]
 
@@ -169,7 +169,7 @@ class ArmModel(nn.Module):
         return self.chain.step(state, pressure, Context(dt, None, temperature_C))
 
     def trace(self, history: History) -> Taps:
-        """What the network and the effects in front of it see in each row of a history.
+        """Inputs of the network, and memories in front of it, in each row of a history.
 
         Every run starts from `first_pressure`.
         """
@@ -188,7 +188,7 @@ class ArmModel(nn.Module):
         return self.chain.scan(history, self.first_pressure(history)).behind["sensor"]
 
     def summary(self) -> str:
-        """One line: inputs, network, effects."""
+        """One line of text: inputs, network and effects."""
         inputs = "pressure+direction" if self.network.directions else "pressure"
         effects = " + ".join(self.effects) or "none"
         return (
@@ -199,7 +199,7 @@ class ArmModel(nn.Module):
 
 
 def arm_facts(spec: ArmSpec, rest_mm: Tensor) -> ArmFacts:
-    """What effects may know of the arm whose key points at rest are rest_mm, (n, 3) in mm."""
+    """Properties for the effects of an arm; rest_mm: (n, 3) key points at rest, mm."""
     low, high, rest = (torch.tensor(x) for x in (spec.low, spec.high, spec.rest))
     rest_mm = rest_mm.detach().cpu()
     return ArmFacts(

@@ -1,4 +1,7 @@
-"""HAW-NN: the Hysteresis-Aware Whole-body Neural Network (Chen et al. 2025, sec. III-A)."""
+"""Networks from actuation to key points: HAW-NN, constant curvature and a recurrent baseline.
+
+HAW-NN is the Hysteresis-Aware Whole-body Neural Network of Chen et al. (2025, sec. III-A).
+"""
 
 import itertools
 import math
@@ -69,9 +72,9 @@ class HawNN(nn.Module):
 
     @torch.no_grad()
     def with_directions(self, use: Tensor) -> "HawNN":
-        """The same function with direction inputs added, whose weights start at zero.
+        """This network with added direction inputs whose weights are zero: an equal function.
 
-        `use` (m,) is 1 for each chamber whose direction the data supports, 0 elsewhere.
+        use: (m,) 1 for each chamber whose direction the data supports, 0 elsewhere.
         """
         grown = HawNN(
             self.centre - self.half_range,
@@ -94,7 +97,7 @@ def range_weights(key_points: Tensor) -> Tensor:
     """Weights of the motion-range weighted MSE (Chen et al. 2025, eqs. 4-5).
 
     w_i = 1 + N dY_i / sum_i dY_i over the N = 3n output coordinates, dY_i their motion range.
-    Key points (S, n, 3) in mm, NaN where missing; answer (n, 3), without unit, mean 2.
+    Key points (S, n, 3) in mm, NaN where missing; returns (n, 3), without unit, mean 2.
     """
     low = key_points.nan_to_num(nan=float("inf")).amin(0)
     high = key_points.nan_to_num(nan=float("-inf")).amax(0)
@@ -121,10 +124,10 @@ def _rotation(vector: Tensor) -> Tensor:
 
 
 def arc_point(bend: Tensor, length: Tensor) -> Tensor:
-    """End of an arc that starts at the origin along z.
+    """End of a circular arc that starts at the origin along z (Webster & Jones 2010).
 
-    bend (..., 2) in rad is the arc's angle times its direction in x and y, length (...,) in mm;
-    answer (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
+    bend (..., 2) in rad is the arc's angle a times its direction in x and y, length L (...,) in mm;
+    returns (..., 3) in mm: x, y = L (1 - cos a) / a^2 bend, z = L sin(a) / a.
     """
     square = bend.square().sum(-1)
     angle = (square + 1e-12).sqrt()
@@ -140,7 +143,7 @@ def arc_rotation(bend: Tensor) -> Tensor:
 
 
 class ConstantCurvature(nn.Module):
-    """Key points of a chain of constant-curvature arcs; ignores directions."""
+    """Key points on constant-curvature arcs; ignores directions (Webster & Jones 2010)."""
 
     directions = False
 
@@ -162,7 +165,7 @@ class ConstantCurvature(nn.Module):
         self.base_mm = nn.Parameter(torch.zeros(3))
 
     def set_rest(self, rest: Tensor) -> None:
-        """Lengths from the key points at rest, (n, 3) in mm, base frame."""
+        """Set base, length and spacing from the key points at rest, (n, 3) in mm, base frame."""
         steps = rest.diff(dim=0).norm(dim=-1)
         if not float(steps.sum()) > 0:
             raise InputError("constant curvature: all key points coincide, expected a chain")
@@ -193,7 +196,7 @@ class ConstantCurvature(nn.Module):
 
 
 class RecurrentArm(nn.Module):
-    """[p, d] at each row -> hidden state -> key points."""
+    """Gated recurrent unit (Cho et al. 2014) from pressures and directions to key points."""
 
     directions = True
 

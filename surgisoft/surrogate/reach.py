@@ -1,4 +1,4 @@
-"""The shapes that a fitted arm can take, as plain arrays for geometric planning."""
+"""Centrelines that a fitted arm can reach, as plain arrays for geometric planning."""
 
 import numpy as np
 import torch
@@ -7,21 +7,22 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.model import ArmModel
 
 COUNTS = {1: 41, 2: 41, 3: 15, 4: 8, 5: 6, 6: 5}
-"""Samples of each chamber's range, by the number of chambers: at most 16,000 shapes."""
+"""Samples of each chamber's range, by the number of chambers: at most 16,000 centrelines."""
 
 
 def model_table(
     model: ArmModel, points: int = 15
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Shapes of an arm on a grid over its chambers' ranges, each reached from rest.
+    """Centrelines of an arm on a grid over its chambers' ranges, each reached from rest.
 
     Returns the grid's axes in the arm's unit; centrelines (N, points, 3) in mm and tip directions
-    (N, 3), unit, both in the base frame, the last axis running fastest.
+    (N, 3), unit, both in the base frame, the last axis running fastest. Raises InputError for an
+    arm of more than six chambers.
     """
     spec = model.spec
     if spec.chambers not in COUNTS:
         raise InputError(
-            f"an arm of {spec.chambers} chambers has too many shapes for a table; expected at "
+            f"an arm of {spec.chambers} chambers needs too large a table; expected at "
             f"most {max(COUNTS)}"
         )
     count = COUNTS[spec.chambers]

@@ -19,7 +19,7 @@ from surgisoft.compiled import compiled
 def clamp_loop(low, high, start, out):
     """y[r, t, c] = clamp(y[r, t - 1, c], low, high) into out; start (R, C), the rest (R, T, C).
 
-    A bound that is not a number makes the answer none.
+    A bound that is not a number makes the result not a number.
     """
     for r in range(out.shape[0]):
         for t in range(out.shape[1]):
@@ -58,9 +58,9 @@ def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:
 
 
 def clamp_scan(low: Tensor, high: Tensor, start: Tensor) -> Tensor:
-    """y[:, t] = clamp(y[:, t-1], low[:, t], high[:, t]) with y[:, -1] = start.
+    """Recurrence y[:, t] = clamp(y[:, t-1], low[:, t], high[:, t]) with y[:, -1] = start.
 
-    Shapes: low, high (R, T, ...), start (R, ...); answer (R, T, ...).
+    low, high: (R, T, ...); start: (R, ...); returns (R, T, ...).
     """
     looped = _looped(clamp_loop, (low, high), start)
     if looped is not None:
@@ -105,7 +105,7 @@ def play_scan(signal: Tensor, radius: Tensor, start: Tensor) -> Tensor:
 
 
 def last_nonzero(values: Tensor) -> Tensor:
-    """At each step the latest value along dim 1 that is not zero; 0 before the first.
+    """Latest value along dim 1 that is not zero, at each step; 0 before the first.
 
     Shape (R, T, ...) in and out.
     """
@@ -116,9 +116,9 @@ def last_nonzero(values: Tensor) -> Tensor:
 
 
 def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
-    """y[:, t] = factor[:, t] y[:, t-1] + addend[:, t] with y[:, -1] = start.
+    """Recurrence y[:, t] = factor[:, t] y[:, t-1] + addend[:, t] with y[:, -1] = start.
 
-    Shapes: addend (R, T, ...), factor broadcast to it with its own (R, T), start (R, ...); answer
+    addend: (R, T, ...); factor: broadcast to it, with its (R, T); start: (R, ...); returns
     (R, T, ...). Real or complex, differentiable; with |factor| <= 1 no intermediate grows. Affine
     maps compose to affine maps (Blelloch 1990, "Prefix sums and their applications", sec. 1.4):
     all blocks of about sqrt(T) rows are stepped at once, then the blocks one after the other.
@@ -139,8 +139,8 @@ def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
         within.append(now * within[-1] + plus)
     share = factor.cumprod(2)
     before = [start]
-    for kept, last in zip(share[:, :, -1].unbind(1), within[-1].unbind(1), strict=True):
-        before.append(kept * before[-1] + last)
+    for factor_of_block, last in zip(share[:, :, -1].unbind(1), within[-1].unbind(1), strict=True):
+        before.append(factor_of_block * before[-1] + last)
     whole = torch.stack(within, 2) + share * torch.stack(before[:-1], 1).unsqueeze(2)
     return whole.flatten(1, 2)[:, :steps]
 
@@ -151,16 +151,16 @@ def follow(
     start: Tensor,
     tolerance: Tensor | float,
 ) -> Tensor:
-    """y[:, t] = target[:, t] - left(target[:, t] - y[:, t-1]) with y[:, -1] = start.
+    """Recurrence y[:, t] = target[:, t] - left(target[:, t] - y[:, t-1]) with y[:, -1] = start.
 
-    decayed: what a row leaves of a gap (R, T, m), and its derivative by the gap. Shapes: target
-    (R, T, m), start (R, m); answer (R, T, m).
+    decayed: function that gives what a row leaves of a gap (R, T, m), and its derivative by the
+    gap. target: (R, T, m); start: (R, m); returns (R, T, m).
 
-    By Newton's method on the whole recording (Lim et al. 2024, "Parallelizing non-linear sequential
-    models over the sequence length"): around the last answer a row's map of the row before is
+    Newton's method on the whole recording (Lim et al. 2024, "Parallelizing non-linear sequential
+    models over the sequence length"): around the last iterate a row's map of the row before is
     affine, and one scan solves all of them. After k passes the first k rows are those of stepping;
     a handful of passes are enough: they end where nothing moves by more than the tolerance. The
-    last pass, at the answer, carries the gradients.
+    last pass, at the solution, carries the gradients.
     """
 
     def solve(lagged: Tensor) -> Tensor:
@@ -170,12 +170,12 @@ def follow(
         return linear_scan(slope, target - left - slope * before, start)
 
     with torch.no_grad():
-        lagged, settled = target, torch.zeros_like(target[:, :1, :1], dtype=torch.bool)
+        lagged, converged = target, torch.zeros_like(target[:, :1, :1], dtype=torch.bool)
         for _ in range(target.shape[1]):
-            last, lagged = lagged, torch.where(settled, lagged, solve(lagged))
+            last, lagged = lagged, torch.where(converged, lagged, solve(lagged))
             moved = ((lagged - last).abs() > tolerance).flatten(1).any(1)
-            settled = settled | ~moved.view(-1, 1, 1)
-            if bool(settled.all()):
+            converged = converged | ~moved.view(-1, 1, 1)
+            if bool(converged.all()):
                 break
     return solve(lagged.detach())
 

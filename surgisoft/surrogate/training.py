@@ -20,14 +20,18 @@ HOLD_BLOCKS = 20
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of histories without padding, with what a static model sees in each."""
+    """Rows of histories without padding, with the inputs of a static model in each."""
 
     pressure: Tensor
+    """(S, m) chamber pressure, in the arm's unit."""
     direction: Tensor
+    """(S, m) direction of change."""
     memory: dict[str, Tensor]
+    """(S, ...) memory of each effect in front of the network."""
     target: Tensor
+    """(S, n, 3) measured key points, mm, base frame; NaN where missing."""
     block: Tensor
-    """(S,) id of the block of time that a row belongs to, for bootstraps."""
+    """(S,) number of the block of time that a row belongs to, for significance tests."""
 
     def take(self, index: Tensor) -> "Rows":
         """The rows at an index or mask (S,)."""
@@ -74,23 +78,23 @@ class Data:
 
     @classmethod
     def split(cls, train: History, valid: History | None, seed: int) -> "Data":
-        """Validate on a validation history, or on held-out runs or blocks without one."""
+        """Data that validate on `valid`, or without it on held-out runs or blocks of `train`."""
         return cls(train, valid, hold_out(train, seed) if valid is None else None)
 
     @property
-    def judge(self) -> History:
+    def validation(self) -> History:
         """The history that the validation rows are part of."""
         return self.train if self.valid is None else self.valid
 
     def fitted_rows(self, model: ArmModel, trace: Taps | None = None) -> Rows:
-        """The rows to fit to, as the model sees them."""
+        """The rows to fit to, with the inputs that a static model gets in each."""
         rows = make_rows(model, self.train, trace)
         if self.held is None:
             return rows
         return rows.take(~self.train.rows(self.held)[measured_rows(self.train)])
 
-    def judging_rows(self, model: ArmModel) -> Rows:
-        """The validation rows, as the model sees them."""
+    def validation_rows(self, model: ArmModel) -> Rows:
+        """The validation rows, with the inputs that a static model gets in each."""
         if self.valid is not None:
             return make_rows(model, self.valid)
         held = self.train.rows(self.held)[measured_rows(self.train)]
@@ -107,7 +111,7 @@ class Data:
 def make_rows(
     model: ArmModel, history: History, trace: Taps | None = None, block_rows: int = 25
 ) -> Rows:
-    """The measured rows of a history as the model sees them."""
+    """The measured rows of a history, with the inputs that a static model gets in each."""
     if trace is None:
         with torch.no_grad():
             trace = model.trace(history)
@@ -172,17 +176,17 @@ CHECK_EVERY = 10
 PATIENCE = 10
 """Validations without improvement before training stops (Chen et al. 2025)."""
 RATES = {"constant curvature": 10.0}
-"""Factors on the learning rate: a handful of parameters of size one takes larger steps."""
+"""Factors on the learning rate: a few parameters of size one need larger steps."""
 AVERAGE_EPOCHS = 3
 """Span of the running average of the weights (Polyak & Juditsky 1992) that is validated."""
 WINDOW = 1024
 """Rows of a window of a run through which memories are trained."""
 WINDOWS = 4
-"""Windows a step."""
+"""Windows per step."""
 MEMORY_STEPS = 3
 """Steps through windows after each epoch of rows."""
 MEMORY_FIRST = 3
-"""Epochs of rows before the memory is touched."""
+"""Epochs of rows before the memory parameters are trained, too."""
 MEMORY_RATE = 10.0
 """Learning rate of memory parameters, times that of the others."""
 
@@ -190,10 +194,11 @@ MEMORY_RATE = 10.0
 def train(
     model: ArmModel, data: Data, name: str, epochs: int, config, losses: list, progress
 ) -> int:
-    """Adam with a cosine schedule; the model ends as its running average of least validation error.
+    """Train by Adam with a cosine schedule; the model ends with its best running average.
 
-    Memories are trained in the stages of effects only. Appends (name, epoch, training loss,
-    validation loss) to `losses`; returns the epochs done.
+    The best average is that of least validation error (early stopping). Memory parameters are
+    trained in the stages of effects only. Appends (name, epoch, training loss, validation loss) to
+    `losses`; returns the number of epochs done.
     """
     every = [p for effect in model.effects.values() for p in effect.memory_parameters()]
     every += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
@@ -212,13 +217,13 @@ def train(
     average = copy.deepcopy(model)
     fast, slow = list(model.parameters()), list(average.parameters())
 
-    judging = None if deep else data.judging_rows(average)
+    fixed_rows = None if deep else data.validation_rows(average)
 
-    def judge() -> float:
-        judged = judging or data.judging_rows(average)
-        return float(weighted_mse(model_rows(average, judged), judged.target, weights))
+    def validation_loss() -> float:
+        held_out = fixed_rows or data.validation_rows(average)
+        return float(weighted_mse(model_rows(average, held_out), held_out.target, weights))
 
-    best, best_state, waited, loss = judge(), copy.deepcopy(model.state_dict()), 0, 0.0
+    best, best_state, waited, loss = validation_loss(), copy.deepcopy(model.state_dict()), 0, 0.0
     epoch = 0
     for epoch in range(1, epochs + 1):
         order = torch.randperm(len(rows.target), generator=generator)
@@ -233,7 +238,7 @@ def train(
             trace = _trace(model, data)
             rows = data.fitted_rows(model, trace)
         if epoch % CHECK_EVERY == 0 or epoch == epochs:
-            now = judge()
+            now = validation_loss()
             losses.append((name, epoch, loss, now))
             waited = 0 if now < best else waited + 1
             if now < best:
@@ -261,7 +266,7 @@ def _step(model: ArmModel, rows: Rows, weights: Tensor, optimiser) -> float:
 
 
 class _Through:
-    """Training of memory parameters through windows of runs."""
+    """Training of memory parameters by gradients through windows of runs."""
 
     def __init__(self, model, data: Data, parameters, weights, config, epochs, generator):
         self.model, self.weights, self.generator = model, weights, generator
@@ -339,7 +344,10 @@ BURN_IN = 32
 def train_recurrent(
     model: ArmModel, data: Data, epochs: int, rate: float, seed: int, progress=None
 ) -> tuple[list[tuple[str, int, float, float]], int]:
-    """Adam on windows; ends as the best on the validation rows. Returns (losses, epochs done)."""
+    """Train a recurrent model by Adam on windows; it ends with its best validated weights.
+
+    Returns (losses, number of epochs done).
+    """
     train = data.train
     generator = torch.Generator().manual_seed(seed)
     network: RecurrentArm = model.network
@@ -393,9 +401,9 @@ def train_recurrent(
 
 def held_rows(model: ArmModel, data: Data) -> tuple[Tensor, Tensor]:
     """(predicted, measured) key points (S, n, 3) in mm on the validation rows."""
-    mask = data.judge.valid if data.held is None else data.held
+    mask = data.validation.valid if data.held is None else data.held
     with torch.no_grad():
-        return model.predict(data.judge)[mask], data.judge.key_points[mask]
+        return model.predict(data.validation)[mask], data.validation.key_points[mask]
 
 
 def held_error(model: ArmModel, data: Data, weights: Tensor) -> float:

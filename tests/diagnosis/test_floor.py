@@ -1,9 +1,16 @@
 """The floor from inputs that came twice, and what must not be taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.residuals import problem_of, repeat_floor, residual_table
+from surgisoft.diagnosis.residuals import (
+    held_out_rows,
+    problem_of,
+    repeat_floor,
+    residual_table,
+)
 from tests.diagnosis.synthetic import NOISE_MM, recording, still_model, walk
 
 FLOOR = np.sqrt(3) * NOISE_MM
@@ -47,6 +54,20 @@ def test_a_statement_of_the_lab_comes_first():
     made = recording(np.zeros(600), walk(600), noise_mm=0.2)
     floor = residual_table(still_model(), [made]).floor
     assert (floor.source, floor.rmse_mm) == ("sidecar", pytest.approx(0.2 * np.sqrt(3)))
+
+
+def test_held_out_rows_take_no_part_in_a_floor_from_second_differences():
+    """Wild key points there change the floor of all rows and not that of either part."""
+    ramp = 5 + 5 * np.sin(np.arange(1500) / 60)[:, None] * [1.0, 0.5]
+    made = recording(0.3 * ramp[:, 0], ramp, noise_mm=None)
+    points = made.key_points_mm.copy()
+    held = held_out_rows([made])
+    points[held] += np.random.default_rng(7).normal(0, 40 * NOISE_MM, points[held].shape)
+    wild = residual_table(still_model(), [replace(made, key_points_mm=points)])
+    for part in ("training", "held_out"):
+        assert wild.only(part).floor.rmse_mm == pytest.approx(FLOOR, rel=0.05)
+        assert wild.view(part).noise_mm == pytest.approx(NOISE_MM * np.sqrt(3), rel=0.1)
+    assert wild.only("all").floor.rmse_mm > 1.2 * FLOOR
 
 
 def test_second_differences_find_the_noise_of_a_smooth_motion():

@@ -15,7 +15,7 @@ from surgisoft.diagnosis.design.isolability import (
     history_of_protocol,
     inducing_points,
     isolability,
-    judge,
+    isolability_from,
     uncertainty_of,
     unimitated,
 )
@@ -102,7 +102,7 @@ def test_identical_columns_cannot_be_told_apart_and_single_ones_are_symmetric():
     columns[..., 1] = 1.7 * columns[..., 0]
     moments = Moments.of(columns, x, d, uncertainty, 40.0)
     draws = Draws(np.eye(3), np.arange(3))
-    result = judge(moments, draws, ["a", "b", "c"], [np.array([k]) for k in range(3)])
+    result = isolability_from(moments, draws, ["a", "b", "c"], [np.array([k]) for k in range(3)])
     assert result.separability[0, 1] == pytest.approx(0.0, abs=1e-4)
     assert result.confidence[0, 1] == pytest.approx(0.5, abs=0.02)
     assert result.separability[0, 2] > 0.5

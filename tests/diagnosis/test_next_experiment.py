@@ -10,7 +10,7 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.diagnosis.design.isolability import isolability
 from surgisoft.diagnosis.design.next_experiment import (
-    likely_rivals,
+    likely_competing,
     make_plans,
     next_experiment,
     pose_question,
@@ -123,7 +123,7 @@ def test_the_plan_tells_more_than_any_one_of_other_schedules(arm):
 
 
 def test_rivals_of_a_lag_are_found_and_a_change_of_the_bench_settles_them(problem):
-    rivals = likely_rivals(problem)
+    rivals = likely_competing(problem)
     assert rivals[0] in ("line_lag", "rate_dependence")
     assert len(rivals) >= 2
     answer = recommend(problem, ["line_lag", "rate_dependence"])

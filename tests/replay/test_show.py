@@ -1,4 +1,4 @@
-"""Which file a path means."""
+"""Which replay a path names."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""From mesh files to scenes: what comes out holds before the checker, what cannot be is said."""
+"""From mesh files to scenes: new scenes pass the check by FCL, impossible ones give a reason."""
 
 import dataclasses
 import os
@@ -68,7 +68,7 @@ def test_a_scene_comes_out_in_millimetres_and_outwards(made):
 
 
 def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
-    """The verdict again, from the scene's numbers alone and by other ways: rays by trimesh."""
+    """The same result from the scene's numbers alone, with rays by trimesh."""
     scene = open_scene(made[1])
     reaches = reaches_of(scene)
     verdict = check_scene(scene, reaches)
@@ -195,7 +195,7 @@ def test_a_path_off_the_organ_tells_how_far(made, tmp_path, capsys):
     off = float(re.search(r"its path_mm leaves the surface by (\S+) mm", said)[1])
     assert 20.0 < off < 40.5
     assert "path 2 mm" in said
-    assert "hangs over" not in said
+    assert "extends over" not in said
 
 
 def test_an_arm_model_that_is_not_there_names_file_and_field(made, tmp_path, capsys):
@@ -262,7 +262,7 @@ def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):
     arguments = (tmp_path / "ball.ply", tmp_path / "lid.ply", "--unit", "mm", "--lesion", 0, 0, 60)
     assert new(tmp_path / "scene", *arguments) == 1
     said = capsys.readouterr().out
-    assert "ball.ply: unit mm, as told\n" in said
+    assert "ball.ply: unit 'mm' as given\n" in said
     assert "No scene was written" in said
     assert "the best covers 0 %" in said
     assert not (tmp_path / "scene").exists()
@@ -274,7 +274,9 @@ def test_a_lesion_on_the_side_is_reached_where_the_lid_leaves_room(tmp_path, cap
     arguments = (tmp_path / "ball.ply", f"{tmp_path / 'lid.ply'}:support", "--lesion", 60, 0, -20)
     assert new(tmp_path / "scene", *arguments) == 0
     # sqrt(60^2 + 20^2) - 60 = 3.246 mm outside the ball, whose facets lie up to 0.15 mm within
-    said = re.search(r"given lies (\S+) mm off the surface: moved", capsys.readouterr().out)
+    said = re.search(
+        r"given point was (\S+) mm off the surface and was moved", capsys.readouterr().out
+    )
     assert 3.2 < float(said[1]) < 3.5
     scene = open_scene(tmp_path / "scene")
     assert scene.spec.body("lid").role == "support"
@@ -289,7 +291,7 @@ BAD = [
     ),
     (("nowhere.stl",), "there is no such file"),
     (("ball.ply", "--unit", "inch"), "unknown unit 'inch'"),
-    (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; expected 20 to 600 mm"),
+    (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; organs measure 20 to 600 mm"),
     (("ball.ply:knife",), "role 'knife'"),
     (("ball.ply:support",), "expected the organ first"),
     (("ball.ply", "--diameter", "0"), "--diameter is 0"),
@@ -297,7 +299,7 @@ BAD = [
     (("ball.ply", "--lesion", "0", "0", "60", "--lesion-direction", "0", "0", "1"), "both"),
     (("ball.ply", "--lesion-direction", "0", "0", "0"), "not zero"),
     (("ball.ply", "--lesion", "nan", "0", "0"), "finite"),
-    (("half.ply",), "too large to guess shut"),
+    (("half.ply",), "too large to close"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""What the camera sees, against geometry done by hand, and the picture against the same."""
+"""Visibility and rendered pictures against geometry that is worked out by hand."""
 
 import math
 
@@ -25,12 +25,12 @@ def flat_ring(radius, height, count=360):
     return np.stack((radius * np.cos(turn), radius * np.sin(turn), 0 * turn + height), axis=1)
 
 
-def on_box(referee_arms=None, eye=(0.0, 0, 60), target=(0.0, 0, 10), ring=None, camera=CAMERA):
+def on_box(arms_in_the_way=None, eye=(0.0, 0, 60), target=(0.0, 0, 10), ring=None, camera=CAMERA):
     ring = flat_ring(10.0, 10.0) if ring is None else ring
     checker = CollisionChecker([Body("slab", "organ", box((80, 80, 20)))])
     up = np.tile([0, 0, 1.0], (len(ring), 1))
     pose = frames.look_at(np.array(eye), np.array(target))
-    return view(checker, camera, pose, ring, up, referee_arms)
+    return view(checker, camera, pose, ring, up, arms_in_the_way)
 
 
 def test_a_ring_straight_ahead_is_wholly_seen():
@@ -85,7 +85,7 @@ def test_the_far_side_of_a_ball_is_hidden_by_the_ball():
         assert seen.fraction == float(angle < limit)
 
 
-def test_batched_view_agrees_with_the_referee(tmp_path):
+def test_batched_view_agrees_with_fcl(tmp_path):
     bodies = [Body("organ", "organ", lumpy(4))]
     engine = BatchedScene(bodies, {"laser": 5.0, "scope": 5.0}, most_nodes=20_000, cache=tmp_path)
     checker = CollisionChecker(bodies)

@@ -1,4 +1,4 @@
-"""The checker against closed forms and against engines that share none of its code."""
+"""The exact collision checker against closed forms and engines that share none of its code."""
 
 import math
 
@@ -22,7 +22,7 @@ BOX = np.array([40.0, 30.0, 20.0])
 POSE = frames.pose_from_z([12.0, -7.0, 30.0], [0.3, -0.5, 0.8], 0.7)
 
 
-def box_referee(**options):
+def box_checker(**options):
     return CollisionChecker([Body("box", "organ", box(BOX), POSE)], **options)
 
 
@@ -48,7 +48,7 @@ point = st.tuples(coordinate, coordinate, coordinate)
 def test_clearance_of_a_box_is_the_closed_form(start, end, radius):
     arm = straight(start, end, radius)
     dense = box_distance(np.linspace(start, end, 4001))
-    found = box_referee().clearance({"a": arm}).bodies_mm["a", "box"]
+    found = box_checker().clearance({"a": arm}).bodies_mm["a", "box"]
     outside = dense.min() > 1e-6
     if outside:
         spacing = np.linalg.norm(np.subtract(end, start)) / 4000
@@ -66,16 +66,16 @@ def test_touching_a_face_is_decided_to_a_nanometre(gap, axis):
     start[axis] = BOX[axis] / 2 + 2.0 + gap
     along = np.roll([1.0, 0, 0], axis + 1)
     arm = straight(start - 5 * along, start + 5 * along)
-    checker = box_referee()
+    checker = box_checker()
     assert checker.clearance({"a": arm}).bodies_mm["a", "box"] == pytest.approx(gap, abs=1e-9)
     assert bool(checker.collisions({"a": arm})) == (gap < 0)
 
 
 def test_an_arm_wholly_inside_is_found_though_it_touches_no_surface():
     arm = straight([-5, 0, 0], [5, 0, 0])
-    (found,) = box_referee().collisions({"a": arm})
+    (found,) = box_checker().collisions({"a": arm})
     assert (found.inside, found.kind, found.other) == (True, "body", "box")
-    assert box_referee().clearance({"a": arm}).bodies_mm["a", "box"] == pytest.approx(-12.0)
+    assert box_checker().clearance({"a": arm}).bodies_mm["a", "box"] == pytest.approx(-12.0)
 
 
 def test_a_body_wholly_inside_the_arm_is_found():
@@ -135,7 +135,7 @@ def test_self_clearance_of_a_hairpin_is_the_gap_between_its_legs():
 
 def test_far_clearances_saturate_at_the_horizon():
     arm = straight([0, 0, 500], [0, 0, 520])
-    assert box_referee(horizon_mm=30.0).clearance({"a": arm}).least_mm == 30.0
+    assert box_checker(horizon_mm=30.0).clearance({"a": arm}).least_mm == 30.0
 
 
 def test_open_meshes_have_no_inside():

@@ -1,4 +1,4 @@
-"""Batched clearance against the checker and against closed forms."""
+"""Batched clearance against FCL and against closed forms."""
 
 import math
 import os
@@ -66,7 +66,7 @@ def on_torch(bodies):
     return BatchedScene(bodies, {"a": RADIUS}, most_nodes=300_000, engine="torch")
 
 
-def test_ten_thousand_poses_agree_with_the_referee(organ_scene):
+def test_ten_thousand_poses_agree_with_fcl(organ_scene):
     """Within 0.1 mm near contact, and not one collision missed or made up."""
     bodies, scene = organ_scene
     checker = CollisionChecker(bodies)

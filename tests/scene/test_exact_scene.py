@@ -1,4 +1,4 @@
-"""FCL in the batched engine's place: the same answers, environment by environment."""
+"""FCL with the batched interface: the results equal those of single queries."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Crossing surfaces: what lies inside is known in closed form and gets nothing of the beam."""
+"""Self-intersecting surfaces: the part inside is known in closed form and receives no dose."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Mesh files: every format gives the same mesh, units are told, broken files get one line."""
+"""Mesh files: every format gives the same mesh, units are inferred, broken files get one line."""
 
 import numpy as np
 import pytest
@@ -56,24 +56,24 @@ def test_ply_keeps_every_bit(tmp_path):
 
 
 @given(size=st.floats(61.0, 600.0))
-def test_the_unit_is_told_from_an_organs_size(size):
+def test_the_unit_is_inferred_from_an_organs_size(size):
     assert recognise_unit(size).unit == "mm"
     assert recognise_unit(size / 10.0).unit == ("cm" if size < 200.0 else "mm")
     assert recognise_unit(size / 1000.0).unit == "m"
 
 
-def test_a_told_unit_that_makes_no_organ_is_warned_of():
-    assert given_unit(180.0, "mm") == "mm, as told"
+def test_a_given_unit_that_makes_no_organ_is_warned_of():
+    assert given_unit(180.0, "mm") == "'mm' as given"
     said = given_unit(180.0, "cm")
-    assert "in doubt: 1800 mm across is not an organ's size" in said
-    assert said.endswith("in mm it is 180 mm (--unit mm)")
-    assert "in doubt: 15 mm" in given_unit(15.0, "mm")
+    assert "the mesh would be 1800 mm across; organs measure 20 to 600 mm; check --unit" in said
+    assert said.endswith("--unit mm would give 180 mm")
+    assert "would be 15 mm" in given_unit(15.0, "mm")
 
 
-def test_doubt_about_the_unit_is_said():
+def test_an_uncertain_unit_is_reported():
     assert "--unit cm" in recognise_unit(35.0).sentence
     for odd in (5000.0, 1.2, 0.004):
-        assert "in doubt" in recognise_unit(odd).sentence
+        assert "uncertain" in recognise_unit(odd).sentence
     # the nearest to a liver of 180 mm, by factor: 1.2 m, 5 m and 4 mm
     assert [recognise_unit(odd).unit for odd in (5000.0, 1.2, 0.004)] == ["mm", "m", "m"]
 

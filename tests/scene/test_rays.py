@@ -1,4 +1,4 @@
-"""Batched rays against the checker, closed forms, and each engine against the other."""
+"""Batched rays against FCL, closed forms, and each engine against the other."""
 
 import math
 
@@ -53,7 +53,7 @@ def near_silhouette(checker, origins, aims, truth):
     return unsure
 
 
-def test_ten_thousand_rays_agree_with_the_referee(scene):
+def test_ten_thousand_rays_agree_with_fcl(scene):
     bodies, engine = scene
     origins, aims = random_rays(10_000, seed=1)
     found = engine.cast(origins, aims, RANGE)
@@ -89,7 +89,7 @@ def lasers(count, rng):
 
 
 @pytest.mark.parametrize("name", ["compiled", "torch"])
-def test_arms_in_the_way_agree_with_the_referee(scene, name, tmp_path):
+def test_arms_in_the_way_agree_with_fcl(scene, name, tmp_path):
     bodies, _ = scene
     radii = {"laser": 4.0, "scope": 5.0}
     engine = BatchedScene(bodies, radii, most_nodes=5_000, cache=tmp_path, engine=name)

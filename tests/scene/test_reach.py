@@ -1,4 +1,4 @@
-"""Reach tables against closed forms of the arc; aiming against arms that are known to solve_aim."""
+"""Reach tables against closed forms of the arc; inverse kinematics against known solutions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Repairs: each kind of damage gives back the body whose volume is known, and is counted."""
+"""Repairs: each kind of damage is counted, and the body has its known volume afterwards."""
 
 import contextlib
 
@@ -140,7 +140,7 @@ REFUSED = {
     "box without a side": (
         trimesh.creation.box((50, 50, 50)).vertices,
         trimesh.creation.box((50, 50, 50)).faces[2:],
-        "too large to guess shut",
+        "too large to close",
     ),
     "sheet": (SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), "enclose nothing"),
     "folded sheet": (SQUARE, np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]), "enclose"),

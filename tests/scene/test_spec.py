@@ -1,4 +1,4 @@
-"""The scene file: exact round trips, and one line for every way to get it wrong."""
+"""The scene file: exact round trips, and a one-line error for every bad field."""
 
 import dataclasses
 import json

@@ -44,7 +44,7 @@ from surgisoft.surrogate.model import ArmModel
 FORM_SHARE = 0.1
 """Share of an effect's mean square that its own formula misses."""
 FORM_S = 20.0
-"""Time over which what it misses stays alike, s: the blocks of time that a diagnosis judges on."""
+"""Time over which what it misses stays alike, s: the blocks of time that a diagnosis holds out."""
 ROOM = 2.0
 """Factor on the validated error that is allowed for."""
 INDUCING = 120
@@ -492,10 +492,10 @@ def isolability(
     columns = columns_on(design, size.shapes)
     draws = size.limited(size.draws(), columns)
     owners = [shape.name for shape in size.shapes]
-    return judge(moments_of(design, columns, uncertainty), draws, owners, size.spans)
+    return isolability_from(moments_of(design, columns, uncertainty), draws, owners, size.spans)
 
 
-def judge(
+def isolability_from(
     moments: Moments,
     draws: "Draws",
     owners: list[str],

@@ -32,7 +32,7 @@ from surgisoft.diagnosis.design.isolability import (
     Uncertainty,
     columns_on,
     design_of,
-    judge,
+    isolability_from,
     length_of,
     moments_of,
     planned_history,
@@ -111,9 +111,9 @@ class Question:
     """(E, E) misfit of the competing effects; larger where the recordings contradict the
     prediction."""
 
-    def judged(self, moments: Moments) -> Isolability:
+    def isolability(self, moments: Moments) -> Isolability:
         """What moments of columns and own weight say about the competing effects."""
-        return judge(moments, self.draws, self.owners, self.spans, self.misfit)
+        return isolability_from(moments, self.draws, self.owners, self.spans, self.misfit)
 
 
 def pose_question(
@@ -476,10 +476,10 @@ def _greedy(question: Question, setting: str, parts: dict[str, Moments], minutes
         for figure, part in parts.items():
             alone = part if new is None else new + part
             total = alone if question.known is None else question.known + alone
-            result = question.judged(total)
+            result = question.isolability(total)
             score = _score(result)
             if question.known is not None:
-                score += _score(question.judged(alone))
+                score += _score(question.isolability(alone))
             if best is None or score > best[0]:
                 best = (score, figure, alone, result)
         score, figure, new, result = best
@@ -626,7 +626,7 @@ def next_experiment(
         return propose(load_model(model), between, minutes, settings)
     arm, measured, notes = open_inputs(model, given)
     problem = identification_problem(arm, measured, reference)
-    found = recommend(problem, between or likely_rivals(problem), minutes, settings)
+    found = recommend(problem, between or likely_competing(problem), minutes, settings)
     return replace(found, notes=notes)
 
 
@@ -654,7 +654,7 @@ def propose(
     return _recommend(model, None, None if rivals is None else list(rivals), minutes, settings)
 
 
-def likely_rivals(problem: Problem, most: int = 4) -> list[str]:
+def likely_competing(problem: Problem, most: int = 4) -> list[str]:
     """The effects that explain the residual of a problem best: those that one could confuse.
 
     The best one, and up to `most` in all whose log evidence is at least half of its own; the two
@@ -729,7 +729,7 @@ def _worded(question: Question, plan: Plan, limits: np.ndarray) -> Recommendatio
     names = "+".join(dict.fromkeys(plan.figures))
     name = names if plan.setting == AS_IT_STANDS else f"{plan.setting}: {names}"
     protocol = schedule("next_experiment", figures, limits, question.model.spec.unit)
-    before = None if question.known is None else question.judged(question.known)
+    before = None if question.known is None else question.isolability(question.known)
     pairs = tuple(
         Pair((a, b), 0.5 if before is None else before.pair(a, b), plan.result.pair(a, b))
         for a, b in pairs_of(plan.result.names)

@@ -6,17 +6,21 @@ from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
 HOW = (
-    "Every effect is added to the model in each of its shapes, to first order, beside a flexible "
-    "correction for the surrogate's own error whose size is what the model was validated to. What "
-    "counts is the error on blocks of time that took no part in the fit.\n\n"
-    "Alone: the share of the held-out squared error above the noise floor that goes with this "
-    "effect only. Unique: the share that comes back when it is left out of all effects together; "
-    "effects that can stand in for each other have much of the first and little of the second.\n\n"
-    "Chance: how often random signs of the blocks' gains would give so large a gain in any of the "
-    "effects. Confidence: how often such a statement was right on virtual robots whose truth was "
-    "known; see the benchmark.\n\n"
-    "The last quarter of each recording was not looked at: it is kept for the final check of "
-    "`surgisoft amend`."
+    "Every effect is added to the model with each choice of its nonlinear parameters, to first "
+    "order in its amplitudes, beside a flexible function of actuation and direction that stands "
+    "for the model discrepancy and has the size of the model's validated error. Effects are "
+    "compared by the error on held-out blocks of time.\n\n"
+    "Alone: the share of the held-out squared error above the noise floor that this effect removes "
+    "by itself. Unique: the share that returns when it is left out of all effects together. Of "
+    "collinear effects, which predict nearly the same change, the first is large and the second "
+    "small.\n\n"
+    "P-value: how often random signs of the blocks' gains give so large a gain in any of the "
+    "effects (family-wise). Confidence: how often such a result was right on virtual robots whose "
+    "missing effect was known; see the benchmark.\n\n"
+    "Best achievable error: the least error on held-out blocks that the model, a black box or any "
+    "effect reached.\n\n"
+    "The diagnosis did not see the last quarter of each recording: `surgisoft amend` validates its "
+    "model on it."
 )
 TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
 """Tone of a verdict; the others are warnings."""
@@ -43,7 +47,8 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
                 "Next experiment",
                 [
                     Text(
-                        f"{plan.name}: {plan.minutes:g} minutes on the bench; tells apart: {pairs}."
+                        f"{plan.name}: {plan.minutes:g} minutes on the bench; "
+                        f"distinguishes {pairs}."
                     )
                 ],
             )
@@ -73,7 +78,7 @@ def _ranking(found: Diagnosis) -> Table:
         )
         for row in found.ranking
     ]
-    header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "chance"]
+    header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "p-value"]
     return Table(header, rows)
 
 

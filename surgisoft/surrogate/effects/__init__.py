@@ -1,4 +1,4 @@
-"""The physical effects by name: one file each, whose stem is the name."""
+"""The physical effects by name: one file each, whose stem is the name of the effect."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -48,7 +48,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "drift": Drift,
     "misalignment": Misalignment,
 }
-"""Every effect of the package by name; `known_effects` adds the users' own."""
+"""Every effect of the package by name; `known_effects` adds user-defined ones."""
 
 __all__ = [
     "EFFECTS",
@@ -82,9 +82,9 @@ def known_effects() -> dict[str, type[Effect]]:
 
 
 def register_effect_file(path: str | Path) -> str:
-    """Run a person's effect file and register its one `Effect`; returns its name, the file's stem.
+    """Run a user's effect file and register its one `Effect`; returns its name, the file's stem.
 
-    Only for files that the person who calls named: it runs code.
+    The file is code: register only files that the user has named.
     """
     return own.register_effect_file(path, EFFECTS)
 
@@ -127,7 +127,7 @@ def make_effect(name: str, facts: ArmFacts, **config) -> Effect:
 
 
 def free_name(kind: str, taken) -> str:
-    """What a model that has the effects `taken` calls one more of a kind: `creep`, `creep#2`."""
+    """Name of one more effect of a kind in a model that has the effects `taken`: `creep#2`."""
     number, name = 1, kind
     while name in taken:
         number += 1

@@ -1,12 +1,12 @@
 """The interface of a physical effect.
 
 An effect acts at one stage of the arm model's chain: line (commanded to chamber pressure),
-material (chamber pressure to effective actuation, with memory), body (loads deform the shape) or
-sensor (shape to what is measured); the network stands between material and body.
+material (chamber pressure to effective actuation, with memory), body (loads displace the key
+points) or sensor (true to measured key points); the network stands between material and body.
 
 An effect has amplitudes, in which its result is linear to first order and which change nothing at
-zero, and nonlinear parameters: time constants, widths, places. What identification needs to know
-of it beside its physics is its `Hypothesis` (`surgisoft.surrogate.effects.hypothesis`).
+zero, and nonlinear parameters: time constants, widths, places. How identification tries an effect
+is its `Hypothesis` (`surgisoft.surrogate.effects.hypothesis`).
 """
 
 from abc import ABC, abstractmethod
@@ -25,7 +25,7 @@ STAGES: tuple[Stage, ...] = ("line", "material", "body", "sensor")
 
 @dataclass(frozen=True)
 class ArmFacts:
-    """What an effect may know of its arm."""
+    """The properties of an arm that its effects may use."""
 
     low: Tensor
     """(m,) smallest actuation, in `unit`."""
@@ -36,7 +36,7 @@ class ArmFacts:
     rest_mm: Tensor
     """(n, 3) key points at rest, mm, base frame; zeros where not known yet."""
     gravity: tuple[float, float, float] | None = None
-    """Unit vector along the weight, base frame; None where the recordings do not say it."""
+    """Unit vector along the weight, base frame; None where the recordings do not state it."""
     length_mm: float | None = None
     """Length at rest, mm."""
     unit: str = "kPa"
@@ -47,7 +47,7 @@ class ArmFacts:
 
 @dataclass(frozen=True)
 class Context:
-    """What comes with the signal: time, and what else was measured.
+    """Time, temperature and pressure that come with a signal.
 
     Leading shape (B,) of one step, (R, T) of whole runs.
     """
@@ -64,7 +64,7 @@ class Context:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One parameter of an effect as a person reads it."""
+    """One parameter of an effect in a unit that a person reads, with its plausible range."""
 
     name: str
     """Name with its unit as suffix, such as `tau_s`."""
@@ -98,7 +98,7 @@ OLD_NAMES = {
     "shapes": "nonlinear_parameters",
     "columns": "sensitivities",
 }
-"""Methods of `Effect` by the names that they had before."""
+"""Present names of methods of `Effect`, by the old names that user-defined effects may have."""
 
 
 class Effect(nn.Module, ABC):
@@ -108,13 +108,13 @@ class Effect(nn.Module, ABC):
     the key points (..., n, 3), mm, base frame. With its amplitudes at zero an effect returns the
     signal unchanged, bit for bit.
 
-    User-defined effects of before may name their methods `strengths` (now `amplitudes`), `shapes`
+    Older user-defined effects may name their methods `strengths` (now `amplitudes`), `shapes`
     (now `nonlinear_parameters`) and `columns` (now `sensitivities`); either name works.
     """
 
     stage: Stage
     version: int = 1
-    """Version of `config` and of the parameters' meaning; a model's file keeps it."""
+    """Version of `config` and of the parameters' meaning, stored in a model's file."""
 
     def __init_subclass__(cls, **more):
         super().__init_subclass__(**more)
@@ -144,17 +144,17 @@ class Effect(nn.Module, ABC):
 
     @abstractmethod
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """`advance` over whole runs: memory (R, T, ...) from the memory (R, ...) before them.
+        """Memory (R, T, ...) along whole runs, from the memory (R, ...) before them.
 
-        Shapes: signal (R, T, ...), `context.dt_s` (R, T).
+        Equals `advance` row by row. signal: (R, T, ...); `context.dt_s`: (R, T).
         """
 
     @abstractmethod
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """The signal after the effect, same shape; any leading dimensions."""
+        """The signal after the effect, in the same array shape; any leading dimensions."""
 
     def forward(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """`apply`."""
+        """Call `apply`, as torch modules do."""
         return self.apply(signal, memory)
 
     def step(self, memory: Tensor, signal: Tensor, context: Context) -> tuple[Tensor, Tensor]:
@@ -167,7 +167,7 @@ class Effect(nn.Module, ABC):
         """The amplitudes by attribute name: all zero means no change at all."""
 
     def nonlinear_parameters(self) -> dict[str, nn.Parameter]:
-        """The other parameters by attribute name, each free to take any real value."""
+        """The parameters other than amplitudes, by attribute name; each may have any real value."""
         mine = {id(parameter) for parameter in self.amplitudes().values()}
         return {name: p for name, p in self.named_parameters() if id(p) not in mine}
 
@@ -183,8 +183,8 @@ class Effect(nn.Module, ABC):
         """(K, *signal.shape) derivative of `apply` by each of the K amplitudes, all at zero.
 
         The amplitudes come in the order of `amplitudes`, each flattened. The memory counts as
-        given. By forward differentiation; an effect may override it with the closed form, which
-        is several times as fast.
+        given. Computed by forward differentiation; an effect may override it with the closed form,
+        which is several times as fast.
         """
         zero = {name: torch.zeros_like(p) for name, p in self.amplitudes().items()}
 
@@ -201,7 +201,7 @@ class Effect(nn.Module, ABC):
         return []
 
     def use_chambers(self, use: Tensor) -> None:
-        """Leave out chambers (m,) with 0 that the data cannot support; most effects need not."""
+        """Exclude chambers (m,) with 0, which the data cannot support; most effects ignore it."""
 
     @abstractmethod
     def config(self) -> dict:
@@ -223,7 +223,7 @@ class Effect(nn.Module, ABC):
 
     @abstractmethod
     def quantities(self) -> list[Quantity]:
-        """The parameters as a person reads them."""
+        """The parameters in units that a person reads, with their plausible ranges."""
 
     def implausible(self) -> list[Quantity]:
         """The parameters outside their plausible range."""

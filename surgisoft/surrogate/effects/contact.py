@@ -1,4 +1,4 @@
-"""Contact: a one-sided support that part of the body cannot pass.
+"""Contact effect: a one-sided support that stops part of the body.
 
 The support is the plane {p : n . p = offset} with the arm's side below it, met by one key point c.
 Where that point would be deeper by delta, the support pushes it back by a share of delta and the
@@ -31,7 +31,7 @@ AROUND = 16
 DEPTHS = (0.5, 0.7, 0.86, 0.96)
 """Quantiles of the body's excursion at which identification puts the support."""
 LEAST_SHARE = 0.08
-"""Least share of a support that is there. One that yields more is met all the time and looks like
+"""Least plausible share. A support that yields more is in contact all the time and looks like
 a weight, or like a stiffer wall."""
 BESIDE = 1
 """Neighbouring directions, on either side, in which identification puts supports at once: the
@@ -54,8 +54,12 @@ class Contact(Memoryless):
         rise_rad: float = 0.0,
         offset_mm: float = 1.0,
     ):
-        """point: the key point that meets the support; azimuth from x and rise above the base's
-        plane of the normal, rad; offset of the plane along it, mm, base frame."""
+        """Place a support by the key point that meets it and by its plane.
+
+        point: number of that key point; azimuth_rad: angle of the plane's normal from x; rise_rad:
+        angle of the normal above the base plane; offset_mm: offset of the plane along its normal,
+        base frame.
+        """
         super().__init__(facts)
         beam = Beam.through(facts.rest_mm)
         self.point = int(point) % len(beam.levers)
@@ -71,6 +75,7 @@ class Contact(Memoryless):
         self.register_buffer("collect", beam.collect, persistent=False)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`share` (1,) of the penetration that the support pushes back; 1: rigid."""
         return {"share": self.share}
 
     @property
@@ -95,13 +100,16 @@ class Contact(Memoryless):
         return signal + self.share * self._yielded(signal)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(1, ..., n, 3) displacement by a rigid support, mm: closed form."""
         with torch.no_grad():
             return self._yielded(signal).unsqueeze(0)
 
     def config(self) -> dict:
+        """The key point that meets the support."""
         return {"point": self.point}
 
     def quantities(self) -> list[Quantity]:
+        """Share, direction (rad) and offset (mm) of the support, and its key point."""
         length = self.length_mm
         offset = length * float(self.offset.detach())
         reach = "within the arm's reach"

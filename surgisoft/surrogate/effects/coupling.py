@@ -1,12 +1,12 @@
-"""Coupling: a chamber loses push where another one is loaded.
+"""Coupling effect: a chamber pushes less where another chamber is loaded.
 
-A loaded neighbour bulges into it and stretches the wall that they share; the loss is a series in
-both loads, cut after its second order:
+A loaded neighbour bulges into the chamber and stretches the wall that they share; the loss is a
+series in both loads, truncated after its second order:
 
     x_eff_i = x_i - sum_{j != i} (linear x_j + quadratic_ij x_j |x_j|),      x = load,
 
-or, where others take a share of what the chamber pushes (all of them, or the next or the previous
-one of chambers in a ring),
+or, where other chambers reduce the push in proportion to it (all of them, or the next or the
+previous one of chambers in a ring),
 
     x_eff_i = x_i - sum_{j != i} linear x_j - product x_i sum_{j in who} x_j.
 """
@@ -26,17 +26,20 @@ from surgisoft.surrogate.effects.base import (
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 
 WHO = ("all", "next", "previous")
-"""Chambers that may take a share of what one pushes."""
+"""Chambers that may reduce the push of one chamber in proportion to it."""
 
 
 class Coupling(Memoryless):
-    """Loss of push by the other chambers' loads."""
+    """Loss of push of each chamber by the loads of the other chambers."""
 
     stage = "material"
 
     def __init__(self, facts: ArmFacts, pairs: bool = False, who: str | None = None):
-        """pairs: a quadratic loss of its own for each pair, not one for all; who: one of WHO, a
-        loss in its place that goes with both loads."""
+        """Choose the form of the second-order loss.
+
+        pairs: one quadratic amplitude for each pair of chambers, not one for all pairs; who: one of
+        WHO, for a loss by the product of both loads in place of the quadratic one.
+        """
         super().__init__(facts)
         if who is not None and who not in WHO:
             raise unknown_name("kind of chambers", who, WHO)
@@ -56,6 +59,7 @@ class Coupling(Memoryless):
         self.register_buffer("spread", spread, persistent=False)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`linear` (1,), and `quadratic` (1,) or (m (m - 1),), or `product` (1,)."""
         return {"linear": self.linear, self._second: getattr(self, self._second)}
 
     @property
@@ -72,6 +76,7 @@ class Coupling(Memoryless):
         return signal - self.reach * lost
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(K, ..., m) change of the actuation by each amplitude: closed form."""
         x = self.load(signal).detach()
         linear = (x.sum(-1, keepdim=True) - x).unsqueeze(0)
         other = x * x.abs() if self.who is None else x
@@ -81,9 +86,11 @@ class Coupling(Memoryless):
         return -self.reach * torch.cat([linear, second])
 
     def config(self) -> dict:
+        """The form of the second-order loss: `pairs` and `who`."""
         return {"pairs": self.pairs, "who": self.who}
 
     def quantities(self) -> list[Quantity]:
+        """Shares of push that a fully loaded neighbour costs, and their total."""
         wall = "wide: at most half of the push is lost to one neighbour"
         second = getattr(self, self._second)
         total = float(self.linear.detach()) + float(second.detach().sum()) / second.numel()

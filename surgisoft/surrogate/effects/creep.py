@@ -1,8 +1,8 @@
-"""Creep: a held load goes on deforming the wall, over decades of time.
+"""Creep effect: the wall goes on deforming under a held load, over decades of time.
 
 Kelvin-Voigt elements with retardation times tau_k, spaced evenly in log(tau), each follow the load
 with delay; their shares w_k are the log-normal spectrum that Wiechert (1893) proposed for real
-solids. A narrow one is a single time, a wide one makes the power law t^n (Findley 1976, ch. 5):
+solids. A narrow spectrum is a single time, a wide one the power law t^n (Findley 1976, ch. 5):
 
     z_k' = (g(x) - z_k) / tau_k,    g(x) = x |x|^(power - 1),
     w_k ~ exp(-(log(tau_k / tau) / width)^2 / 2),   sum_k w_k = 1,
@@ -44,7 +44,7 @@ GRID = (
 
 
 class Creep(Effect):
-    """Retarded loads over decades of time, the same for all chambers."""
+    """Delayed loads with a spectrum of retardation times, equal for all chambers."""
 
     stage = "material"
 
@@ -60,9 +60,11 @@ class Creep(Effect):
         self.log_power = logarithm(power)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`amount` (1,): creep under full load after infinite time, as a share of the load."""
         return {"amount": self.amount}
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """The load's power; the spectrum only weighs the elements and is no part of it."""
         return [self.log_power]
 
     @property
@@ -95,12 +97,15 @@ class Creep(Effect):
         return signal + self.amount * self.reach * (memory @ self.spectrum)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(1, ..., m) delayed actuation: closed form."""
         return (self.reach * (memory @ self.spectrum)).unsqueeze(0).detach()
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Amount, centre (s) and width of the spectrum, and the power of the load."""
         rubber = "wide: at most as much again as at once; a solid does not creep backwards"
         return [
             Quantity("amount_share", value_of(self.amount), "", 0.0, 1.0, rubber),

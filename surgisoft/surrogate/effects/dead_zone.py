@@ -1,6 +1,6 @@
-"""Dead zone: nothing moves before a threshold of push.
+"""Dead-zone effect: the arm moves little below a threshold of push.
 
-Folds, play and slack take up the first of the actuation, smoothly:
+Folds, play and slack absorb the first part of the actuation, smoothly:
 
     x_eff = x - threshold x / sqrt(x^2 + width^2),      x = load.
 
@@ -28,18 +28,19 @@ GRID = (0.04, 0.1, 0.25)
 
 
 class DeadZone(Memoryless):
-    """A smooth dead zone around rest, the same for all chambers or one for each."""
+    """A smooth dead zone around rest, one for all chambers or one for each."""
 
     stage = "material"
 
     def __init__(self, facts: ArmFacts, width: float = 0.1, each: bool = False):
-        """Half width, as a share of full load; each: a threshold for each chamber."""
+        """width: half width, as a share of full load; each: one threshold for each chamber."""
         super().__init__(facts)
         self.each = bool(each)
         self.threshold = amplitude(len(facts.low) if self.each else 1)
         self.log_width = logarithm(width)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`threshold` (1,) or (m,): loss of push far from rest, as a share of full load."""
         return {"threshold": self.threshold}
 
     def _lost(self, signal: Tensor) -> Tensor:
@@ -51,13 +52,16 @@ class DeadZone(Memoryless):
         return signal + self.threshold * self._lost(signal)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(K, ..., m) change of the actuation by each threshold: closed form."""
         lost = self._lost(signal).detach()
         return torch.diag_embed(lost).movedim(-1, 0) if self.each else lost.unsqueeze(0)
 
     def config(self) -> dict:
+        """Whether each chamber has a threshold."""
         return {"each": self.each}
 
     def quantities(self) -> list[Quantity]:
+        """Threshold and half width, in the arm's unit."""
         unit, full = self.facts.unit, float(self.reach.mean())
         folds = "a chamber that pushes in most of its range"
         threshold = value_of(full * self.threshold)

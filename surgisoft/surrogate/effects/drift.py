@@ -1,4 +1,4 @@
-"""Drift: what changes with elapsed time, or with the temperature of the room.
+"""Drift effect: a slow change with elapsed time or with the temperature of the room.
 
 `base`: the arm's holder yields, a rotation and shift of the whole body that grows towards a limit
 like a Kelvin-Voigt element under a constant load (Findley 1976, ch. 5),
@@ -6,9 +6,9 @@ like a Kelvin-Voigt element under a constant load (Findley 1976, ch. 5),
     g(t) = (1 - exp(-t / tau)) / (1 - exp(-600 s / tau)),      q = R(g turn) p + g shift,
 
 or, where many such elements yield one after the other, with (t / tau)^power for t / tau (Kohlrausch
-1854), so that `turn` and `shift` are those after ten minutes, and a tau of hours is a steady drift.
+1854). `turn` and `shift` are the values after ten minutes; a tau of hours is a steady drift.
 
-`actuation`: sensors and regulators of the chambers, or their walls, change in the same way,
+`actuation`: sensors and regulators of the chambers, or their walls, change with the same g(t),
 
     x_eff_i = x_i + g(t) (gain_i x_i + offset_i),      x = load.
 
@@ -16,8 +16,8 @@ or, where many such elements yield one after the other, with (t / tau)^power for
 
     x_eff_i = x_i + (T - T_0) / 10 K (gain x_i + offset_i).
 
-Elapsed time is that of the recording where there is one, and the sum of the steps in a world; where
-no temperature is known it counts as T_0.
+Elapsed time comes from the recording where it is stated, and is the sum of the steps in a
+simulated world; a temperature that is not known counts as T_0.
 """
 
 import torch
@@ -64,8 +64,12 @@ class Drift(Effect):
         reference_C: float | None = None,
         power: float | None = None,
     ):
-        """kind: one of KINDS; tau of base and actuation, s; T_0, degrees Celsius (default: that of
-        the room in which the arm was measured); power of the time, 1 where None."""
+        """Choose the kind of drift.
+
+        kind: one of KINDS; tau_s: time constant of `base` and `actuation`; reference_C: T_0 in
+        degrees Celsius (default: that of the room in which the arm was measured); power: of the
+        time, 1 if None.
+        """
         super().__init__(facts)
         if kind not in KINDS:
             raise unknown_name("kind of drift", kind, KINDS)
@@ -85,6 +89,7 @@ class Drift(Effect):
             self.log_power = None if power is None else logarithm(power)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`turn` (3,) rad and `shift` (3,) mm, or `gain` and `offset` by chamber."""
         if self.kind == "base":
             return {"turn": self.turn, "shift": self.shift}
         return {"gain": self.gain, "offset": self.offset}
@@ -138,6 +143,7 @@ class Drift(Effect):
         return signal + share * moved
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(K, ..., n, 3) or (K, ..., m) change by each amplitude: closed form."""
         with torch.no_grad():
             if self.kind == "base":
                 grown = self.grown(memory).unsqueeze(-2)
@@ -153,12 +159,14 @@ class Drift(Effect):
             return torch.cat([torch.diag_embed(gain).movedim(-1, 0), offsets])
 
     def config(self) -> dict:
+        """Kind, reference temperature and power of the time."""
         power = None
         if self.kind != "temperature" and self.log_power is not None:
             power = float(self.log_power.detach().exp())
         return {"kind": self.kind, "reference_C": self.reference_C, "power": power}
 
     def quantities(self) -> list[Quantity]:
+        """Change after ten minutes or by 10 K, and the time constant (s)."""
         if self.kind == "base":
             held = "a holder that yields a little, not one that has come loose"
             tau = value_of(self.log_tau.exp())

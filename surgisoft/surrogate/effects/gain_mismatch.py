@@ -1,4 +1,4 @@
-"""Gain mismatch: chambers of one make push unequally.
+"""Gain-mismatch effect: chambers that are nominally equal push unequally.
 
 Area, wall and pressure sensor of a chamber differ from the nominal ones by a constant factor:
 
@@ -13,7 +13,7 @@ from surgisoft.surrogate.effects.hypothesis import Hypothesis
 
 
 class GainMismatch(Memoryless):
-    """A gain for each chamber."""
+    """One relative gain error for each chamber."""
 
     stage = "material"
 
@@ -22,6 +22,7 @@ class GainMismatch(Memoryless):
         self.gain = amplitude(len(facts.low))
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`gain` (m,): relative error of each chamber's gain."""
         return {"gain": self.gain}
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -29,12 +30,15 @@ class GainMismatch(Memoryless):
         return signal + self.gain * (signal - self.origin)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(m, ..., m) change of the actuation by each gain: closed form."""
         return torch.diag_embed((signal - self.origin).detach()).movedim(-1, 0)
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Relative gain errors, by chamber."""
         cast = "wide: half to one and a half times the nominal push"
         return [Quantity("gain_share", self.gain.detach().tolist(), "", -0.5, 0.5, cast)]
 

@@ -1,4 +1,4 @@
-"""What identification needs to know of an effect, beside the effect's physics.
+"""How identification tries an effect: candidate parameters, combinations and criteria.
 
 A file of an effect ends with its `HYPOTHESIS`. An effect without one is tried as it is built by
 default; `hypothesis_of` then also reads the class attributes that older user-defined effects have.
@@ -19,7 +19,7 @@ def all_together(some: list[Effect]) -> list[list[int]]:
 
 
 def no_combinations(some: list[Effect]) -> list[list[int]]:
-    """No combination: several candidates of the effect at once make no sense."""
+    """No combination, for an effect of which several candidates at once make no sense."""
     return []
 
 
@@ -34,14 +34,14 @@ class Hypothesis:
     known of the arm and the predicted key points (S, n, 3) in mm of the recordings, base frame.
     None: the effect as its class builds it by default."""
     grid_further: Callable[[ArmFacts, Tensor], list[Effect]] | None = None
-    """Gives the same where the model has the effect already: effects that add up with any other of
-    the kind. None: there can only be more or less of the present one."""
+    """Gives effects of zero amplitude for a model that has the effect already: effects that add up
+    with any other of the kind. None: there can only be more or less of the present one."""
     combinations: Callable[[list[Effect]], list[list[int]]] = all_together
     """Sets of candidates, by number, that are also tried side by side."""
     needs_reversals: bool = False
     """Whether the effect can only be learned from data with inner reversals."""
     exact_form: bool = False
-    """Whether real arms have exactly this formula, as with a turned frame or a weight. Then the
+    """Whether real arms have exactly this formula, as with a rotated frame or a weight. Then the
     effect must explain more before it is named, because nothing but noise may be left of it."""
     mimic_log_odds: float = 0.0
     """Log odds of a diagnosis that names the effect. Below 0 for an effect that causes outside the
@@ -70,9 +70,9 @@ class Hypothesis:
 def hypothesis_of(effect: Effect | type[Effect]) -> Hypothesis:
     """The hypothesis of an effect or its class.
 
-    It is the `HYPOTHESIS` of the effect's file. Without one it is made from the class attributes
-    `candidates`, `further`, `together`, `side_by_side`, `needs_reversals` and `settled_form`, as
-    far as the class has them.
+    The `HYPOTHESIS` of the effect's file, if there is one. Otherwise it is built from the class
+    attributes `candidates`, `further`, `together`, `side_by_side`, `needs_reversals` and
+    `settled_form`, as far as the class has them.
     """
     kind = effect if isinstance(effect, type) else type(effect)
     stated = getattr(sys.modules.get(kind.__module__), "HYPOTHESIS", None)

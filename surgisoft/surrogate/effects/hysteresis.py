@@ -1,10 +1,10 @@
-"""Hysteresis: play operators with memory on mixtures of the chambers (Prandtl-Ishlinskii).
+"""Hysteresis effect: play operators on mixtures of the chambers (Prandtl-Ishlinskii model).
 
 A play operator of radius r follows its input through a gap of width 2r:
 y(t) = clamp(y(t-), u(t) - r, u(t) + r) (Krasnosel'skii & Pokrovskii 1989, ch. 1). Many of them
 remember every reversal that no larger one has wiped out. In a soft arm friction sits in the wall,
-and several chambers at once move the strain of a wall fibre; as in a vector hysteron model
-(Mayergoyz 2003, ch. 3), play operators therefore run along several lines l of the actuation space,
+and several chambers at once move the strain of a wall fibre; therefore play operators run along
+several lines l of the actuation space, as in a vector hysteron model (Mayergoyz 2003, ch. 3),
 
     u_l = sum_i a_li x_i + sum_ij b_lij x_i x_j,      x = actuation scaled to [-1, 1],
 
@@ -32,7 +32,7 @@ OTHERS = (0.0, -0.2, -0.4)
 SECTION = {3: -0.2, 4: 0.2}
 """Shares of the neighbours in the lines of a plane section: four fifths of a strain bend."""
 FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
-"""Radii for the question whether there is any play."""
+"""Radii for the test whether an arm has any hysteresis at all."""
 
 
 class Hysteresis(Effect):
@@ -88,32 +88,35 @@ class Hysteresis(Effect):
             self.slope = nn.Parameter(torch.zeros(shape))
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`weight` and `slope` (m, L, J); `turned` (L, J) for alike chambers in a ring."""
         if self.ring:
             return {"turned": self.turned}
         return {"weight": self.weight, "slope": self.slope}
 
     def use_chambers(self, use: Tensor) -> None:
+        """Exclude chambers (m,) with 0 from every line."""
         self.use.copy_(use)
 
     def lines(self, signal: Tensor) -> Tensor:
-        """(..., L) inputs of the lines' plays from the actuation (..., m)."""
+        """(..., L) inputs u of the lines' play operators from the actuation (..., m)."""
         x = (signal - self.centre) / self.half_range * self.use
         products = (x.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2)
         return x @ self.linear.T + products @ self.bent.flatten(1).T
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """The lines' mixtures a (L, m) and b (L, m, m)."""
         return [self.linear, self.bent]
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, L, J) plays centred on the lines at the actuation (B, m): no history."""
+        """(B, L, J) play operators centred on the lines at the actuation (B, m): no history."""
         return self.lines(signal)[..., None].expand(*signal.shape[:-1], -1, len(self.radii))
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, L, J) plays after the actuation (B, m); time does not matter."""
+        """(B, L, J) play operators after the actuation (B, m); time does not matter."""
         return self._follow(memory, self.lines(signal))
 
     def step(self, memory: Tensor, signal: Tensor, context: Context) -> tuple[Tensor, Tensor]:
-        """Plays and effective actuation after the actuation (B, m), its lines computed once."""
+        """Play operators and effective actuation after the actuation (B, m)."""
         u = self.lines(signal)
         memory = self._follow(memory, u)
         return memory, self._superpose(signal, u, memory)
@@ -123,12 +126,12 @@ class Hysteresis(Effect):
         return torch.clamp(memory, u - self.radius, u + self.radius)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, L, J) plays along the actuation (R, T, m), from plays (R, L, J) before it."""
+        """(R, T, L, J) play operators along the actuation (R, T, m), from (R, L, J) before it."""
         u = self.lines(signal).unsqueeze(-1)
         return play_scan(u.expand(*u.shape[:-1], len(self.radii)), self.radius, memory)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """Effective actuation (..., m) from actuation (..., m) and plays (..., L, J)."""
+        """Effective actuation (..., m) from actuation (..., m) and play operators (..., L, J)."""
         return self._superpose(signal, self.lines(signal), memory)
 
     def _superpose(self, signal: Tensor, u: Tensor, memory: Tensor) -> Tensor:
@@ -141,6 +144,7 @@ class Hysteresis(Effect):
         return signal + self.half_range * shift
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(K, ..., m) change of the actuation by each weight: closed form."""
         with torch.no_grad():
             u = self.lines(signal)
             lag = memory - u.unsqueeze(-1)
@@ -154,6 +158,7 @@ class Hysteresis(Effect):
             return torch.cat([x.flatten(0, 1) for x in moved])
 
     def config(self) -> dict:
+        """Radii and the choice of lines."""
         return {
             "radii": list(self.radii),
             "ring": self.ring,
@@ -163,6 +168,7 @@ class Hysteresis(Effect):
         }
 
     def quantities(self) -> list[Quantity]:
+        """Half loop widths in the arm's unit, the lines' shares and the radii."""
         weight = (self.turned[self.turns] if self.ring else self.weight).detach()
         # A full sweep opens each play by its radius on both sides.
         opened = (weight * self.radius).sum(-1) * self.half_range[:, None]
@@ -177,14 +183,14 @@ class Hysteresis(Effect):
 
 
 def turns(chambers: int, lines: int) -> Tensor:
-    """(m, L) which of the first chamber's lines each line is to each chamber of a ring."""
-    answer = []
+    """(m, L) line of the first chamber that corresponds to each line of each chamber of a ring."""
+    rows = []
     for chamber in range(chambers):
         row = [(line - chamber) % chambers for line in range(chambers)]
         pairs = lines - chambers
         row += [chambers + (pair - chamber) % pairs for pair in range(pairs)]
-        answer.append(row)
-    return torch.tensor(answer)
+        rows.append(row)
+    return torch.tensor(rows)
 
 
 def first_lines(chambers: int) -> Tensor:
@@ -197,7 +203,7 @@ def first_lines(chambers: int) -> Tensor:
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    """Chambers that are alike; the others stretch a fibre the other way, or do not."""
+    """Candidates for alike chambers; their lines differ in the share of the other chambers."""
     if len(facts.low) == 1:
         return [Hysteresis(facts, FEW_RADII, ring=True, pairs=False)]
     return [*_further(facts, points), Hysteresis(facts, FEW_RADII, True, True, OTHERS[1])]

@@ -1,4 +1,4 @@
-"""Inertia: the arm swings after its actuation.
+"""Inertia effect: the arm swings after its actuation changes.
 
 The first bending mode is an under-damped oscillator that the actuation drives (Meirovitch 2001,
 ch. 8):
@@ -42,21 +42,23 @@ GRID = (
 
 
 class Inertia(Effect):
-    """An under-damped second-order response, the same for all chambers."""
+    """An under-damped second-order response, equal for all chambers."""
 
     stage = "material"
 
     def __init__(self, facts: ArmFacts, frequency_Hz: float = 2.0, damping: float = 0.2):
-        """Undamped frequency, Hz, and damping ratio between 0 and 1."""
+        """frequency_Hz: undamped frequency; damping: damping ratio between 0 and 1."""
         super().__init__(facts)
         self.share = amplitude(1)
         self.log_frequency = logarithm(frequency_Hz)
         self.damping_logit = nn.Parameter(torch.tensor([math.log(damping / (1 - damping))]))
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`share` (1,) of the actuation that the oscillator delays; 1: all of it."""
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """Frequency and damping ratio, each (1,)."""
         return [self.log_frequency, self.damping_logit]
 
     def _pole(self) -> tuple[Tensor, Tensor]:
@@ -101,12 +103,15 @@ class Inertia(Effect):
         return signal + self.share * (memory[..., 0] - signal)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(1, ..., m) oscillator minus actuation: closed form."""
         return (memory[..., 0] - signal).unsqueeze(0).detach()
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Share, undamped frequency (Hz) and damping ratio."""
         soft = "wide: first modes of soft arms of centimetres to a metre"
         swings = "more hardly swings: it looks like viscosity"
         damping = value_of(self.damping_logit.sigmoid())

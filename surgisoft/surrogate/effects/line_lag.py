@@ -1,7 +1,7 @@
-"""Line lag: the chamber's pressure follows the command through a long thin tube.
+"""Line-lag effect: the chamber's pressure follows the command through a long thin tube.
 
 A chamber fills through the resistance of its tube (Blackburn, Reethof & Shearer 1960), with another
-time constant in emptying than in filling (choked and laminar flow, and the valve's own openings,
+time constant in emptying than in filling (choked and laminar flow, and the openings of the valve,
 differ). Slow flow in a tube is laminar, in proportion to the difference of pressure (Hagen &
 Poiseuille); fast flow is turbulent and goes with its root (Darcy & Weisbach). Forchheimer (1901)
 adds both resistances; here they pass into each other at the difference `turn`. The tube itself
@@ -64,25 +64,25 @@ GRID = (
     (0.35, 0.7, 0.02, TURBULENT),
     (0.6, 1.2, 0.02, TURBULENT),
 )
-"""(filling, emptying, dead time) in s and the difference of the turn that identification tries."""
+"""(filling, emptying, dead time) in s and the difference at which flow becomes turbulent."""
 TOLERANCE = 1e-6
-"""Change of a whole recording's lag, as a share of the range, at which its iteration ends."""
+"""Change of the lag, as a share of the range, below which the iteration over a recording ends."""
 
 
 class Flow(NamedTuple):
-    """How a chamber's difference to the end of its tube decays over one row each."""
+    """Decay of the pressure difference between chamber and end of the tube, over one row each."""
 
     up: Tensor
     """(..., 1) time of the row over the time constant of filling."""
     down: Tensor
-    """(..., 1) the same of emptying."""
+    """(..., 1) time of the row over the time constant of emptying."""
     turn: Tensor
-    """(1,) difference of the turn, in the signal's unit, by chamber."""
+    """(m,) difference at which flow becomes turbulent, in the signal's unit."""
     usual: Tensor
-    """Difference at which the time constants are stated, in the signal's unit, by chamber."""
+    """(m,) difference at which the time constants are stated, in the signal's unit."""
 
     def decayed(self, gap: Tensor) -> tuple[Tensor, Tensor]:
-        """What is left of a gap (..., m) after the row, and its derivative by the gap."""
+        """Remaining part of a gap (..., m) after the row, and its derivative by the gap."""
         times = torch.where(gap > 0, self.up, self.down)
         size = gap.abs()
         speed, drop = self._speed(times, size)
@@ -99,7 +99,7 @@ class Flow(NamedTuple):
 
 
 class LineLag(Effect):
-    """Lag of laminar or turbulent flow, with its own times up and down, and a dead time."""
+    """Lag of laminar or turbulent flow, with time constants up and down and a dead time."""
 
     stage = "line"
 
@@ -113,7 +113,7 @@ class LineLag(Effect):
     ):
         """Time constants of filling and emptying and the mean dead time, s.
 
-        turn: difference at which flow turns turbulent, as a share of the range.
+        turn: difference at which flow becomes turbulent, as a share of the range.
         """
         super().__init__(facts)
         self.share = amplitude(1)
@@ -123,13 +123,15 @@ class LineLag(Effect):
         self.log_turn = logarithm(turn)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`share` (1,) of the command that lags; 1: all of it."""
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """Time constants, dead time and turbulence threshold, each (1,)."""
         return [self.log_up, self.log_down, self.log_dead, self.log_turn]
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, m, 1 + CHAIN) the chamber's pressure and the chain's, all at the command (B, m)."""
+        """(B, m, 1 + CHAIN) pressures of the chamber and of the chain, at the command (B, m)."""
         return signal.unsqueeze(-1).expand(*signal.shape, 1 + CHAIN)
 
     def _keep(self, dt: Tensor) -> Tensor:
@@ -168,12 +170,15 @@ class LineLag(Effect):
         return signal + self.share * (memory[..., 0] - signal)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(1, ..., m) lagging pressure minus command: closed form."""
         return (memory[..., 0] - signal).unsqueeze(0).detach()
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Share, time constants and dead time (s), and the turbulence threshold."""
         tube = "wide: tubes of up to some ten metres; slower is creep"
         both = "from turbulent in every flow to laminar in every flow"
         return [

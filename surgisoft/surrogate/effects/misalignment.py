@@ -1,4 +1,4 @@
-"""Misalignment: the cameras' frame is turned, shifted and scaled against the arm's base frame.
+"""Misalignment effect: the cameras' frame differs from the arm's base frame.
 
     q = (1 + scale) R(turn) p + shift
 
@@ -26,6 +26,7 @@ class Misalignment(Memoryless):
         self.scale = amplitude(1)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`turn` (3,) rad, `shift` (3,) mm and `scale` (1,)."""
         return {"turn": self.turn, "shift": self.shift, "scale": self.scale}
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -34,15 +35,18 @@ class Misalignment(Memoryless):
         return turned + self.scale * turned + self.shift
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(7, ..., n, 3) change of the key points by each amplitude: closed form."""
         axes = torch.eye(3, dtype=signal.dtype, device=signal.device)
         axes = axes.view(3, *[1] * (signal.ndim - 1), 3).expand(3, *signal.shape)
         p = signal.detach()
         return torch.cat([torch.linalg.cross(axes, p.expand(axes.shape)), axes, p.unsqueeze(0)])
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Rotation vector (rad), shift (mm) and relative scale error."""
         setup = "beyond it the base frame was set up wrongly, not a little off"
         return [
             Quantity("turn_rad", value_of(self.turn), "rad", -0.3, 0.3, setup),

@@ -1,8 +1,8 @@
-"""Effects of the users' own: by entry point of an installed package, or by file.
+"""User-defined effects: by entry point of an installed package, or by file.
 
-A package offers effects in the entry point group `surgisoft.effects`; the entry's name is the
-effect's. A file holds one `Effect`; its stem is the effect's name, and it is only ever run because
-a person named it.
+A package offers effects in the entry point group `surgisoft.effects`; the name of the entry is the
+name of the effect. A file holds one `Effect`, and its stem is the name of the effect. A file is
+code and is run only if the user named it.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from surgisoft.surrogate.effects.base import STAGES, Effect
 GROUP = "surgisoft.effects"
 """Entry point group of effects in other packages."""
 RESERVED = ("network", "none")
-"""Names that mean something else in a model."""
+"""Names with another meaning in a model, which no effect may have."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class EffectFile:
     """An effect that came from a file."""
 
     kind: type[Effect]
-    """Its class."""
+    """Class of the effect."""
     path: str
     """The file as it was named."""
     sha256: str
@@ -34,18 +34,19 @@ class EffectFile:
 
 
 FILES: dict[str, EffectFile] = {}
-"""Effects from files that a person has named, by name."""
+"""Registered effects from files, by name."""
 
 
 def register_effect_file(path: str | Path, taken=()) -> str:
-    """Run a person's effect file and register its one `Effect`; returns its name, the file's stem.
+    """Run a user's effect file and register its one `Effect`; returns its name, the file's stem.
 
-    taken: names that the package has itself.
+    taken: names of the package's effects. Raises InputError where the file is missing, does not
+    run, does not hold exactly one complete `Effect`, or has a name that is in use.
     """
     path = Path(path)
     name = path.stem
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a .py file with one Effect in it")
+        raise InputError(f"{path}: no such file; name a .py file that defines one Effect")
     if path.suffix != ".py" or not name.isidentifier():
         raise InputError(f"{path}: expected a .py file whose stem is a plain name (my_effect.py)")
     if name in taken or name in RESERVED or name in offered():
@@ -71,8 +72,8 @@ def register_effect_file(path: str | Path, taken=()) -> str:
         and not value.__abstractmethods__
     ]
     if len(made) != 1:
-        found = ", ".join(kind.__name__ for kind in made) or "none"
-        raise InputError(f"{path}: expected one complete Effect in the file, found {found}")
+        names = ", ".join(kind.__name__ for kind in made) or "none"
+        raise InputError(f"{path}: expected one complete Effect in the file, found {names}")
     _check(made[0], str(path))
     FILES[name] = EffectFile(made[0], str(path), hashlib.sha256(content).hexdigest())
     return name
@@ -110,7 +111,7 @@ def _check(kind, label: str) -> None:
 
 
 def files_of(names) -> dict[str, dict]:
-    """Path and hash of those named effects that came from files, for a checkpoint."""
+    """Path and hash, by name, of those named effects that came from files, for a checkpoint."""
     return {
         kind: {"path": FILES[kind].path, "sha256": FILES[kind].sha256}
         for kind in map(kind_of, names)
@@ -119,7 +120,7 @@ def files_of(names) -> dict[str, dict]:
 
 
 def check_files(wanted: dict[str, dict], label: str) -> None:
-    """Raise unless a person has named each effect file that a checkpoint needs, unchanged."""
+    """Raise InputError unless each effect file of a checkpoint has been named and is unchanged."""
     for name, file in wanted.items():
         if name not in FILES:
             raise InputError(

@@ -1,12 +1,12 @@
-"""Payload: weight at the tip and along the body bends the arm.
+"""Payload effect: weight at the tip and along the body bends the arm.
 
 Euler-Bernoulli beam on the bent centreline r(s) (Love 1927, ch. XVIII; `effects/beam.py`):
 
     M(s) = (r_tip - r(s)) x F + int_s^L (r(s') - r(s)) x w ds',
     theta(s) = C int_0^s M ds,     u(s) = int_0^s theta x dr,     q = p + u.
 
-The shape of an arm determines only C F and C w, compliance times load. They are given as the sag
-that they cause at the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8.
+The key points of an arm determine only C F and C w, compliance times load. They are given as the
+sag that they cause at the tip of the same arm held straight and level: C F L^3 / 3 and C w L^4 / 8.
 Where gravity's direction is not known, each is a vector in the base frame.
 """
 
@@ -56,6 +56,7 @@ class Payload(Memoryless):
         return signal + self._moved(signal, torch.stack([self.tip_sag, self.body_sag]) @ self.down)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(K, ..., n, 3) displacement by each unit sag: closed form."""
         with torch.no_grad():
             p = signal.mT.contiguous()
             chords = p @ self.chords
@@ -69,9 +70,11 @@ class Payload(Memoryless):
             )
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Sags at the tip by the tip load, by the body load and by both, mm."""
         small = "to first order in the load, so below half the length"
         largest = 0.5 * self.length_mm
         least = -0.1 * self.length_mm if len(self.down) == 1 else -largest

@@ -1,17 +1,18 @@
-"""Rate dependence: a viscous wall resists fast changes.
+"""Rate-dependence effect: a viscous wall resists fast changes.
 
     y' = (u - y) / tau  (1 + |u - y| / turn) / (1 + 1/10 / turn),      u = A x / |A|, x = load,
     x_eff = x + share A' (y - u) / |A|.
 
 u is the load of a wall fibre, y the part of it that the fibre has followed, and u - y the stress
-that its fluid takes up. With share = 1 a fibre is a spring beside a dashpot (Kelvin & Voigt), with
-less the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is that
-of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newton's at stresses below
-`turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele). So
-tau is the time constant at a stress of a tenth of the range; turn -> infinity is Newton's fluid. A
-mixes the chambers' loads into those of the fibres (`fibre_matrix`): a chamber that bends the arm
-shortens the wall on the other side; what moves all fibres most is held back by the whole share.
-The load is held between two rows; over one of them the equation, a logistic one, is solved exactly.
+that its fluid carries. With share = 1 a fibre is a spring parallel to a dashpot (Kelvin & Voigt),
+with less the rest of the wall follows at once (the standard linear solid, Zener 1948). The fluid is
+that of Ellis with the exponent 2 (Bird, Armstrong & Hassager 1987, sec. 4.1): Newtonian at stresses
+below `turn`, beyond it shear-thinning with a stress like the root of the rate (Ostwald & de Waele).
+So tau is the time constant at a stress of a tenth of the range; turn -> infinity is a Newtonian
+fluid. A mixes the chambers' loads into those of the fibres (`fibre_matrix`): a chamber that bends
+the arm shortens the wall on the other side; what moves all fibres most is held back by the whole
+share. The load is held between two rows; over one of them the equation, a logistic one, is solved
+exactly.
 """
 
 import torch
@@ -66,13 +67,15 @@ class RateDependence(WallFibres):
         self.set_fibres(others, ring)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`share` (1,) of the load that the fluid holds back at first; 1: all of it."""
         return {"share": self.share}
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """Time constant, thinning stress and the fibres' mixture, each (1,)."""
         return [self.log_tau, self.log_turn, self.others]
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, K) what the fibres of an arm at rest at the actuation (B, m) have followed."""
+        """(B, K) loads that the fibres of an arm at rest at the actuation (B, m) have followed."""
         return self.fibre_loads(signal)
 
     def _decayed(self, dt: Tensor, stress: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,17 +86,17 @@ class RateDependence(WallFibres):
         return stress * keep / faster, keep / faster.square()
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, K) what the fibres have followed after the actuation (B, m)."""
+        """(B, K) loads that the fibres have followed after the actuation (B, m)."""
         u = self.fibre_loads(signal)
         return u - self._decayed(context.dt_s.unsqueeze(-1), u - memory)[0]
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(R, T, K) what the fibres have followed along the actuation (R, T, m)."""
+        """(R, T, K) loads that the fibres have followed along the actuation (R, T, m)."""
         dt = context.dt_s.unsqueeze(-1)
         return follow(lambda s: self._decayed(dt, s), self.fibre_loads(signal), memory, TOLERANCE)
 
     def _behind(self, signal: Tensor, memory: Tensor) -> Tensor:
-        """(..., m) what the fluid keeps back of the loads, at a share of one."""
+        """(..., m) part of the loads that the fluid holds back, at share 1."""
         return (memory - self.fibre_loads(signal)) @ self.fibres
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
@@ -101,9 +104,11 @@ class RateDependence(WallFibres):
         return signal + self.reach * self.share * self._behind(signal, memory)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(1, ..., m) actuation that the fluid holds back: closed form."""
         return (self.reach * self._behind(signal, memory)).unsqueeze(0).detach()
 
     def quantities(self) -> list[Quantity]:
+        """Share, time constant (s), thinning stress and the fibres' mixture."""
         rubber = "wide: what is slower than a second is creep"
         fluid = "1: a fluid keeps all of a step back; it cannot push"
         both = "from shear-thinning at every stress to Newton's at every stress"

@@ -10,7 +10,7 @@ def _over(value: Tensor, small: Tensor, square: Tensor) -> Tensor:
 
 
 def rotate(points: Tensor, vector: Tensor) -> Tensor:
-    """Points (..., 3) turned by rotation vectors (..., 3) in rad, broadcast (Rodrigues 1840).
+    """Rotate points (..., 3) by rotation vectors (..., 3) in rad, broadcast (Rodrigues 1840).
 
     p + a (v x p) + b v x (v x p) with a = sin|v| / |v|, b = (1 - cos|v|) / |v|^2; differentiable
     at v = 0, where the points come back bit for bit.

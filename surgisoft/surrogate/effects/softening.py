@@ -1,7 +1,7 @@
-"""Softening: the wall is softer below the largest load that it has seen (Mullins 1969).
+"""Softening effect: the wall is softer below the largest load that it has carried (Mullins 1969).
 
-As in pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall fibre's load, its
-largest value so far W_max, and an exponential instead of the error function:
+The form is that of pseudo-elasticity (Ogden & Roxburgh 1999), with the energy W ~ u^2 of a wall
+fibre's load, its largest value so far W_max, and an exponential instead of the error function:
 
     x_eff = x + own A' (u d(W, W_max)) / |A| + common x d(V, V_max),   u = A x / |A|,
     d(W, W_max) = 1 - exp(-(W_max - W) / (width + growth W_max)),
@@ -45,8 +45,9 @@ class Softening(WallFibres):
         others: float = 0.0,
         ring: bool = False,
     ):
-        """width: fall of the energy over which the wall turns soft, in units of that at full load.
+        """Choose the range of energy over which the wall softens, and the fibres.
 
+        width: drop of the energy over which the wall softens, in units of the energy at full load;
         growth: share of the largest energy that is added to the width; others, ring: the mixture of
         the wall fibres' loads (`fibre_matrix`).
         """
@@ -58,9 +59,11 @@ class Softening(WallFibres):
         self.set_fibres(others, ring)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`own` (1,) by each fibre's load and `common` (1,) by all chambers' loads."""
         return {"own": self.own, "common": self.common}
 
     def memory_parameters(self) -> list[nn.Parameter]:
+        """The fibres' mixture."""
         return [self.others]
 
     def energy(self, signal: Tensor) -> Tensor:
@@ -82,7 +85,7 @@ class Softening(WallFibres):
         return torch.maximum(self.energy(signal).cummax(dim=1).values, memory.unsqueeze(1))
 
     def _softened(self, signal: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at amplitude one: own and common."""
+        """Two (..., m) shifts of the actuation at amplitude one: `own` and `common`."""
         below = (memory - self.energy(signal)).clamp(min=0)
         damage = -torch.expm1(-below / (self.log_width.exp() + self.log_growth.exp() * memory))
         load, fibres = self.load(signal), self.fibres
@@ -95,9 +98,11 @@ class Softening(WallFibres):
         return signal + self.own * own + self.common * common
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(2, ..., m) change of the actuation by each amplitude: closed form."""
         return torch.stack(self._softened(signal, memory)).detach()
 
     def quantities(self) -> list[Quantity]:
+        """Shares of push that softening adds, its energy range and the fibres' mixture."""
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"
         total = float((self.own + self.common).detach())
         return [

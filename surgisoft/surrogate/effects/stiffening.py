@@ -1,4 +1,4 @@
-"""Stiffening: the wall resists more, the farther it is strained.
+"""Stiffening effect: the wall resists more, the farther it is strained.
 
 The share of push that is lost grows with the load u of each wall fibre and with the bending of the
 arm, after Fung's exponential (Fung 1967), whose first term is the cubic spring:
@@ -35,7 +35,7 @@ OTHERS = -0.35
 
 
 class Stiffening(WallFibres, Memoryless):
-    """Progressive loss of push, the same for all chambers."""
+    """Progressive loss of push, equal for all chambers."""
 
     stage = "material"
 
@@ -53,10 +53,11 @@ class Stiffening(WallFibres, Memoryless):
         self.set_fibres(others, ring)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
+        """`own` (1,) by each fibre's load and `bend` (1,) by the arm's bending."""
         return {"own": self.own, "bend": self.bend}
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
-        """Two (..., m) shifts of the actuation at amplitude one: own and bending."""
+        """Two (..., m) shifts of the actuation at amplitude one: `own` and `bend`."""
         x, k = self.load(signal), self.log_steepness.exp()
         m = x.shape[-1]
         if m == 4:
@@ -80,9 +81,11 @@ class Stiffening(WallFibres, Memoryless):
         return signal + self.own * own + self.bend * bend
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(2, ..., m) change of the actuation by each amplitude: closed form."""
         return torch.stack(self._lost(signal)).detach()
 
     def quantities(self) -> list[Quantity]:
+        """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"
         total = float((self.own + self.bend).detach())
         return [

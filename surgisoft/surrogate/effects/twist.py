@@ -1,12 +1,13 @@
-"""Twist: actuation turns the cross-sections about the centreline.
+"""Twist effect: actuation rotates the cross-sections about the centreline.
 
-Fibres that are wound unequally make every slice of the body turn by an angle per length that grows
+Fibres that are wound unequally rotate every slice of the body by an angle per length that grows
 with the chambers' mean load l (Connolly, Walsh & Bertoldi 2017, fibre-reinforced actuators):
 
     theta(s) = (linear l + quadratic l |l|) / L  int_0^s t ds = (...) (r(s) - r(0)) / L,
     q = p + int_0^s theta x dr,
 
-with t the tangent of the bent centreline r(s) of length L. A straight arm hides it.
+with t the tangent of the bent centreline r(s) of length L. On a straight arm the effect is
+invisible.
 """
 
 import torch
@@ -43,11 +44,11 @@ class Twist(Effect):
         return {"linear": self.linear, "quadratic": self.quadratic}
 
     def rest(self, signal: Tensor) -> Tensor:
-        """(B, 1) mean load of the chambers: none."""
+        """(B, 1) mean load of the chambers of an arm at rest: zero."""
         return signal.new_zeros(len(signal), 1)
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
-        """(B, 1) mean load of the chambers now; the last one where it is not told."""
+        """(B, 1) present mean load of the chambers; the last one if `context` has no pressure."""
         if context.pressure is None:
             return memory
         return self.load(context.pressure).mean(-1, keepdim=True)
@@ -69,14 +70,17 @@ class Twist(Effect):
         return signal + angle.unsqueeze(-1) * self._turned(signal)
 
     def sensitivities(self, signal: Tensor, memory: Tensor) -> Tensor:
+        """(2, ..., n, 3) displacement by each amplitude: closed form."""
         with torch.no_grad():
             turned, load = self._turned(signal), memory.unsqueeze(-1)
             return torch.stack([load * turned, load * load.abs() * turned])
 
     def config(self) -> dict:
+        """No arguments: tensors hold everything."""
         return {}
 
     def quantities(self) -> list[Quantity]:
+        """Twist of the tip at full load, its linear and quadratic part, rad."""
         fibres = "arms that are meant to bend, not to twist (Connolly et al. 2017)"
         return [
             Quantity("linear_rad", value_of(self.linear), "rad", -1.0, 1.0, fibres),

@@ -1,8 +1,8 @@
 """Wall fibres: lines along an arm's wall whose material remembers, stiffens or flows.
 
-A fibre carries a load u of its own, a mixture of the loads x of the chambers: a chamber that bends
-the arm shortens the wall on the other side. What a fibre holds back acts on the chambers by the
-transpose of that mixture (virtual work).
+Each fibre carries a load u, a mixture of the loads x of the chambers: a chamber that bends the arm
+shortens the wall on the other side. What a fibre holds back acts on the chambers by the transpose
+of that mixture (virtual work).
 """
 
 import math
@@ -15,7 +15,7 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.effects.base import Effect
 
 RINGS = (3, 4)
-"""Numbers of chambers that are taken to stand in one ring; of other numbers nothing is known."""
+"""Numbers of chambers that are assumed to stand in one ring; of other numbers nothing is known."""
 
 
 class WallFibres(Effect, ABC):
@@ -23,7 +23,8 @@ class WallFibres(Effect, ABC):
 
     stage = "material"
     version = 2
-    """1: one fibre along each chamber; 2: also a ring of fibres, and `others` redefined."""
+    """Version 1 had one fibre along each chamber; 2 also has a ring of fibres and redefines
+    `others`."""
 
     def set_fibres(self, others: float, ring: bool) -> None:
         """Add the parameter of the mixture; the arguments are those of `fibre_matrix`."""
@@ -40,11 +41,13 @@ class WallFibres(Effect, ABC):
         return self.load(signal) @ self.fibres.T
 
     def config(self) -> dict:
+        """Whether the fibres stand in a ring."""
         return {"ring": self.ring}
 
     @classmethod
     def migrated(cls, config: dict, version: int | None) -> dict:
         # Models that were written before versions were kept have version 2 if they name the ring.
+        """The arguments of this version; raises InputError for parameters of version 1."""
         if version == 1 or (version is None and "ring" not in config):
             raise InputError(
                 "an earlier surgisoft fitted its parameters, which then had another meaning"
@@ -56,8 +59,8 @@ def fibre_matrix(others: Tensor, chambers: int, ring: bool = False) -> Tensor:
     """(K, m) matrix A / |A| that gives the fibres' loads u = A x / |A| from the chambers' loads x.
 
     others: () or (1,) share of a neighbouring chamber's load in the load of the fibre along a
-    chamber, whose own share is 1. ring: 2 m fibres, one along each chamber and one between any two;
-    plane sections stay plane, so that the fibre at the azimuth f carries
+    chamber, where that chamber's share is 1. ring: 2 m fibres, one along each chamber and one
+    between any two; plane sections stay plane, so that the fibre at the azimuth f carries
     c sum_i x_i + (1 - c) sum_i x_i cos(f - f_i). Otherwise m fibres, one along each chamber, with
     the same share of all others. |A| is the largest singular value, so that all fibres together
     hold back no more than there is.

@@ -77,22 +77,22 @@ def _length(setup: Setup) -> float:
 
 
 def _hysteresis(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    more = 0.035 * strength * np.array([0.4, 0.6])
+    more = 0.1 * strength * np.array([0.4, 0.6])
     _set_wall(setup, friction=setup.plant.wall.friction + more)
 
 
 def _rate_dependence(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     _, scale, _ = setup.plant.wall.viscous
-    viscous = np.array([0.8, scale + 0.02 * strength, rng.uniform(0.4, 1.2)])
+    viscous = np.array([0.8, scale + 0.1 * strength, rng.uniform(0.4, 1.2)])
     _set_wall(setup, viscous=viscous)
 
 
 def _creep(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, creep=0.08 * strength)
+    _set_wall(setup, creep=1.0 - math.exp(-0.3 * strength))
 
 
 def _softening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    _set_wall(setup, softening=1.0 - math.exp(-0.15 * strength))
+    _set_wall(setup, softening=0.85 * (1.0 - math.exp(-strength)))
 
 
 def _stiffening(setup: Setup, strength: float, rng: np.random.Generator) -> None:
@@ -102,7 +102,7 @@ def _stiffening(setup: Setup, strength: float, rng: np.random.Generator) -> None
 def _line_lag(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     """Tubes so narrow that a chamber follows within a good part of a second; unlike lengths."""
     m = len(setup.plant.areas)
-    narrow = setup.plant.volumes.mean() / (14.0 * strength * rng.uniform(0.8, 1.25, m))
+    narrow = setup.plant.volumes.mean() / (5.0 * strength * rng.uniform(0.8, 1.25, m))
     _set_gas(setup, line=narrow)
 
 

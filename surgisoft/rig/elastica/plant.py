@@ -145,8 +145,10 @@ def new_state(plant: Plant, body: Body) -> State:
     )
 
 
-SETTLE_S = 4.0
-"""Time for which a vented arm swings out before it counts as at rest [s]."""
+SETTLE_S = 1.5
+"""Time for which a vented arm swings out, twice, before it counts as at rest [s]."""
+SWINGS_OUT = 20.0
+"""Damping while an arm swings out [1/s]."""
 
 
 def rest(plant: Plant, state: State) -> None:
@@ -166,17 +168,13 @@ def rest(plant: Plant, state: State) -> None:
     now = float(state.time[0])
     for memory in (state.bending, state.stretch):
         memory.peak[:] = 0.0
-    for span in (SETTLE_S, SETTLE_S):
-        advance(calm, state, math.ceil(span / plant.step), False)
+    for _ in range(2):
+        advance(calm, state, math.ceil(SETTLE_S / plant.step), False)
         forget(state.bending)
         forget(state.stretch)
     state.body.velocity[:] = 0.0
     state.body.omega[:] = 0.0
     state.time[0] = now
-
-
-SWINGS_OUT = 20.0
-"""Damping while an arm swings out [1/s]."""
 
 
 @compiled
@@ -372,7 +370,6 @@ def see(plant: Plant, state: State, tape: np.ndarray, seen: np.ndarray, clean: n
     return math.floor(10.0 * warmed(plant, state.time[0]) + 0.5) / 10.0
 
 
-@compiled
 def pause_cameras(plant: Plant, state: State, seconds: float, tape: np.ndarray) -> None:
     """Let the cameras' slow noise go on for a time [s] without frames; tape: standard normals."""
     wander(plant.cameras, state.tracking, seconds, tape, 0)

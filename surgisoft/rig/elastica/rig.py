@@ -52,7 +52,7 @@ class ElasticaRigConfig:
     """Hidden effects: (name, amplitude), see `hidden`."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
     """Window of time since switching on in which hidden events that occur once fall [s]."""
-    elements: int = 12
+    elements: int = 10
     """Elements of the rod."""
 
     def __post_init__(self):
@@ -207,7 +207,7 @@ class _Beside:
 
 def _with_stable_step(plant: plants.Plant, body) -> plants.Plant:
     """The plant with a time step that its wall allows, a whole part of the cameras' period."""
-    step = largest_step(body, max(stiffest(plant.wall), 2.0))
+    step = largest_step(body, max(stiffest(plant.wall), 1.2))
     damping = -math.log(plant.keep) / plant.step
     step = plant.cameras.period / math.ceil(plant.cameras.period / step)
     return plant._replace(step=step, keep=math.exp(-damping * step))

@@ -34,10 +34,10 @@ def make_robot(
     length = rng.uniform(0.06, 0.15)
     radius = length / rng.uniform(7.0, 10.5)
     density = rng.uniform(850.0, 1150.0)  # silicone with empty chambers, up to filled silicone
-    modulus = math.exp(rng.uniform(math.log(8e4), math.log(2.5e5)))
+    modulus = math.exp(rng.uniform(math.log(6e4), math.log(1.4e5)))
     # Weight over bending stiffness: beyond about 8 an upright column buckles (Greenhill 1881).
     slack = 4.0 * density * STANDARD_GRAVITY * length**3 / radius**2
-    modulus = max(modulus, slack / 3.0)
+    modulus = max(modulus, slack / 3.5)
     m = int(rng.choice([2, 3, 3, 3, 4]))
     planes = int(rng.integers(3, 7))
     body = straight_body(elements, length, radius, density, modulus)
@@ -54,14 +54,14 @@ def make_robot(
     bend = body.bend_matrix[0, 0].copy()
     curvature = math.radians(rng.uniform(40.0, 75.0)) / length
     high = curvature * bend.mean() / (areas.mean() * offset.mean())
-    high = 1e3 * round(min(max(high, 2e4), 1.2e5) / 1e3)
+    high = 1e3 * round(min(max(high, 2e4), 9e4) / 1e3)
     curvature = high * areas.mean() * offset.mean() / bend.mean()
     volumes = areas * length
 
     fluid = rng.uniform(0.05, 0.25)
     wall = Wall(
         friction=rng.uniform(0.0, 0.012) * np.array([0.4, 0.6]),
-        slip=np.array([0.03, 0.12]) * rng.uniform(0.7, 1.4),
+        slip=np.array([0.05, 0.2]) * rng.uniform(0.7, 1.4),
         viscous=np.array([0.3, rng.uniform(0.001, 0.006), fluid]),
         creep=0.0,
         softening=0.0,
@@ -90,7 +90,7 @@ def make_robot(
     cameras = build_cameras(
         CameraDesign(rate_Hz=1.0 / period), 2e3 * radius, m, planes, 1e-3 * high, noise, seed
     )
-    step = largest_step(body, max(stiffest(wall), 2.0))
+    step = largest_step(body, max(stiffest(wall), 1.2))
     plant = Plant(
         step=period / math.ceil(period / step),
         keep=1.0,

@@ -157,14 +157,17 @@ def _thermal_drift(setup: Setup, strength: float, rng: np.random.Generator) -> N
 
 
 def _contact(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    """A wall beside the arm, at a share of the way that the arm goes towards it.
+    """A wall beside the arm, at a share of the way that the arm goes towards it; roughly on the
+    side to which one chamber bends the arm.
 
     At strength 1 it stands at 70 % of that way, at large strengths at 10 %.
     """
     m, high = len(setup.plant.areas), setup.plant.high
-    towards = -_sideways(rng)
     singles = high * np.eye(m)
     shapes = [_shape(setup, p) for p in [np.zeros(m), *singles, *(high - singles)]]
+    aside = (shapes[1 + int(rng.integers(m))] - shapes[0])[:2, -1]
+    angle = math.atan2(aside[1], aside[0]) + math.radians(rng.uniform(-40.0, 40.0))
+    towards = np.array([math.cos(angle), math.sin(angle), 0.0])
     reaches = [float((towards @ shape).max()) for shape in shapes]
     share = 0.1 + 0.6 * 2.0 ** (1.0 - strength) if strength > 1.0 else 0.95 - 0.25 * strength
     surface = reaches[0] + share * (max(reaches) - reaches[0])
@@ -180,7 +183,7 @@ def _shape(setup: Setup, pressures: np.ndarray) -> np.ndarray:
     plant = setup.plant
     body = Body(*(array.copy() for array in setup.body))
     state = new_state(plant, body)
-    rest(plant, state)
+    rest(plant, state, 0.0)
     state.air.target[:] = pressures
     advance(plant, state, round(2.0 / plant.step), True)
     return body.position

@@ -115,6 +115,8 @@ class State(NamedTuple):
     """Pressures."""
     slipped: np.ndarray
     """(3,) rotation of the base's bracket about x and y [rad], and 1 while it slips."""
+    hung: np.ndarray
+    """(2,) couple on the bracket about x and y at rest, to which it has yielded long ago [N m]."""
     clamp: np.ndarray
     """(3,) position of the base [m]."""
     axes: np.ndarray
@@ -137,6 +139,7 @@ def new_state(plant: Plant, body: Body) -> State:
         stretch=new_memory(1, body.sigma.shape[1]),
         air=vented(plant.volumes),
         slipped=np.zeros(3),
+        hung=np.zeros(2),
         clamp=np.zeros(3),
         axes=plant.base.copy(),
         tracking=new_tracking(plant.cameras),
@@ -151,10 +154,11 @@ SWINGS_OUT = 20.0
 """Damping while an arm swings out [1/s]."""
 
 
-def rest(plant: Plant, state: State) -> None:
-    """Vent the chambers, let the arm hang at rest under its weight, and forget its history.
+def rest(plant: Plant, state: State, seconds: float) -> None:
+    """Vent the chambers, let the arm hang at rest under its weight for a time [s], and forget.
 
-    The arm swings out without friction and viscosity, as if it had been left alone for long.
+    The arm swings out without friction and viscosity, as if it had been left alone for long; only
+    the end of the time is stepped.
     """
     air = state.air
     for pressures in (air.target, air.line, air.chamber):
@@ -162,19 +166,21 @@ def rest(plant: Plant, state: State) -> None:
     air.volume[:] = plant.volumes
     state.slipped[:] = 0.0
     plain = plant.wall._replace(friction=np.zeros(2), viscous=np.zeros(3), creep=0.0)
-    calm = plant._replace(
-        wall=plain, keep=math.exp(-SWINGS_OUT * plant.step), bracket=np.zeros(2), breath=np.zeros(5)
-    )
-    now = float(state.time[0])
+    calm = plant._replace(wall=plain, keep=math.exp(-SWINGS_OUT * plant.step), bracket=np.zeros(2))
     for memory in (state.bending, state.stretch):
         memory.peak[:] = 0.0
-    for _ in range(2):
-        advance(calm, state, math.ceil(SETTLE_S / plant.step), False)
-        forget(state.bending)
-        forget(state.stretch)
+    state.time[0] += seconds - 2 * SETTLE_S
+    before = state.clamp.copy()
+    place_base(calm, state.time[0], state.slipped, state.clamp, state.axes)
+    state.body.position[:] += (state.clamp - before)[:, None]
     state.body.velocity[:] = 0.0
     state.body.omega[:] = 0.0
-    state.time[0] = now
+    for _ in range(2):
+        advance(calm, state, round(SETTLE_S / plant.step), False)
+        forget(state.bending)
+        forget(state.stretch)
+    base_couple(plant, state.body, state.hung)
+    chamber_volumes(plant, state, air.volume)
 
 
 @compiled
@@ -193,7 +199,7 @@ def place_base(plant: Plant, time: float, slipped: np.ndarray, clamp: np.ndarray
     is a raised cosine that is shorter in than out.
     """
     turn = np.zeros(3)
-    slow = math.log(1.0 + time / 40.0) / math.log(1.0 + 600.0 / 40.0)
+    slow = math.log(1.0 + max(time, 0.0) / 40.0) / math.log(1.0 + 600.0 / 40.0)
     knocked = min(max((time - plant.knock[3]) / 0.2, 0.0), 1.0)
     for d in range(3):
         turn[d] = plant.drift[d] * slow + plant.knock[d] * knocked
@@ -227,6 +233,15 @@ def rotate(turn: np.ndarray, vector: np.ndarray, out: np.ndarray) -> None:
 
 
 @compiled
+def base_couple(plant: Plant, body: Body, couple: np.ndarray) -> None:
+    """Couple (2,) [N m] of the first inner node about the base's x and y, into `couple`."""
+    couple[:] = 0.0
+    for d in range(2):
+        for axis in range(2):
+            couple[axis] += plant.base[d, axis] * body.internal_couple[d, 0]
+
+
+@compiled
 def slip_bracket(plant: Plant, state: State) -> None:
     """Let the base's bracket stick, or slip under the couple of the first inner node.
 
@@ -234,11 +249,10 @@ def slip_bracket(plant: Plant, state: State) -> None:
     nearly all is released (Coulomb friction with a lower kinetic than static value).
     """
     compliance, held = plant.bracket[0], plant.bracket[1]
-    rows = plant.base
-    lack_x, lack_y = -state.slipped[0] / compliance, -state.slipped[1] / compliance
-    for d in range(2):
-        lack_x += rows[d, 0] * state.body.internal_couple[d, 0]
-        lack_y += rows[d, 1] * state.body.internal_couple[d, 0]
+    couple = np.empty(2)
+    base_couple(plant, state.body, couple)
+    lack_x = couple[0] - state.hung[0] - state.slipped[0] / compliance
+    lack_y = couple[1] - state.hung[1] - state.slipped[1] / compliance
     lack = math.sqrt(lack_x**2 + lack_y**2)
     if lack > held:
         state.slipped[2] = 1.0

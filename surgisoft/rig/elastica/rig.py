@@ -102,8 +102,8 @@ class ElasticaRig:
         self.gravity = self._plant.gravity / np.linalg.norm(self._plant.gravity)
         self._thermometer = self._plant.warmth != 0.0
         self._rng = np.random.default_rng([seed, config.take, 0xE1A57])
+        self._state.time[0] = -REST_S
         self.reset()
-        self._state.time[0] = 0.0
 
     @property
     def time_s(self) -> float:
@@ -117,8 +117,7 @@ class ElasticaRig:
 
     def reset(self) -> None:
         """Vent the arm and let it rest until it has no memory of before: the start of a run."""
-        plants.rest(self._plant, self._state)
-        self._state.time[0] += REST_S
+        plants.rest(self._plant, self._state, REST_S)
 
     def command(self, pressures: np.ndarray) -> None:
         """Set the pressures (m,) [kPa gauge] that the regulators reach for from now on."""

@@ -248,7 +248,7 @@ def accelerate(
         # Damped by a tenth of what would stop the lightest element within a step.
         damping = 0.1 * body.mass[1] / step
         _calculate_contact_forces_rod_plane(
-            plane[0],
+            plane[0].copy().reshape((3, 1)),
             plane[1],
             CONTACT_TOLERANCE_M,
             stiffness,

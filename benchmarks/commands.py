@@ -228,3 +228,32 @@ def real(
     if json_file:
         write_json(json_file, to_json(outcomes))
     _show("Real robots: known changes", command, markdown(outcomes), output)
+
+
+@app.command()
+def inject(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the cases.")
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
+        ),
+    ] = None,
+    robots: Annotated[
+        str | None, typer.Option(help="Robots, with commas; default: all of them.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the cases.")] = 1,
+) -> None:
+    """Inject effects into real recordings: cases with a known truth and real noise."""
+    from benchmarks.injected.cases import ROBOTS, make_cases
+    from benchmarks.real.entries import data_folder
+
+    check_folder(output)
+    names = robots.split(",") if robots else list(ROBOTS)
+    folder = data_folder(data)
+    with progress("inject") as report:
+        lines = make_cases(names, folder, output, seed, report)
+    print(*lines, sep="\n")

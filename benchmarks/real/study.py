@@ -1,4 +1,4 @@
-"""Benchmark `real`: a model fitted to the recordings before a change, asked about those after it."""
+"""Benchmark `real`: a model fitted before a change, asked about the recordings after it."""
 
 import hashlib
 import time
@@ -67,7 +67,7 @@ class Outcome:
     amended_mm: float | None = None
     """Error on the held-out quarter after amending by what was named, mm; None: nothing named."""
     oracle_mm: float | None = None
-    """Error on the held-out quarter after amending by the truth, mm; None: no effect is the truth."""
+    """Error on the held-out quarter after amending by the truth, mm; None: the truth is no effect."""
     held_out_mm: float | None = None
     """Error on the held-out quarter before amending, mm."""
 

@@ -141,7 +141,7 @@ class Case:
 
 
 def cases_of(name: str, seed: int) -> list[Case]:
-    """The cases of one robot: single effects of drawn sizes, unknown ones, pairs, and clean ones."""
+    """The cases of one robot: single effects of drawn sizes, unknown ones, pairs, clean ones."""
     if name not in ROBOTS:
         raise unknown_name("robot", name, ROBOTS)
     robot = ROBOTS[name]
@@ -205,7 +205,7 @@ def running_time(recording: Recording) -> np.ndarray:
 
 
 def thinned(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of a recording about RATE_HZ apart, first and last of each run among them; run starts."""
+    """Rows about RATE_HZ apart, with the first and the last of each run, and where runs start."""
     rows, starts = [], [0]
     for run in recording.runs:
         time = recording.t_s[run]
@@ -260,8 +260,8 @@ def inject(
 ) -> Injection:
     """The change by an effect, of the strength that moves the key points by a wanted RMS.
 
-    The strength is found by steps in proportion, and by bisection of its logarithm where they leave
-    the bracket; the search ends at the law's largest plausible strength.
+    The strength is found by secant steps in its logarithm, and by bisection where they leave the
+    bracket; the search ends at the law's largest plausible strength.
     """
     arms, drawn = [], {}
     for number, recording in enumerate(recordings):
@@ -284,19 +284,25 @@ def inject(
 
     if wanted_mm == 0:
         return Injection(changes(0.0), 0.0, drawn, 0.0)
-    low, high, strength = 0.0, math.inf, 0.1 * law.most
+    low, high, strength, power = 0.0, math.inf, 0.1 * law.most, 1.0
+    best: Injection | None = None
     for _ in range(SCALE_STEPS):
         change = changes(strength)
-        reached = size(change)
-        if abs(reached / wanted_mm - 1) < SCALE_TOLERANCE:
+        found = Injection(change, strength, drawn, size(change))
+        if best and strength != best.strength and min(best.rms_mm, found.rms_mm) > 0:
+            power = math.log(found.rms_mm / best.rms_mm) / math.log(strength / best.strength)
+            power = min(max(power, 0.3), 4.0)
+        if best is None or abs(found.rms_mm - wanted_mm) < abs(best.rms_mm - wanted_mm):
+            best = found
+        small = found.rms_mm < wanted_mm
+        if abs(found.rms_mm / wanted_mm - 1) < SCALE_TOLERANCE or (small and strength >= law.most):
             break
-        if reached < wanted_mm and strength >= law.most:
-            break
-        low, high = (strength, high) if reached < wanted_mm else (low, strength)
-        guess = min(strength * wanted_mm / max(reached, 1e-3 * wanted_mm), law.most)
-        inside = low < guess < high
-        strength = guess if inside else math.sqrt(max(low, 1e-3 * high) * high)
-    return Injection(change, strength, drawn, reached)
+        low, high = (strength, high) if small else (low, strength)
+        share = wanted_mm / max(found.rms_mm, 1e-3 * wanted_mm)
+        guess = min(strength * share ** (1 / power), law.most)
+        strength = guess if low < guess < high else math.sqrt(max(low, 1e-3 * high) * high)
+    assert best is not None
+    return best
 
 
 def _between(

@@ -67,7 +67,7 @@ class Outcome:
     amended_mm: float | None = None
     """Error on the held-out quarter after amending by what was named, mm; None: nothing named."""
     oracle_mm: float | None = None
-    """Error on the held-out quarter after amending by the truth, mm; None: the truth is no effect."""
+    """Error on the held-out quarter after amending by the truth, mm; None: no effect is true."""
     held_out_mm: float | None = None
     """Error on the held-out quarter before amending, mm."""
 

@@ -257,3 +257,32 @@ def inject(
     with progress("inject") as report:
         lines = make_cases(names, folder, output, seed, report)
     print(*lines, sep="\n")
+
+
+@app.command()
+def cases(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of cases, as `inject` writes it.")
+    ],
+    only: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
+    ] = None,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Diagnose a folder of cases with a known truth; one model is fitted for each robot."""
+    from benchmarks.injected.study import find_cases, markdown, run, to_json
+    from surgisoft.errors import InputError
+
+    check_free(json_file, "cases")
+    found = find_cases(folder)
+    some = [case for case in found if only is None or only in str(case.place)]
+    if not some:
+        raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
+    with progress("cases") as report:
+        judged = run(some, processes, report)
+    if json_file:
+        write_json(json_file, to_json(judged))
+    command = "surgisoft benchmark cases DIR" + (f" --only {only}" if only else "")
+    _show("Cases with a known truth", command, markdown(judged), output)

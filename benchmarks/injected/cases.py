@@ -61,6 +61,7 @@ _TRUNK = (
     "asl_trunk_payload/control_inputs_controlled_1.csv",
     "asl_trunk_payload/observations_controlled_1.csv",
 )
+_LOADED = (_TRUNK[0], "asl_trunk_payload/observations_controlled_1_200g.csv")
 
 
 def _asu(*names: str) -> Source:
@@ -101,16 +102,10 @@ ROBOTS = {
         (_asu("Jan_10-4_data_collect_*"),), (_asu("Jan_10-5_data_collect_*"),), ALL
     ),
     "asu_april": Robot((_asu("apr_4_data_collect_[1-7]"),), (_asu("apr_5_data_collect_1"),), ALL),
-    "asu_both": Robot(
-        (
-            _asu("Jan_10-4_data_collect_*", "apr_4_data_collect_[1-7]"),
-            replace(_asu("apr_5_data_collect_1"), part=(0.0, 0.5)),
-        ),
-        (
-            _asu("Jan_10-5_data_collect_*"),
-            replace(_asu("apr_5_data_collect_1"), part=(0.5, 1.0)),
-        ),
-        ALL,
+    "trunk_200g": Robot(
+        (Source(_LOADED, str(MAPS / "asl_trunk.toml"), (0.0, 0.6)),),
+        (Source(_LOADED, str(MAPS / "asl_trunk.toml"), (0.6, 1.0)),),
+        tuple(name for name in ALL if name not in NO_TENDON),
     ),
 }
 """Robots by name."""

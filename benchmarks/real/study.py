@@ -73,24 +73,30 @@ class Outcome:
 
     @property
     def named(self) -> bool:
-        """Whether the truth is named, alone or in a set of at most two (or as many as there are).
-
-        Where nothing changed: whether nothing was named.
-        """
-        if self.answer is None:
-            return False
-        names, truth = self.answer.names, self.entry.truth
-        if not truth:
-            return not names
-        return set(truth) <= set(names) and len(names) <= max(MOST_NAMES, len(truth))
+        """Whether the diagnosis is right (`right`)."""
+        return self.answer is not None and right(self.answer, self.entry.truth)
 
     @property
     def misled(self) -> bool:
-        """Whether a wrong name stands first with a confidence that claims to be right."""
-        if self.answer is None or self.answer.kind not in NAMING:
-            return False
-        first = self.answer.names[0]
-        return first not in self.entry.truth and self.answer.confidence >= CLAIMED
+        """Whether the diagnosis claims a wrong name (`misleads`)."""
+        return self.answer is not None and misleads(self.answer, self.entry.truth)
+
+
+def right(answer: Answer, truth: Sequence[str]) -> bool:
+    """Whether the truth is named, alone or in a set of at most two (or as many as there are).
+
+    Where nothing changed: whether nothing was named.
+    """
+    if not truth:
+        return not answer.names
+    return set(truth) <= set(answer.names) and len(answer.names) <= max(MOST_NAMES, len(truth))
+
+
+def misleads(answer: Answer, truth: Sequence[str]) -> bool:
+    """Whether a wrong name stands first with a confidence that claims to be right."""
+    if answer.kind not in NAMING:
+        return False
+    return answer.names[0] not in truth and answer.confidence >= CLAIMED
 
 
 def digest_of(recordings: Sequence[Recording], options: FitOptions, actuation: str) -> str:

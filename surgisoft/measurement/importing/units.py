@@ -43,3 +43,19 @@ def check_conversion(unit: str, to: str, where: Where) -> None:
             else f"'{unit}' itself, a unit that nothing converts to; use scale and offset"
         )
         raise where.error(f"got '{to}'", expected)
+
+
+_SELDOM = ("hPa", "atm", "mmHg", "rev")
+"""Units that no wrong unit is taken for: another one is as large, or nobody logs in them."""
+
+
+def other_units(unit: str) -> dict[str, float]:
+    """The usual other units of the quantity that a unit measures, and how many of `unit` one is."""
+    for quantity in _QUANTITIES:
+        if unit in quantity:
+            return {
+                name: size / quantity[unit]
+                for name, size in quantity.items()
+                if name != unit and name not in _SELDOM
+            }
+    return {}

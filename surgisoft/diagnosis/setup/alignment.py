@@ -115,7 +115,12 @@ def block_moments(x: np.ndarray, y: np.ndarray, block: np.ndarray, count: int) -
         [np.bincount(block[inside], column[inside], minlength=count) for column in rows.T], axis=1
     )
     return Moments(
-        sums[:, 0], sums[:, 1:4], sums[:, 4:7], sums[:, 7], sums[:, 8], sums[:, 9:].reshape(-1, 3, 3)
+        sums[:, 0],
+        sums[:, 1:4],
+        sums[:, 4:7],
+        sums[:, 7],
+        sums[:, 8],
+        sums[:, 9:].reshape(-1, 3, 3),
     )
 
 
@@ -140,6 +145,13 @@ def unturned(like: Moments, scale: np.ndarray | float = 1.0) -> Frame:
     """The frame that is not turned or shifted, for every case (...)."""
     shape = np.shape(like.count)
     return Frame(np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3)), scale)
+
+
+def shifted(rotation: np.ndarray, given: Moments, scale: np.ndarray | float) -> Frame:
+    """The frame of this rotation and scale with the least-squares shift."""
+    count = np.maximum(given.count, 1e-9)[..., None]
+    turned = np.einsum("...ij,...j->...i", rotation, given.y / count)
+    return Frame(rotation, given.x / count - np.asarray(scale)[..., None] * turned, scale)
 
 
 def angle(rotation: np.ndarray) -> np.ndarray:

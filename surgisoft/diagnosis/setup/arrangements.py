@@ -160,7 +160,7 @@ def _slope(actuation: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _matched(measured: np.ndarray, predicted: np.ndarray, factor: float) -> list[Arrangement]:
     """The best assignments of responses (m, n, 3) under turned and mirrored frames."""
-    turns = Rotation.from_euler("z", np.arange(TURNS) * 2 * np.pi / TURNS).as_matrix()
+    turns = Rotation.from_euler("z", np.arange(TURNS)[:, None] * 2 * np.pi / TURNS).as_matrix()
     frames = np.concatenate([turns, Rotation.create_group("O").as_matrix()])
     frames = np.concatenate([frames, frames * np.array([1.0, -1.0, 1.0])])
     scale = np.linalg.norm(measured) / max(np.linalg.norm(predicted), 1e-12)

@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from surgisoft.diagnosis.setup.channels import frozen_points
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.errors import InputError
+from surgisoft.measurement.importing.rows import without_frozen
 from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.columns import MM_PER
 
@@ -42,9 +44,20 @@ class Correction:
     """Recorded channels that are dead, in whose place the command is taken, from 0."""
     lost: tuple[int, ...] = ()
     """Recorded key points that are dead: they become missing."""
+    stale: tuple[int, ...] = ()
+    """Recorded key points that are frozen in some rows: they become missing there."""
+    frozen: bool = False
+    """Whether a channel is frozen in some rows: these are left out."""
 
     def applied(self, recording: Recording) -> Recording:
         """The mended recording; rows that a shifted clock does not reach are left out."""
+        if self.stale:
+            lost = frozen_points(recording)
+            lost[:, [k for k in range(recording.key_points) if k not in self.stale]] = False
+            points = np.where(lost[..., None], np.nan, recording.key_points_mm)
+            recording = replace(recording, key_points_mm=points)
+        if self.frozen:
+            recording, _ = without_frozen(recording)
         measured, commanded = recording.measured, recording.commanded
         if self.from_command:
             if commanded is None:
@@ -126,6 +139,8 @@ class Correction:
         key_points: dict[str, Any] = {}
         if self.lost:
             key_points["lost"] = list(self.lost)
+        if self.stale:
+            key_points["repeated"] = "missing"
         if self.points != tuple(range(len(self.points))):
             key_points["order"] = list(self.points)
         if self.mm_per_unit != 1.0:
@@ -144,6 +159,7 @@ class Correction:
             "commanded": command,
             "key_points": key_points,
             "frame": frame,
+            "rows": {"frozen": "drop"} if self.frozen else {},
         }
         return {name: table for name, table in tables.items() if table}
 

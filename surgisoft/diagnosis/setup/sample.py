@@ -109,7 +109,9 @@ class Sample:
         def arranged(tensor: torch.Tensor) -> torch.Tensor:
             """(A R, ..., m) actuation (R, ..., m) of the chambers in every arrangement."""
             gains = torch.from_numpy(np.stack([a.gain for a in arrangements])).to(tensor)
-            parts = [tensor[..., list(a.order)] * g for a, g in zip(arrangements, gains)]
+            parts = [
+                tensor[..., list(a.order)] * g for a, g in zip(arrangements, gains, strict=True)
+            ]
             return torch.cat(parts)
 
         wide = History(

@@ -9,6 +9,7 @@ well as any is taken, and then has to prove itself (`Proof`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,12 +23,11 @@ from surgisoft.diagnosis.setup.alignment import (
     block_moments,
     fitted,
     moments,
+    shifted,
     unturned,
 )
-from surgisoft.diagnosis.setup.arrangements import EXHAUSTIVE, improved, proposed, units
-from surgisoft.diagnosis.residuals import EVERY_ROW
-from surgisoft.diagnosis.setup.sample import Arrangement, Sample, interpolated, sample_of
-from surgisoft.measurement.recordings import Recording
+from surgisoft.diagnosis.setup.arrangements import EXHAUSTIVE, improved, proposed
+from surgisoft.diagnosis.setup.sample import Arrangement, Sample, interpolated
 from surgisoft.surrogate.effects.misalignment import Misalignment
 from surgisoft.surrogate.model import ArmModel
 
@@ -208,12 +208,6 @@ class Found:
     """The explanation that is named."""
     as_good: tuple[Fitted, ...]
     """Other explanations with as many kinds that do as well."""
-    before_mm: float
-    """Error without a correction, on the same blocks, mm."""
-    floor_mm: float
-    """Noise of the measurement, mm."""
-    explained: float
-    """Share of the squared error above the validated one that the correction removes."""
 
 
 @dataclass(frozen=True)
@@ -240,27 +234,60 @@ class Search:
         fine: Sample,
         full: Sample,
         levels: Levels,
-        factors: Sequence[float] = (1.0,),
+        units: dict[str, float],
         settings: SearchSettings = SETTINGS,
         proof: Proof = PROOF,
     ):
-        """factors: model units in the units of actuation that are tried."""
+        """units: unit -> model units in it, for the units of actuation that are tried."""
         self.coarse, self.fine, self.full, self.levels = coarse, fine, full, levels
-        self.factors, self.settings, self.proof = tuple(factors), settings, proof
+        self.units, self.settings, self.proof = units, settings, proof
+        self.factors = tuple(units.values())
         self.border = Border.of(coarse.model)
         self.chambers = coarse.history.chambers
         self._measured = fine.measured()[0]
         self._predicted: dict[Arrangement, np.ndarray] = {}
         self._whole: dict[Arrangement, np.ndarray] = {}
 
+    @cached_property
+    def raw(self) -> Fitted:
+        """The recordings as they are."""
+        return self.fit(replace(self._nothing(), frame="none"))
+
+    @cached_property
+    def start(self) -> Fitted:
+        """The recordings as they are, but for a small misalignment where that helps."""
+        before = self.fit(self._nothing())
+        return before if before.rmse_mm < self.raw.rmse_mm else self.raw
+
+    @property
+    def limit_mm(self) -> float:
+        """Error up to which no fault is looked for, mm."""
+        return self.proof.noticed * self.levels.reference
+
+    @property
+    def noticed(self) -> bool:
+        """Whether the error is large enough for a fault."""
+        return self.raw.rmse_mm > self.limit_mm
+
+    def explains(self, before_mm: float, after_mm: float) -> bool:
+        """Whether an error before is noticed, and explained by what leaves the error after."""
+        noticed = before_mm > self.limit_mm
+        return noticed and self._share(before_mm, after_mm) >= self.proof.explained
+
+    def _share(self, before_mm: float, after_mm: float) -> float:
+        """Share of the squared error above the reference that falls."""
+        least = min(self.levels.reference, after_mm)
+        return (before_mm**2 - after_mm**2) / max(before_mm**2 - least**2, 1e-12)
+
+    def motion(self, arrangement: Arrangement) -> np.ndarray:
+        """(n,) RMS motion of the predicted key points, mm."""
+        return _motion(self._fine(arrangement))
+
     def run(self) -> Found | None:
         """The faults, where some are proved."""
-        nothing = self._nothing()
-        before = self.fit(nothing)
-        raw = self.fit(replace(nothing, frame="none"))
-        if raw.rmse_mm <= self.proof.noticed * self.levels.reference:
+        if not self.noticed:
             return None
-        start = before if before.rmse_mm < raw.rmse_mm else raw
+        start = self.start
         tried = [start, *(self.fit(each) for each in self._shortlist(start.hypothesis))]
         best = self._simplest(tried)
         while "time" in best.hypothesis.kinds and not self._pure_delay(best):
@@ -268,16 +295,9 @@ class Search:
             best = self._simplest(tried)
         if not best.hypothesis.kinds:
             return None
-        explained = self._explained(start, best)
-        if not self._proved(start, best, explained):
+        if not self._proved(start, best):
             return None
-        return Found(
-            best=best,
-            as_good=self._equals(best, tried),
-            before_mm=raw.rmse_mm,
-            floor_mm=self.levels.noise,
-            explained=explained,
-        )
+        return Found(best, self._equals(best, tried))
 
     # Coarse search ----------------------------------------------------------------------------
 
@@ -513,21 +533,13 @@ class Search:
                 found[each.hypothesis.what] = each
         return tuple(found.values())[1:]
 
-    def _explained(self, before: Fitted, after: Fitted) -> float:
-        """Share of the squared error above the reference that a correction removes."""
-        least = min(self.levels.reference, after.rmse_mm)
-        start = before.rmse_mm * self._in_mm(before, after)
-        return (start**2 - after.rmse_mm**2) / max(start**2 - least**2, 1e-12)
-
-    def _in_mm(self, before: Fitted, after: Fitted) -> float:
-        """1, or what a distance in a wrong unit of length is worth, where that is more."""
-        return max(1.0, after.hypothesis.mm_per_unit)
-
-    def _proved(self, before: Fitted, after: Fitted, explained: float) -> bool:
+    def _proved(self, before: Fitted, after: Fitted) -> bool:
         """Whether a correction shows what `Proof` asks for."""
         asked = self.proof
-        moved = _motion(self._fine(after.hypothesis.arrangement))
-        motion = float(np.sqrt(np.mean(moved**2)))
+        # In a wrong unit of length the error before is in that unit, too.
+        start = before.rmse_mm * max(1.0, after.hypothesis.mm_per_unit)
+        explained = self._share(start, after.rmse_mm)
+        motion = float(np.sqrt(np.mean(self.motion(after.hypothesis.arrangement) ** 2)))
         most = max(asked.near_validated * self.levels.reference, asked.left_of_motion * motion)
         counted = after.blocks.count > 0
         falls = float(np.mean(after.losses[counted] < before.losses[counted]))
@@ -609,9 +621,7 @@ def _rescaled(frame: Frame, sums: Moments, scale: np.ndarray) -> Frame:
     """The frame with another scale and the shift that goes with it."""
     if not np.any(frame.shift) and np.allclose(frame.rotation, np.eye(3)):
         return Frame(frame.rotation, frame.shift, scale)
-    count = np.maximum(sums.count, 1e-9)[..., None]
-    turned = np.einsum("...ij,...j->...i", frame.rotation, sums.y / count)
-    return Frame(frame.rotation, sums.x / count - scale[..., None] * turned, scale)
+    return shifted(frame.rotation, sums, scale)
 
 
 def _least(square: np.ndarray, many: int = 2) -> list[tuple[int, int]]:
@@ -642,18 +652,3 @@ def _jackknife(grid: np.ndarray, losses: np.ndarray) -> float:
     total = losses.sum(1)
     without = np.array([_lowest(grid, total - losses[:, b]) for b in range(count)])
     return float(np.sqrt((count - 1) / count * np.square(without - without.mean()).sum()))
-
-
-def search(
-    model: ArmModel,
-    recordings: list[Recording],
-    levels: Levels,
-    actuation: np.ndarray,
-    settings: SearchSettings = SETTINGS,
-) -> Found | None:
-    """The set-up faults of recordings of one set-up; actuation (N, m) as recorded."""
-    coarse = sample_of(model, recordings, settings.coarse_rows)
-    fine = sample_of(model, recordings, settings.fine_rows)
-    factors = tuple(units(model.spec, actuation).values())
-    full = sample_of(model, recordings, EVERY_ROW)
-    return Search(coarse, fine, full, levels, factors, settings).run()

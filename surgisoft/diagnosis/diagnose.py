@@ -173,7 +173,7 @@ def result_of(found: Findings) -> Diagnosis:
     """The diagnosis that the findings amount to."""
     problem, selection = found.problem, found.selection
     best = best_achievable(problem, found.box, found)
-    reached = selection.rmse_mm(selection.losses(found.picked))
+    reached = selection.rmse_mm(selection.losses(found.chosen))
     evidence = evidence_of(found)
     decision = decide(evidence)
     kind, effects, sure = decision.kind, decision.effects, decision.confidence

@@ -26,8 +26,8 @@ HOW = (
 HOW_SETUP = (
     "Frames, units, orders, chambers, clocks and dead channels are tested before any effect. A "
     "fault is named where the model, with the fault corrected, predicts held-out blocks of time "
-    "about as well as a right set-up would. No effect was looked for: mend the recordings first, with the "
-    "lines in the map of `surgisoft import` or with `surgisoft diagnose ... --apply DIR`."
+    "about as well as a right set-up would. No effect was looked for: mend the recordings first, "
+    "with the lines in the map of `surgisoft import` or with `surgisoft diagnose ... --apply DIR`."
 )
 TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
 """Tone of a verdict; the others are warnings."""

@@ -53,7 +53,7 @@ FLOORS = {
         ("residuals",),
         ("discrepancy", "data_quality", "error_axes", "inputs"),
         ("cross_validation",),
-        ("black_box", "candidates"),
+        ("black_box", "candidates", "setup"),
         ("estimation",),
         ("selection",),
         ("decision",),
@@ -91,6 +91,17 @@ FLOORS = {
 
 ROOMS = {
     "diagnosis/design": ("schedules", "isolability", "next_experiment"),
+    "diagnosis/setup": (
+        "alignment",
+        "channels",
+        "sample",
+        "arrangements",
+        "search",
+        "words",
+        "blind",
+        "correction",
+        "result",
+    ),
 }
 """Modules of a folder in order: each imports from those before it only."""
 

@@ -66,6 +66,8 @@ def compare(
         write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
         written.append(replay)
     print(result.sentence)
+    if result.setup:
+        print(f"set-up: {result.setup}; `surgisoft diagnose` shows what mends it")
     print(arm.summary())
     _show(result)
     for path in written:

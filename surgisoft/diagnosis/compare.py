@@ -25,9 +25,11 @@ from surgisoft.diagnosis.residuals import (
     residual_table,
 )
 from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
+from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
+from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -102,6 +104,8 @@ class Comparison:
     """The worst moments, each from another stretch of time."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    setup: str | None = None
+    """What is wrong with the set-up of the recordings, in words; None where no fault is proved."""
 
     @property
     def explainable(self) -> float | None:
@@ -174,7 +178,10 @@ def compare(
     part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
     for `diagnose`, which takes it into account for the best achievable error.
     """
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, sized=False)
+    wrong = find_setup_faults(model, recordings) if part == "all" else None
+    if wrong is None:
+        check_fits(model.spec, recordings)
     whole = residual_table(model, recordings)
     if np.isnan(whole.only(part).measured_mm).all():
         raise InputError("no key point was measured in any row of the recordings")
@@ -208,6 +215,7 @@ def compare(
             bands=tuple(bands(problem)),
             worst=tuple(_worst(table)),
             notes=notes,
+            setup=wrong and wrong.sentence,
         ),
         table,
     )

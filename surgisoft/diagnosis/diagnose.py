@@ -1,6 +1,7 @@
 """`diagnose`: which physical effect is the model missing?
 
-System identification of a grey-box model in five steps:
+What is wrong with the set-up of the recordings is tested first (`setup`): where a fault is proved,
+the diagnosis ends there. Else it is a system identification of a grey-box model in five steps:
 
 1. Residual table: the model's residuals on the training rows, thinned, in blocks (`residuals`).
 2. Sensitivities: what each effect, with each choice of its nonlinear parameters, would change in
@@ -36,7 +37,9 @@ from surgisoft.diagnosis.selection import (
     find,
     rmse_interval,
 )
+from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.errors import unknown_name
+from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
@@ -54,7 +57,7 @@ class Verdict:
     """The result of a diagnosis in short."""
 
     kind: Kind
-    """One of the six kinds of result."""
+    """One of the seven kinds of result."""
     effects: tuple[str, ...]
     """The missing effects, the surest first; all competing ones where they cannot be told apart."""
     sentence: str
@@ -120,10 +123,13 @@ class Diagnosis:
     """Time that it took, s."""
     statistics: Evidence | None = None
     """The numbers that the decision was made from."""
+    setup: SetupResult | None = None
+    """What is wrong with the set-up of the recordings; None where no fault is proved."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        return asdict(self)
+        plain = asdict(replace(self, setup=None))
+        return plain | {"setup": self.setup.to_json() if self.setup else None}
 
 
 @torch_threads(1)
@@ -133,10 +139,13 @@ def diagnose(
     progress: Progress | None = None,
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     without: Collection[str] = (),
+    setup_tests: bool = True,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths. Where `setup_tests` prove a fault of the
+    set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
+    recordings.
 
     Only the training rows are looked at: the view of the residual table that is worked on holds no
     other key points. reference: recordings from before a change in question; without them the
@@ -145,7 +154,13 @@ def diagnose(
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    if setup_tests:
+        report("set-up")
+        wrong = find_setup_faults(model, recordings)
+        if wrong is not None:
+            return replace(with_setup(wrong), notes=notes, seconds=time.perf_counter() - begin)
+        check_fits(model.spec, recordings)
     report("predicting")
     problem = identification_problem(model, recordings, reference)
     report("sensitivities of the effects")
@@ -158,6 +173,16 @@ def diagnose(
     if result.verdict.kind == "unknown_effect":
         result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def with_setup(wrong: SetupResult) -> Diagnosis:
+    """The diagnosis of recordings whose set-up is at fault."""
+    return Diagnosis(
+        verdict=Verdict("setup", (), wrong.sentence),
+        error_mm=ErrorLevels(wrong.before_mm, wrong.floor_mm, wrong.after_mm),
+        ranking=(),
+        setup=wrong,
+    )
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:

@@ -284,8 +284,8 @@ class ResidualTable:
 
 
 def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTable:
-    """Evaluate a model on whole recordings."""
-    check_fits(model.spec, recordings)
+    """Evaluate a model on whole recordings, whatever their unit of length."""
+    check_fits(model.spec, recordings, sized=False)
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
         predicted = history.rows(model.predict(history))

@@ -166,6 +166,9 @@ class ResidualTable:
     """The noise over all key points, and where it is known from."""
     holds: Floor
     """The noise floor from the scatter in holds alone."""
+    paired_discrepancy_mm: np.ndarray | None = None
+    """(n,) where the residuals are paired differences (`pairs`): what takes the place of the model
+    discrepancy, mm; None: the residuals are those of the model."""
 
     @property
     def spec(self) -> ArmSpec:
@@ -271,7 +274,9 @@ class ResidualTable:
             block_of_row=places,
             motion=motion,
             fold=folds(motion),
-            discrepancy_mm=model_discrepancy(self.model, table.noise_mm),
+            discrepancy_mm=model_discrepancy(self.model, table.noise_mm)
+            if self.paired_discrepancy_mm is None
+            else self.paired_discrepancy_mm,
         )
 
     def training(self, rows: int = ROWS) -> "Problem":

@@ -214,15 +214,16 @@ class RunSignal:
         return np.stack(columns, axis=1)
 
 
-def run_signals(table: ResidualTable) -> list[RunSignal]:
-    """The actuation of every run of a table, as the model takes it."""
+def run_signals(table: ResidualTable, commanded: bool) -> list[RunSignal]:
+    """The actuation of every run of a table, as commanded or as the model takes it."""
     span, answer = np.array(table.spec.span), []
+    actuation = table.commanded if commanded else table.pressure
     for number in np.unique(table.run):
         rows = np.flatnonzero(table.run == number)
         timed = bool(table.timed[rows[0]])
         time = table.t_s[rows] if timed else np.arange(len(rows), dtype=float)
         name = table.names[table.recording[rows[0]]]
-        answer.append(RunSignal(int(number), name, rows, time, table.pressure[rows] / span, timed))
+        answer.append(RunSignal(int(number), name, rows, time, actuation[rows] / span, timed))
     return answer
 
 
@@ -390,26 +391,30 @@ class _Found:
     stretches: tuple[Stretch, ...]
 
 
-def _alike(after: ResidualTable, before: ResidualTable) -> np.ndarray:
+def _alike(after: ResidualTable, before: ResidualTable, commanded: bool) -> np.ndarray:
     """(m,) difference of each chamber, as a share of its range, that counts as the same."""
     span = np.array(after.spec.span)
     noise = [
-        np.zeros(len(span)) if t.history.noise is None else np.array(t.history.noise)
-        for t in (after, before)
+        np.zeros(len(span)) if table.history.noise is None else np.array(table.history.noise)
+        for table in (after, before)
     ]
-    return np.maximum(ALIKE, ALIKE_NOISES * np.hypot(*noise) / span)
+    noise_share = 0.0 if commanded else ALIKE_NOISES * np.hypot(*noise) / span
+    return np.maximum(ALIKE, noise_share)
 
 
 def _partners(after: ResidualTable, before: ResidualTable, itself: bool = False) -> _Found:
     """The partners of every row of AFTER; itself: BEFORE is the same table, rows are not their own
     partners."""
-    shape, alike = after.measured_mm.shape, _alike(after, before)
+    shape = after.measured_mm.shape
+    # A command has no noise, and a change of the arm does not change it.
+    commanded = all(np.isfinite(table.commanded).all() for table in (after, before))
+    alike = _alike(after, before, commanded)
     sums, predicted = np.zeros(shape), np.zeros(shape)
     seen, averaging = np.zeros(shape[:2]), np.zeros(shape[0])
     partners, time = np.zeros(shape[0], int), np.full(shape[0], np.nan)
     stretches = []
-    others = run_signals(before)
-    for one in run_signals(after):
+    others = run_signals(before, commanded)
+    for one in run_signals(after, commanded):
         for other in others:
             if one.timed != other.timed:
                 continue
@@ -517,7 +522,7 @@ def _enough(after: ResidualTable, pairs: Pairs) -> bool:
     both = shown & np.isfinite(pairs.change_mm).all(2).any(1)
     if both.sum() < 2 * LEAST_BLOCKS * BLOCK_ROWS:
         return False
-    step = np.median(np.concatenate([np.diff(s.t_s) for s in run_signals(after)]))
+    step = np.median(np.concatenate([np.diff(s.t_s) for s in run_signals(after, False)]))
     enough_time = after.timed.any() and both.sum() * step >= LEAST_S
     return bool(both.sum() >= LEAST_SHARE * shown.sum() or enough_time)
 
@@ -587,6 +592,8 @@ class BeforeAfter:
 
     table: ResidualTable
     """Residuals of AFTER: paired differences where `used`, else those of the model."""
+    plain: ResidualTable
+    """Residuals of the model on AFTER."""
     before: tuple[Recording, ...]
     """The recordings of BEFORE."""
     pairs: Pairs
@@ -603,6 +610,14 @@ class BeforeAfter:
         """The training rows of AFTER; without pairs the residuals of BEFORE are their reference."""
         problem = self.table.training(rows)
         return problem if self.used else problem.with_reference(self.before)
+
+    def with_held_out_pairs(self) -> "BeforeAfter":
+        """These recordings; through the model where too few held-out rows have a partner."""
+        shown = np.isfinite(self.plain.measured_mm).all(2).any(1) & self.plain.held_out
+        both = shown & self.pairs.paired
+        if not self.used or both.sum() >= LEAST_SHARE * shown.sum():
+            return self
+        return replace(self, table=self.plain, used=False)
 
     @property
     def change(self) -> Change:
@@ -651,7 +666,9 @@ def before_and_after(
     _check_common_range(table, other)
     if paired == "never":
         empty = replace(other, run=np.full(len(other.run), -1))
-        return BeforeAfter(table, before, _pairs(table, other, _partners(table, empty)), False)
+        return BeforeAfter(
+            table, table, before, _pairs(table, other, _partners(table, empty)), False
+        )
     found, pairs = paired_table(table, other)
     if found is None and paired == "always":
         raise InputError(
@@ -659,7 +676,7 @@ def before_and_after(
             f"recorded with the same actuation as {' + '.join(pairs.before)}; record the same "
             "protocol before and after, or leave out --paired always"
         )
-    return BeforeAfter(table if found is None else found, before, pairs, found is not None)
+    return BeforeAfter(found or table, table, before, pairs, found is not None)
 
 
 def _check_common_range(after: ResidualTable, before: ResidualTable) -> None:

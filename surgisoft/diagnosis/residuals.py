@@ -142,6 +142,8 @@ class ResidualTable:
     """(N, n, 3) measured key points, base frame, mm; NaN where missing, or not to be seen."""
     pressure: np.ndarray
     """(N, m) actuation, in the arm's unit."""
+    commanded: np.ndarray
+    """(N, m) commanded actuation, in the arm's unit; NaN where not known."""
     direction: np.ndarray
     """(N, m) direction of change of the chambers' pressure, as the network sees it: -1, 0, 1."""
     t_s: np.ndarray
@@ -316,6 +318,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         # Not through float32: the measured values are compared as they were recorded.
         measured_mm=np.concatenate([recording.key_points_mm for recording in recordings]),
         pressure=np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings]),
+        commanded=each(lambda r: r.commanded, (model.spec.chambers,)),
         direction=direction.double().numpy(),
         t_s=history.rows(history.t_s).numpy(),
         run=history.run_of_row.numpy(),

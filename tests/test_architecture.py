@@ -51,7 +51,8 @@ FLOORS = {
     "diagnosis": (
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
-        ("discrepancy", "data_quality", "error_axes", "inputs", "pairs"),
+        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("pairs",),
         ("cross_validation",),
         ("black_box", "candidates"),
         ("estimation",),

@@ -27,6 +27,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
+from surgisoft.diagnosis.discrepancy import LENGTHS
 from surgisoft.diagnosis.residuals import (
     BLOCK_ROWS,
     LEAST_BLOCKS,
@@ -73,6 +74,13 @@ LEAST_SHARE = 0.5
 used, or:"""
 LEAST_S = 60.0
 """time with a partner from which fewer do, s."""
+SPECTRUM_S = 20.0
+"""Longest stretch of a power spectrum, s: four blocks of time."""
+FREE_POWER = 4.0
+"""Power of the measured motion over that of the predicted one from which motion is free."""
+LEAST_BINS = 8
+"""Lowest frequency at which motion can be free, in steps of the spectrum: below it the few bins say
+little, and creep and drift act there."""
 UNSEEN_NOISE = 1.0
 """Repeatability beyond the noise floor, in noise floors, where BEFORE has no repeats that show it:
 slow noise is then taken to be as large as fast noise."""
@@ -122,10 +130,15 @@ class Pairs:
     nothing has changed, for one recording (their difference over root two), mm."""
     source: str
     """Where the repeatability is from: `repeats` of BEFORE, or `noise` where it has none."""
+    free_mm: np.ndarray
+    """(n,) RMS of the change at the frequencies of free motion, mm, see `free_motion`."""
     noise_mm: np.ndarray
-    """(n,) RMS noise of the paired difference of each key point, mm."""
+    """(n,) RMS noise of the paired difference of each key point, free motion included, mm."""
     discrepancy_mm: np.ndarray
     """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
+    tolerance_mm: np.ndarray
+    """(n,) what the right effect may leave, mm: the discrepancy, and the share of the change that
+    the sensitivities of the effects are off by (`slope_error`)."""
 
     @property
     def paired(self) -> np.ndarray:
@@ -154,6 +167,9 @@ class Change:
     """RMS distance by which a recording of the same motion differs where nothing changed, mm."""
     repeatability_source: str
     """`repeats`, `noise`, or `none` without pairs."""
+    free_mm: float
+    """RMS of the change at frequencies at which the arm moves freely (swings, vibration,
+    noise), mm; no effect explains it."""
     mismatch: float
     """RMS difference of the actuation between partners, as a share of its range."""
     stretches: tuple[Stretch, ...]
@@ -477,30 +493,34 @@ def paired_table(after: ResidualTable, before: ResidualTable) -> tuple[ResidualT
     measured = after.predicted_mm + change
     points = after.history.key_points.clone()
     points[after.history.valid] = torch.from_numpy(measured).to(points.dtype)
-    floor = after.floor
-    if floor.rmse_mm is not None:
-        floor = Floor(float(np.sqrt(np.mean(noise**2))), floor.source)
     paired = replace(
         after,
         measured_mm=measured,
         history=replace(after.history, key_points=points),
         noise_mm=noise,
-        floor=floor,
+        floor=Floor(float(np.sqrt(np.mean(noise**2))), "pairs"),
         paired_discrepancy_mm=pairs.discrepancy_mm,
+        paired_tolerance_mm=pairs.tolerance_mm,
     )
     return paired, pairs
 
 
 def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
-    """The pairs that the partners amount to."""
-    paired = found.partners > 0
+    """The pairs that the partners amount to; what they say about errors is of training rows."""
+    paired, training = found.partners > 0, ~after.held_out
+    measured_before = found.residual_mm + found.predicted_mm
+    correction = after.predicted_mm - found.predicted_mm
+    correction = without_noise(after, after.measured_mm - measured_before, correction)
+    change = after.measured_mm - measured_before - correction
     noise = np.sqrt(
         np.square(after.noise_mm)
         + np.square(before.noise_mm) * (np.nanmean(found.averaging) if paired.any() else 1.0)
     )
-    correction = after.predicted_mm - found.predicted_mm
-    change = after.residual_mm - found.residual_mm
+    free = free_motion(after, measured_before, found.predicted_mm, change)
+    noise = np.maximum(noise, free)
     repeatability, source = _repeatability(before)
+    slope = slope_error(after)
+    discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
     return Pairs(
         before=before.names,
         stretches=found.stretches,
@@ -511,9 +531,108 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         correction_mm=correction,
         repeatability_mm=repeatability,
         source=source,
+        free_mm=free,
         noise_mm=noise,
-        discrepancy_mm=paired_discrepancy(after, change, correction, repeatability, noise),
+        discrepancy_mm=discrepancy,
+        tolerance_mm=np.hypot(discrepancy, slope * rms_by_point(change[training])),
     )
+
+
+def without_noise(
+    after: ResidualTable, difference_mm: np.ndarray, correction_mm: np.ndarray
+) -> np.ndarray:
+    """(N, n, 3) the correction for the actuation, its fast part only as far as the arm followed it.
+
+    Differences of a measured actuation are real, or noise of its sensors, which moves no arm. What
+    is slower than PAST_S is taken for real. Of the rest a share is, found by regression of the
+    steps of the measured difference on those of the correction (training rows, one number).
+    """
+    if not after.timed.any():
+        return correction_mm
+    slow = np.full_like(correction_mm, np.nan)
+    for signal in run_signals(after, False):
+        width = max(1, round(PAST_S / signal.step_s))
+        slow[signal.rows] = _moving_mean(correction_mm[signal.rows], width)
+    fast = correction_mm - slow
+    same = (after.run[1:] == after.run[:-1]) & ~after.held_out[1:] & ~after.held_out[:-1]
+    left, right = np.diff(difference_mm, axis=0)[same], np.diff(fast, axis=0)[same]
+    seen = np.isfinite(left) & np.isfinite(right)
+    power = float(np.square(right[seen]).sum())
+    share = float((left[seen] * right[seen]).sum()) / power if power > 0 else 0.0
+    return slow + float(np.clip(share, 0.0, 1.0)) * fast
+
+
+def _moving_mean(field: np.ndarray, width: int) -> np.ndarray:
+    """(T, ...) mean over `width` rows around each row, of what is not NaN; NaN where nothing is."""
+    seen = np.isfinite(field)
+    empty = np.zeros((1, *field.shape[1:]))
+    sums = np.concatenate([empty, np.cumsum(np.where(seen, field, 0.0), axis=0)])
+    counts = np.concatenate([empty, np.cumsum(seen, axis=0)])
+    rows = np.arange(len(field))
+    low, high = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(field))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (sums[high] - sums[low]) / (counts[high] - counts[low])
+
+
+def free_motion(
+    after: ResidualTable,
+    measured_before_mm: np.ndarray,
+    predicted_before_mm: np.ndarray,
+    change_mm: np.ndarray,
+) -> np.ndarray:
+    """(n,) RMS of the change of each key point at the frequencies of free motion, mm.
+
+    An arm that swings, vibrates or is measured with noise moves at frequencies that the actuation
+    hardly contains: there BEFORE or AFTER shows FREE_POWER times the power that the model predicts,
+    or more.
+    No change of gain below 1 and no delay of a predicted motion has so much (|1 - exp(i phi)|^2 is
+    at most 4), so no effect of the catalogue explains what changes there, and it counts as noise of
+    the pair. Power by the method of Welch (1967), in bands of a third of an octave.
+    """
+    points = change_mm.shape[1]
+    fields = np.concatenate(
+        [measured_before_mm, after.measured_mm, predicted_before_mm, after.predicted_mm, change_mm],
+        axis=1,
+    )
+    count, power = 0, None
+    signals = [signal for signal in run_signals(after, False) if signal.timed]
+    if not signals:
+        return np.zeros(points)
+    step = float(np.median(np.concatenate([np.diff(signal.t_s) for signal in signals])))
+    length = int(2 ** np.floor(np.log2(max(2.0, SPECTRUM_S / step))))
+    for signal in signals:
+        rows = signal.rows[~after.held_out[signal.rows]]
+        seen = np.isfinite(fields[rows]).all((1, 2))
+        if seen.sum() < length:
+            continue
+        time = after.t_s[rows][seen]
+        even = np.arange(time[0], time[-1], step)
+        flat = fields[rows][seen].reshape(seen.sum(), -1)
+        values = np.stack([np.interp(even, time, column) for column in flat.T], axis=1)
+        for begin in range(0, len(even) - length + 1, length // 2):
+            found = _power(values[begin : begin + length]).reshape(-1, 5, points, 3).sum(3)
+            power, count = found if power is None else power + found, count + 1
+    if power is None:
+        return np.zeros(points)
+    total = power / count
+    frequency = np.fft.rfftfreq(length, step)
+    band = np.floor(3.0 * np.log2(np.maximum(frequency, frequency[1]) / frequency[1])).astype(int)
+    free = np.zeros(points)
+    for number in range(band[LEAST_BINS] + 1, band.max() + 1):
+        level = total[band == number].sum(0)
+        before, later, predicted_before, predicted_later = level[:4].sum(1)
+        if before >= FREE_POWER * predicted_before or later >= FREE_POWER * predicted_later:
+            free += level[4]
+    return np.sqrt(free)
+
+
+def _power(values: np.ndarray) -> np.ndarray:
+    """(F, C) power of signals (T, C) at each frequency; their sum is the variance."""
+    window = np.hanning(len(values))
+    spectrum = np.fft.rfft((values - values.mean(0)) * window[:, None], axis=0)
+    power = np.square(np.abs(spectrum)) / np.square(window).sum() / len(values)
+    power[1:-1] *= 2.0
+    return power
 
 
 def _enough(after: ResidualTable, pairs: Pairs) -> bool:
@@ -544,38 +663,43 @@ def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
 
 
 def paired_discrepancy(
-    after: ResidualTable,
-    change_mm: np.ndarray,
-    correction_mm: np.ndarray,
-    repeatability_mm: np.ndarray,
-    noise_mm: np.ndarray,
+    repeatability_mm: np.ndarray, correction_mm: np.ndarray, noise_mm: np.ndarray, slope: float
 ) -> np.ndarray:
-    """(n,) RMS error of each key point, mm, that is to be expected where no effect is missing.
+    """(n,) RMS systematic error of the paired difference of each key point, mm, without noise.
 
-    Two parts, independent of each other: what BEFORE does not repeat, without the noise of the
-    pair (`noise_mm`), and what an error e of the model's slope, as a share of it, causes in the
-    correction for the actuation and in the sensitivities by which a change is explained:
+    What BEFORE does not repeat, without the noise of the pair (`noise_mm`), and the error of the
+    correction for the actuation, of which the model's slope is off by a share (`slope`):
 
-        discrepancy^2 = max(2 repeatability^2 - noise^2, (LEAST noise)^2)
-                        + e^2 (rms(correction)^2 + rms(change)^2).
+        discrepancy^2 = max(2 repeatability^2 - noise^2, (least noise)^2) + (slope correction)^2.
 
-    The share e is the model's validated error over the RMS motion that it predicts.
+    It takes the place of the model discrepancy, in its size and its form: a smooth function of the
+    actuation that is the same in every repeat.
     """
     slow = np.maximum(2 * repeatability_mm**2 - noise_mm**2, (LEAST_DISCREPANCY * noise_mm) ** 2)
-    training = ~after.held_out
-    square = [
-        np.nan_to_num(np.nanmean(np.square(field[training]).sum(2), axis=0))
-        for field in (change_mm, correction_mm)
-    ]
-    return np.sqrt(slow + slope_error(after) ** 2 * (square[0] + square[1]))
+    return np.sqrt(slow + (slope * rms_by_point(correction_mm)) ** 2)
+
+
+def rms_by_point(field_mm: np.ndarray) -> np.ndarray:
+    """(n,) RMS distance of a field (N, n, 3), mm; NaN counts as missing, nothing at all as 0."""
+    square = np.square(field_mm).sum(2)
+    count = np.isfinite(square).sum(0)
+    return np.sqrt(np.nansum(square, axis=0) / np.maximum(count, 1))
 
 
 def slope_error(table: ResidualTable) -> float:
-    """Error of a model's slopes as a share of them: validated error over the motion, at most 1."""
+    """Error of a model's slopes as a share of them, at most 1.
+
+    Values off by e (validated error over the RMS motion that the model predicts) have slopes that
+    are off by more, the shorter the scales of the error are: a Matern-5/2 function of unit variance
+    and length l has slopes of variance 5 / (3 l^2) (Rasmussen & Williams 2006, sec. 4.2), here the
+    mixture of lengths of the model discrepancy. A motion of m chambers, each spread evenly over its
+    range of -1 to 1 with a slope s, is m s^2 / 3 in the mean square.
+    """
     motion = table.predicted_mm - table.predicted_mm.mean(0)
     moved = float(np.sqrt(np.mean(np.square(motion).sum(2))))
     error = float(np.sqrt(np.mean(model_discrepancy(table.model, table.noise_mm) ** 2)))
-    return min(1.0, error / max(moved, 1e-9))
+    steepness = sum(share * 5.0 / (3.0 * length**2) for length, share in LENGTHS)
+    return min(1.0, np.sqrt(steepness * table.spec.chambers / 3.0) * error / max(moved, 1e-9))
 
 
 # Before and after ----------------------------------------------------------------------------
@@ -625,7 +749,7 @@ class BeforeAfter:
         pairs, training = self.pairs, ~self.table.held_out
         share = float(pairs.paired[training].mean())
         if not self.used:
-            return Change(pairs.before, share, None, (), None, "none", 0.0, pairs.stretches)
+            return Change(pairs.before, share, None, (), None, "none", 0.0, 0.0, pairs.stretches)
         square = np.square(pairs.change_mm[training]).sum(2)
         counts = np.array([each.rows for each in pairs.stretches])
         mismatch = np.array([each.mismatch for each in pairs.stretches])
@@ -636,6 +760,7 @@ class BeforeAfter:
             per_key_point_mm=tuple(float(x) for x in np.sqrt(np.nanmean(square, axis=0))),
             repeatability_mm=float(np.sqrt(np.mean(pairs.repeatability_mm**2))),
             repeatability_source=pairs.source,
+            free_mm=float(np.sqrt(np.mean(pairs.free_mm**2))),
             mismatch=float(np.sqrt(np.average(mismatch**2, weights=counts))),
             stretches=pairs.stretches,
         )

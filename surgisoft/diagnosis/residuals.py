@@ -68,7 +68,8 @@ class Floor:
     rmse_mm: float | None
     """RMS distance of a measured key point from its true place, mm; None if it is not known."""
     source: str
-    """`sidecar`, `holds`, `second differences`, `repeats` or `unknown`."""
+    """`sidecar`, `holds`, `second differences`, `repeats`, `pairs` (of a paired difference) or
+    `unknown`."""
 
 
 UNKNOWN = Floor(None, "unknown")
@@ -171,6 +172,8 @@ class ResidualTable:
     paired_discrepancy_mm: np.ndarray | None = None
     """(n,) where the residuals are paired differences (`pairs`): what takes the place of the model
     discrepancy, mm; None: the residuals are those of the model."""
+    paired_tolerance_mm: np.ndarray | None = None
+    """(n,) where they are paired differences: `Problem.tolerance_mm`."""
 
     @property
     def spec(self) -> ArmSpec:
@@ -263,6 +266,10 @@ class ResidualTable:
         names = np.unique(block[index])
         places = np.where(np.isin(block, names), np.searchsorted(names, block), -1)
         motion = motions(table.history, half_range(self.spec), places)
+        discrepancy = self.paired_discrepancy_mm
+        if discrepancy is None:
+            discrepancy = model_discrepancy(self.model, table.noise_mm)
+        tolerance = self.paired_tolerance_mm
         return Problem(
             model=self.model,
             table=table,
@@ -276,9 +283,8 @@ class ResidualTable:
             block_of_row=places,
             motion=motion,
             fold=folds(motion),
-            discrepancy_mm=model_discrepancy(self.model, table.noise_mm)
-            if self.paired_discrepancy_mm is None
-            else self.paired_discrepancy_mm,
+            discrepancy_mm=discrepancy,
+            tolerance_mm=discrepancy if tolerance is None else tolerance,
         )
 
     def training(self, rows: int = ROWS) -> "Problem":
@@ -407,6 +413,9 @@ class Problem:
     """(B,) fold that each block is left out with; one for all blocks of a motion."""
     discrepancy_mm: np.ndarray
     """(n,) model discrepancy: validated RMS error of each key point without its noise, mm."""
+    tolerance_mm: np.ndarray
+    """(n,) RMS error, mm, that the right effect may leave: the model discrepancy, and in a paired
+    difference what errors of the model's slope do to the sensitivities of the effects."""
     reference: Reference | None = None
     """Residuals from before the change in question; None: the discrepancy is known by its size
     alone."""

@@ -220,29 +220,44 @@ class ArmModel(nn.Module):
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
         return self.chain.scan(history, self.first_pressure(history)).behind["sensor"]
 
-    @torch.no_grad()
-    def predict_interval(self, history: History, coverage: float = LEVEL) -> PredictionInterval:
-        """Predicted key points of whole runs, and the radii within which measured ones lie.
+    @property
+    def states_interval(self) -> bool:
+        """Whether `predict_interval` knows how far off this model may be."""
+        interval = self.validation.interval
+        return interval is not None and (
+            interval.growth == 0 or self.training_residuals is not None
+        )
 
-        coverage: share (0..1) of measured key points to enclose, on runs like those of the fit.
-        Raises InputError where the model has no interval (`Validation.interval`).
+    @torch.no_grad()
+    def error_radius(self, actuation: Tensor, coverage: float = LEVEL) -> Tensor:
+        """(S, n) radii in mm around predicted key points within which measured ones lie.
+
+        actuation: (S, m) in the arm's unit; coverage: share (0..1) of measured key points to
+        enclose, on runs like those of the fit. Raises InputError where the model states none.
         """
         if not 0 < coverage < 1:
             raise InputError(f"coverage {coverage:g}: expected a share between 0 and 1")
-        interval, known = self.validation.interval, self.training_residuals
-        if interval is None or (interval.growth > 0 and known is None):
+        if not self.states_interval:
             raise InputError(
                 "this model states no prediction interval: it was fitted by an earlier version, "
                 "or effects were added to it since; fit it again"
             )
-        points = self.predict(history)
-        distance = torch.zeros(history.valid.shape, device=points.device)
+        interval, distance = self.validation.interval, torch.zeros_like(actuation[:, 0])
         if interval.growth > 0:
-            span = torch.tensor(self.spec.span, device=points.device)
-            reference = known.actuation.to(points.device)
-            apart = distance_to(history.pressure.flatten(0, 1), reference, span)
-            distance = apart.view(history.valid.shape)
-        return PredictionInterval(points, interval.radius_mm(distance, coverage), coverage)
+            span = torch.tensor(self.spec.span, dtype=actuation.dtype, device=actuation.device)
+            reference = self.training_residuals.actuation.to(actuation)
+            distance = distance_to(actuation, reference, span)
+        return interval.radius_mm(distance, coverage)
+
+    @torch.no_grad()
+    def predict_interval(self, history: History, coverage: float = LEVEL) -> PredictionInterval:
+        """Predicted key points of whole runs, and the radii within which measured ones lie.
+
+        Arguments and error as those of `error_radius`.
+        """
+        radius = self.error_radius(history.pressure.flatten(0, 1), coverage)
+        shaped = radius.view(*history.valid.shape, -1)
+        return PredictionInterval(self.predict(history), shaped, coverage)
 
     def summary(self) -> str:
         """One line of text: inputs, network and effects."""

@@ -3,7 +3,7 @@
     python -m benchmarks.real_models RECORDING.parquet [--actuation commanded] [--folds 5]
 
 Runs, or blocks of time of a single run, are dealt into folds. Each fold is left out once; on the
-others a model is fitted as `surgisoft fit --effects auto --members 5` does, and three black boxes
+others a model is fitted as `surgisoft fit --prior arcs --effects auto --members 5` does, and three black boxes
 are too. None of them sees the left-out fold before it is judged there; what each of them chooses
 by held-out data, it chooses inside the other folds.
 
@@ -176,6 +176,7 @@ def main() -> None:
     parser.add_argument("--members", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=200)
     parser.add_argument("--effects", default="auto")
+    parser.add_argument("--prior", default="arcs")
     options = parser.parse_args()
     torch.set_num_threads(1)
     with warnings.catch_warnings():
@@ -187,6 +188,7 @@ def main() -> None:
     )
     config = FitConfig(
         effects=tuple(name for name in options.effects.split(",") if name),
+        prior=options.prior,
         members=options.members,
         epochs=options.epochs,
     )

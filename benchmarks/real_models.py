@@ -3,9 +3,9 @@
     python -m benchmarks.real_models RECORDING.parquet [--actuation commanded] [--folds 5]
 
 Runs, or blocks of time of a single run, are dealt into folds. Each fold is left out once; on the
-others a model is fitted as `surgisoft fit --prior arcs --effects auto --members 5` does, and three black boxes
-are too. None of them sees the left-out fold before it is judged there; what each of them chooses
-by held-out data, it chooses inside the other folds.
+others a model is fitted as `surgisoft fit --prior arcs --effects auto --members 5` does, and three
+black boxes are too. None of them sees the left-out fold before it is judged there; what each of
+them chooses by held-out data, it chooses inside the other folds.
 
 Black boxes: the recurrent network of `fit --network recurrent`; ridge regression on the actuation
 and its low passes, with all products of two; and kernel ridge regression (Gaussian kernel, Nystroem

@@ -1,10 +1,10 @@
 """Ensembles: networks trained side by side, each with another share of the data left out.
 
-The effects and the prior mean of a fitted model stay as they are. Runs, or long blocks of time, are
-dealt into as many folds as there are members, and each member is trained from new weights on all folds but its own
-(bagging over blocks: Breiman 1996). The mean of the members is the prediction. Each row was left
-out by one member; that member's error on it is what cross-validation finds, and calibrates the
-interval (CV+, Barber et al. 2021).
+The effects and the prior mean of a fitted model stay as they are. Runs, or long blocks of time,
+are dealt into as many folds as there are members, and each member is trained from new weights on
+all folds but its own (bagging over blocks: Breiman 1996). The mean of the members is the
+prediction. Each row was left out by one member; that member's error on it is what cross-validation
+finds, and calibrates the interval (CV+, Barber et al. 2021).
 
 All members are trained at once by batched products and for a fixed number of epochs: no row stops
 the training, so the errors of rows left out are those of new rows.

@@ -52,6 +52,7 @@ FLOORS = {
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("pairs",),
         ("cross_validation",),
         ("black_box", "candidates", "setup"),
         ("estimation",),

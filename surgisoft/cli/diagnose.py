@@ -8,11 +8,13 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_new_folder
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
+    Before,
     EffectFiles,
     JsonFile,
     Model,
+    Paired,
     Recordings,
     Report,
     with_effect_files,
@@ -27,15 +29,8 @@ def diagnose(
     recordings: Recordings,
     json_file: JsonFile = None,
     report: Report = None,
-    reference: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="REC...",
-            help="Recordings from before a change. The diagnosis then separates what has changed "
-            "since from errors of the model; default: the training residuals in the model's "
-            "folder.",
-        ),
-    ] = None,
+    before: Before = None,
+    paired: Paired = "auto",
     without: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,7 +67,7 @@ def diagnose(
     check_new_folder(apply)
     check_model(model)
     measured = read_recordings(recordings)
-    before = read_recordings(reference) if reference else None
+    earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.measurement.recordings import save_recordings
@@ -85,9 +80,10 @@ def diagnose(
             arm,
             measured,
             lambda text: tell(next(stages), 6, text),
-            before,
-            without or (),
-            setup_tests,
+            without=without or (),
+            setup_tests=setup_tests,
+            before=earlier,
+            paired=paired,
         )
     warn_all(found.notes)
     written = []
@@ -116,7 +112,10 @@ def diagnose(
         print(f"next: {with_effect_files(command)}")
     elif found.verdict.kind in ("identified", "several"):
         effects = " ".join(found.verdict.effects)
-        command = f"surgisoft amend {model} --effect {effects} --data {data} -o NEW"
+        command = f"surgisoft amend {model} --effect {effects} --data {data}"
+        if before:
+            command += f" --before {' '.join(map(str, before))}"
+        command += " -o NEW"
         print(f"next: {with_effect_files(command)}")
 
 

@@ -127,7 +127,7 @@ def setup_faults(
     ] = Path("runs/benchmark-setup-faults"),
     output: Output = None,
 ) -> None:
-    """Faults of the set-up in recordings: frames, units, orders, chambers, clocks, dead channels."""
+    """Faults of the set-up in recordings: frames, units, orders, chambers, clocks."""
     from benchmarks.setup_faults import markdown, run
 
     numbers = _numbers("--robots", robots)

@@ -84,10 +84,10 @@ class Proof:
     """Corrections whose errors differ by less than this factor do equally well: the simplest of
     them is named, and those of its number of kinds are named together."""
     blocks: float = 0.9
-    """Least share of the blocks of time with an error above the validated one in which it falls."""
+    """Least share of the blocks of time whose error falls, of those above the validated error."""
     lag_t: float = 3.0
-    """By how many standard errors, over blocks of time, the logarithm of the error must be less with
-    a pure delay than with any lag, alone or behind a quarter of the delay."""
+    """By how many standard errors, over blocks of time, the logarithm of the error must be less
+    with a pure delay than with any lag, alone or behind a quarter of the delay."""
     lag_gain: float = 0.5
     """Most squared error above the validated one that a pure delay may leave, as a share of what
     the best lag without a delay leaves."""

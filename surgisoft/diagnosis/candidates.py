@@ -29,10 +29,10 @@ class Candidate:
     """The effect's name."""
     effect: Effect
     """The effect, at zero amplitude."""
-    columns: np.ndarray
+    sensitivities: np.ndarray
     """(S, n, 3, K) sensitivity of the key points to each amplitude, mm."""
     more: bool = False
-    """Whether the columns make an effect that the model has already stronger."""
+    """Whether the sensitivities make an effect that the model has already stronger."""
     fitted: bool = False
     """Whether its nonlinear parameters were fitted and not taken from a grid."""
 
@@ -88,7 +88,7 @@ def signals(problem: Problem) -> Signals:
 
 
 @torch.no_grad()
-def columns_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
+def sensitivities_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
     """(S, n, 3, K) sensitivity of the key points, mm, to each amplitude of an effect at zero.
 
     The effect stands behind the others of its stage. Effects of line and material act through the
@@ -113,8 +113,10 @@ def more_of(problem: Problem, signal: Signals, name: str) -> Candidate | None:
     before, after = problem.model.chain.around(name, signal.taps)
     change = problem.rows(after - before)
     each = torch.diag_embed(change).movedim(-1, 0)
-    columns = torch.einsum("snjm,ksm->ksnj", signal.slope, torch.cat([change[None], each[:-1]]))
-    return Candidate(name, effect, columns.movedim(0, -1).numpy(), more=True)
+    sensitivities = torch.einsum(
+        "snjm,ksm->ksnj", signal.slope, torch.cat([change[None], each[:-1]])
+    )
+    return Candidate(name, effect, sensitivities.movedim(0, -1).numpy(), more=True)
 
 
 def facts_of(problem: Problem) -> ArmFacts:
@@ -140,6 +142,10 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
             answer.append(more)
             fresh = hypothesis.further(facts, points)
         for effect in fresh:
-            columns = columns_of(problem, signal, effect)
-            answer.append(Candidate(name, copy.deepcopy(effect), columns))
-    return [c for c in answer if np.isfinite(c.columns).all() and np.abs(c.columns).max() > 1e-6]
+            sensitivities = sensitivities_of(problem, signal, effect)
+            answer.append(Candidate(name, copy.deepcopy(effect), sensitivities))
+    return [
+        c
+        for c in answer
+        if np.isfinite(c.sensitivities).all() and np.abs(c.sensitivities).max() > 1e-6
+    ]

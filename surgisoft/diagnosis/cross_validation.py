@@ -34,10 +34,10 @@ FITTED = -1
 def static_features(x, d, number: int = INDUCING, seed: int = 0) -> np.ndarray:
     """(S, F) features whose unit-normal mixture has the discrepancy's covariance."""
     rng = np.random.default_rng(seed)
-    picked = rng.permutation(len(x))[: min(number, len(x))]
-    values, vectors = linalg.eigh(kernel(x[picked], d[picked], x[picked], d[picked]))
+    chosen = rng.permutation(len(x))[: min(number, len(x))]
+    values, vectors = linalg.eigh(kernel(x[chosen], d[chosen], x[chosen], d[chosen]))
     kept = values > 1e-8 * values.max()
-    return kernel(x, d, x[picked], d[picked]) @ (vectors[:, kept] / np.sqrt(values[kept]))
+    return kernel(x, d, x[chosen], d[chosen]) @ (vectors[:, kept] / np.sqrt(values[kept]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Basis:
     values: np.ndarray
     """(F,) eigenvalues of the features' products over the fitted rows."""
     vectors: np.ndarray
-    """(F, F) their eigenvectors, in columns."""
+    """(F, F) their eigenvectors, in sensitivities."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,32 +165,32 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Held-out errors of sets of columns."""
+    """Held-out errors of sets of sensitivities."""
 
     split: Split
     fields: np.ndarray
-    """(rows, n, 3, 1 + K) residual and columns, mm; 0 where missing."""
+    """(rows, n, 3, 1 + K) residual and sensitivities, mm; 0 where missing."""
     grams: np.ndarray
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
     held_out: np.ndarray
     """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each held-out block."""
     cache: dict = field(default_factory=dict)
-    """Held-out sums of squares and amplitudes by columns."""
+    """Held-out sums of squares and amplitudes by sensitivities."""
 
     @classmethod
-    def on(cls, split: Split, columns: np.ndarray) -> "CrossValidation":
-        """The same with columns (rows, n, 3, K) on a split."""
+    def on(cls, split: Split, sensitivities: np.ndarray) -> "CrossValidation":
+        """The same with sensitivities (rows, n, 3, K) on a split."""
         first = split.residual[: split.rows, ..., None]
-        both = np.concatenate([first, _masked(split, columns)], axis=3)
+        both = np.concatenate([first, _masked(split, sensitivities)], axis=3)
         known = split.residual[split.rows :]
         turned = split.turned(both, known)
         grams, held_out = _products(split, both, turned, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
         return cls(split, both, grams, held_out)
 
-    def extended(self, columns: np.ndarray) -> "CrossValidation":
-        """The same with further columns (rows, n, 3, K') behind those that it has."""
-        more = _masked(self.split, columns)
+    def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
+        """The same with further sensitivities (rows, n, 3, K') behind those that it has."""
+        more = _masked(self.split, sensitivities)
         both = np.concatenate([self.fields, more], axis=3)
         turned = self.split.turned(more)
         known = self.split.residual[self.split.rows :]
@@ -207,8 +207,8 @@ class CrossValidation:
         return self.held_out[:, :, 0, 0].astype(float)
 
     @property
-    def columns(self) -> int:
-        """Number of columns, K."""
+    def sensitivities(self) -> int:
+        """Number of sensitivities, K."""
         return self.fields.shape[3] - 1
 
     @property
@@ -218,27 +218,27 @@ class CrossValidation:
         weights = self.split.seen[:rows].sum(1)
         return np.bincount(self.split.block[:rows], weights, minlength=len(self.split.fold))
 
-    def losses(self, picked: list[int] | tuple[int, ...] | np.ndarray = ()) -> np.ndarray:
-        """(B,) held-out sum of squared distances of each block, mm^2, with the picked columns."""
-        columns = np.unique(np.asarray(picked, int))
-        tried, _ = self._solved(columns)
-        ridges = len(RIDGES) if len(columns) > 1 else 1
+    def losses(self, chosen: list[int] | tuple[int, ...] | np.ndarray = ()) -> np.ndarray:
+        """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2."""
+        sensitivities = np.unique(np.asarray(chosen, int))
+        tried, _ = self._solved(sensitivities)
+        ridges = len(RIDGES) if len(sensitivities) > 1 else 1
         tried = tried[:, :ridges].reshape(-1, tried.shape[2])
         return tried[tried.sum(axis=1).argmin()]
 
-    def amplitudes(self, picked: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
-        """(k,) amplitudes of the picked columns, mean over the folds."""
-        columns, where = np.unique(np.asarray(picked, int), return_inverse=True)
-        tried, amplitudes = self._solved(columns)
+    def amplitudes(self, chosen: list[int] | tuple[int, ...] | np.ndarray) -> np.ndarray:
+        """(k,) amplitudes of the chosen sensitivities, mean over the folds."""
+        sensitivities, where = np.unique(np.asarray(chosen, int), return_inverse=True)
+        tried, amplitudes = self._solved(sensitivities)
         sums = tried.sum(axis=2)
         level, ridge = np.unravel_index(sums.argmin(), sums.shape)
         return amplitudes[level, ridge].mean(axis=0)[where]
 
-    def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _solved(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """((L, r, B) held-out sums of squares, (L, r, folds, k) amplitudes) for every ridge."""
-        key = columns.tobytes()
+        key = sensitivities.tobytes()
         if key not in self.cache:
-            rows = np.concatenate([[0], columns + 1])
+            rows = np.concatenate([[0], sensitivities + 1])
             amplitudes = _amplitudes(self.grams[:, :, rows[:, None], rows])
             mix = np.insert(-amplitudes, 0, 1.0, axis=-1)[:, :, self.split.fold]
             part = self.held_out[:, :, rows[:, None], rows].astype(float)
@@ -247,13 +247,13 @@ class CrossValidation:
         return self.cache[key]
 
 
-def _masked(split: Split, columns: np.ndarray) -> np.ndarray:
+def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
     """Columns (rows, n, 3, K) in single precision, 0 where nothing was measured."""
-    return np.where(split.seen[: split.rows, :, None, None], columns, 0.0).astype(np.float32)
+    return np.where(split.seen[: split.rows, :, None, None], sensitivities, 0.0).astype(np.float32)
 
 
 def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:
-    """(grams, held_out) of CrossValidation from the columns of two fields (rows, n, 3, A or B)."""
+    """(grams, held_out) of CrossValidation from columns of two fields (rows, n, 3, A or B)."""
     levels, folds, size = len(split.ridges), len(split.bases), (a.shape[3], b.shape[3])
     parts = np.array([_product(a[rows], b[rows]) for rows in split.held], float)
     grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
@@ -290,7 +290,7 @@ def _bordered(inner: np.ndarray, border: np.ndarray) -> np.ndarray:
 def _amplitudes(gram: np.ndarray) -> np.ndarray:
     """(L, r, folds, k) least-squares amplitudes with each of r RIDGES.
 
-    gram: (L, folds, 1 + k, 1 + k) products of the residual and the columns.
+    gram: (L, folds, 1 + k, 1 + k) products of the residual and the sensitivities.
     """
     normal, right = gram[..., 1:, 1:], gram[..., 1:, 0]
     normal = 0.5 * (normal + np.swapaxes(normal, -1, -2))

@@ -23,6 +23,7 @@ Kind = Literal[
     "nothing_missing",
     "unknown_effect",
     "surrogate_undertrained",
+    "setup",
 ]
 
 MOST_RUNNER_UP = 1.2
@@ -123,7 +124,7 @@ def evidence_of(found: Findings) -> Evidence:
     floor = selection.floor.sum()
     raw = float(np.nansum(np.square(problem.residual)))
     null = selection.losses()
-    after = selection.losses(found.picked)
+    after = selection.losses(found.chosen)
     best = found.named[0] if found.named else (found.first[0] if found.first else None)
     others = [s for s in found.first if best is not None and s.effect != best.effect]
     runner = others[0] if others else None

@@ -72,9 +72,9 @@ def polynomial(x: np.ndarray, degree: int = 3) -> np.ndarray:
     degree = degree if x.shape[1] < 5 else min(degree, 2)
     return np.stack(
         [
-            np.prod(x[:, list(picked)], axis=1)
+            np.prod(x[:, list(chosen)], axis=1)
             for power in range(1, degree + 1)
-            for picked in itertools.combinations_with_replacement(range(x.shape[1]), power)
+            for chosen in itertools.combinations_with_replacement(range(x.shape[1]), power)
         ],
         axis=1,
     )

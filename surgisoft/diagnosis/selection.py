@@ -34,14 +34,14 @@ ASKED = CRITERIA.selection
 
 @dataclass(frozen=True, eq=False)
 class Option:
-    """One way to add an effect: one of its shapes, or several of them side by side."""
+    """One form of an effect: one of its candidates, or several of them side by side."""
 
     effect: str
     """The effect's name."""
-    picked: tuple[int, ...]
-    """Its columns."""
-    shape: int | None
-    """Number of the candidate; None: several shapes."""
+    chosen: tuple[int, ...]
+    """Its sensitivities."""
+    candidate: int | None
+    """Number of the candidate; None: several of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Score:
     effect: str
     """Its name."""
     option: Option
-    """The way to add it that explains most."""
+    """Its form that explains most."""
     losses: np.ndarray
     """(B,) held-out sum of squared distances by block, mm^2."""
     log_gain: np.ndarray
@@ -64,12 +64,12 @@ class Score:
     @property
     def score(self) -> float:
         """Mean log gain less the price of its amplitudes: what effects are ranked by."""
-        return ASKED.priced(self.log_gain.mean(), len(self.option.picked))
+        return ASKED.priced(self.log_gain.mean(), len(self.option.chosen))
 
 
-def picked_by(scores: Sequence[Score]) -> tuple[int, ...]:
-    """The columns of effects, one after another."""
-    return sum((score.option.picked for score in scores), ())
+def chosen_by(scores: Sequence[Score]) -> tuple[int, ...]:
+    """The sensitivities of effects, one after another."""
+    return sum((score.option.chosen for score in scores), ())
 
 
 def _near(quantity: Quantity) -> bool:
@@ -80,10 +80,12 @@ def _near(quantity: Quantity) -> bool:
     return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
 
 
-def _ways(candidates: Sequence[Candidate], number: int = 0, first: int = 0) -> Iterator[Option]:
-    """One option for each candidate, these being numbered and having columns from those given."""
+def _options_of(
+    candidates: Sequence[Candidate], number: int = 0, first: int = 0
+) -> Iterator[Option]:
+    """One option for each candidate, numbered and indexed from the given numbers on."""
     for candidate in candidates:
-        end = first + candidate.columns.shape[3]
+        end = first + candidate.sensitivities.shape[3]
         yield Option(candidate.name, tuple(range(first, end)), number)
         number, first = number + 1, end
 
@@ -96,54 +98,56 @@ class ModelSelection:
     candidates: list[Candidate]
     validation: CrossValidation
     options: dict[str, list[Option]]
-    """Ways to add each effect."""
-    columns: np.ndarray
-    """(S, n, 3, K) all columns, mm."""
+    """Forms of each effect."""
+    sensitivities: np.ndarray
+    """(S, n, 3, K) all sensitivities, mm."""
     floor: np.ndarray
     """(B,) sum of squared noise in each block, mm^2."""
     fitted: dict = field(default_factory=dict)
-    """Effects at their amplitudes by shape and base."""
+    """Effects at their amplitudes by candidate and base."""
 
     @classmethod
     def of(cls, problem: Problem, candidates: list[Candidate]) -> "ModelSelection":
         """Prepare the selection; afterwards every set of effects is cheap to try."""
-        columns = np.concatenate(
-            [np.zeros((*problem.residual.shape, 0)), *(c.columns for c in candidates)], axis=3
+        sensitivities = np.concatenate(
+            [np.zeros((*problem.residual.shape, 0)), *(c.sensitivities for c in candidates)], axis=3
         )
-        validation = CrossValidation.on(split_of(problem), columns)
+        validation = CrossValidation.on(split_of(problem), sensitivities)
         options: dict[str, list[Option]] = {}
-        for way in _ways(candidates):
-            options.setdefault(way.effect, []).append(way)
-        for name, ways in options.items():
-            # Beside more of an effect that the model has, one further shape of it is enough.
-            own = any(candidates[way.shape].more for way in ways)
-            shapes = [candidates[way.shape].effect for way in ways]
-            for some in [] if own else hypothesis_of(shapes[0]).combinations(shapes):
+        for option in _options_of(candidates):
+            options.setdefault(option.effect, []).append(option)
+        for name, choices in options.items():
+            # Beside more of an effect that the model has, one further candidate is enough.
+            own = any(candidates[option.candidate].more for option in choices)
+            members = [candidates[option.candidate].effect for option in choices]
+            for some in [] if own else hypothesis_of(members[0]).combinations(members):
                 if len(some) > 1:
-                    ways.append(Option(name, sum((ways[i].picked for i in some), ()), None))
+                    choices.append(Option(name, sum((choices[i].chosen for i in some), ()), None))
         noise = float(np.mean(problem.noise_mm**2))
-        return cls(problem, candidates, validation, options, columns, validation.counts * noise)
+        return cls(
+            problem, candidates, validation, options, sensitivities, validation.counts * noise
+        )
 
     def extended(self, more: list[Candidate]) -> "ModelSelection":
-        """The selection with further shapes of its effects; what is known of the others is kept."""
+        """The selection with further candidates of its effects; known results are kept."""
         if not more:
             return self
-        columns = np.concatenate([c.columns for c in more], axis=3)
-        options = {name: list(ways) for name, ways in self.options.items()}
-        for way in _ways(more, len(self.candidates), self.columns.shape[3]):
-            options.setdefault(way.effect, []).append(way)
+        sensitivities = np.concatenate([c.sensitivities for c in more], axis=3)
+        options = {name: list(choices) for name, choices in self.options.items()}
+        for option in _options_of(more, len(self.candidates), self.sensitivities.shape[3]):
+            options.setdefault(option.effect, []).append(option)
         return replace(
             self,
             candidates=[*self.candidates, *more],
-            validation=self.validation.extended(columns),
+            validation=self.validation.extended(sensitivities),
             options=options,
-            columns=np.concatenate([self.columns, columns], axis=3),
+            sensitivities=np.concatenate([self.sensitivities, sensitivities], axis=3),
             fitted=dict(self.fitted),
         )
 
-    def losses(self, picked: tuple[int, ...] = ()) -> np.ndarray:
-        """(B,) held-out sum of squared distances, mm^2, with the picked columns."""
-        return self.validation.losses(picked)
+    def losses(self, chosen: tuple[int, ...] = ()) -> np.ndarray:
+        """(B,) held-out sum of squared distances, mm^2, with the chosen sensitivities."""
+        return self.validation.losses(chosen)
 
     def rmse_mm(self, losses: np.ndarray) -> float:
         """RMS distance of a key point, mm."""
@@ -154,9 +158,10 @@ class ModelSelection:
         return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
     def size(self, losses: np.ndarray) -> float:
-        """Error that is left above the noise floor, in units of the model discrepancy."""
+        """Error that is left above the noise floor, in units of the model discrepancy (of what the
+        right effect may leave, `Problem.tolerance_mm`)."""
         seen = np.isfinite(self.problem.residual).all(2).sum(0)
-        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.discrepancy_mm))))
+        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.tolerance_mm))))
 
     @property
     def whole_size(self) -> float:
@@ -178,41 +183,49 @@ class ModelSelection:
     def scores(self, base: tuple[int, ...] = (), without: tuple[str, ...] = ()):
         """Every effect on top of a base, the best first."""
         before = self.losses(base)
-        ways = [w for name, some in self.options.items() if name not in without for w in some]
-        after = [self.losses(base + way.picked) for way in ways]
-        if not ways:
+        choices = [w for name, some in self.options.items() if name not in without for w in some]
+        after = [self.losses(base + option.chosen) for option in choices]
+        if not choices:
             return []
         gains = np.array([self.log_ratio(before, losses) for losses in after])
-        chances = sign_flip_p_values(self.problem.by_motion(gains), [way.effect for way in ways])
+        chances = sign_flip_p_values(
+            self.problem.by_motion(gains), [option.effect for option in choices]
+        )
         best: dict[str, Score] = {}
-        scores = [ASKED.priced(g.mean(), len(w.picked)) for g, w in zip(gains, ways, strict=True)]
+        scores = [
+            ASKED.priced(g.mean(), len(w.chosen)) for g, w in zip(gains, choices, strict=True)
+        ]
         for i in np.argsort(-np.array(scores), kind="stable"):
-            way, losses = ways[i], after[i]
-            if way.effect not in best and self.plausible(way, base):
+            option, losses = choices[i], after[i]
+            if option.effect not in best and self.plausible(option, base):
                 gain = (before.sum() - losses.sum()) / self.excess(before)
-                best[way.effect] = Score(way.effect, way, losses, gains[i], chances[i], gain)
+                best[option.effect] = Score(
+                    option.effect, option, losses, gains[i], chances[i], gain
+                )
         return sorted(best.values(), key=lambda score: -score.score)
 
-    def plausible(self, way: Option, base: tuple[int, ...] = ()) -> bool:
+    def plausible(self, option: Option, base: tuple[int, ...] = ()) -> bool:
         """Whether an effect's parameters lie in their ranges as the selection leaves them.
 
-        Several shapes side by side are as plausible as the best of them. One that only inner
+        Several candidates side by side are as plausible as the best of them. One that only inner
         reversals show must explain more than a function of the actuation does: on ramps that all
         begin at rest, loops can be summed to any such function.
         """
-        effect = self.in_place(self.single(way, base), base)
+        effect = self.in_place(self.single(option, base), base)
         if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
             return False
-        some = self.candidates[self.options[way.effect][0].shape].effect
+        some = self.candidates[self.options[option.effect][0].candidate].effect
         return (
             not hypothesis_of(some).needs_reversals
-            or self._static_share(way, base) <= ASKED.most_static
+            or self._static_share(option, base) <= ASKED.most_static
         )
 
-    def _static_share(self, way: Option, base: tuple[int, ...]) -> float:
+    def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
-        amplitudes = self.validation.amplitudes(base + way.picked)[len(base) :]
-        part = (self.columns[..., list(way.picked)] @ amplitudes).reshape(len(self.columns), -1)
+        amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+        part = (self.sensitivities[..., list(option.chosen)] @ amplitudes).reshape(
+            len(self.sensitivities), -1
+        )
         part = part - part.mean(axis=0)
         known = self._cubics.T @ part
         return float(np.square(known).sum() / max(np.square(part).sum(), 1e-30))
@@ -225,65 +238,65 @@ class ModelSelection:
         return np.linalg.qr(np.hstack([np.ones((len(x), 1)), x, pairs, x**3]))[0]
 
     def freest(self, score: Score) -> tuple[int, ...]:
-        """An effect's columns; beside a fitted one those of the grid that do best with it."""
-        own = score.option.picked
-        shape = score.option.shape
-        if shape is None or not self.candidates[shape].fitted:
+        """An effect's sensitivities; beside a fitted one those of the grid that do best with it."""
+        own = score.option.chosen
+        one = score.option.candidate
+        if one is None or not self.candidates[one].fitted:
             return own
-        ways = [w for w in self.options[score.effect] if w.shape != shape]
-        return min((own + w.picked for w in ways), key=lambda p: float(self.losses(p).sum()))
+        choices = [w for w in self.options[score.effect] if w.candidate != one]
+        return min((own + w.chosen for w in choices), key=lambda p: float(self.losses(p).sum()))
 
-    def single(self, way: Option, base: tuple[int, ...] = ()) -> Option:
-        """The way itself, or the best single shape of those that stand side by side in it."""
-        if way.shape is not None:
-            return way
-        own = set(way.picked)
-        ways = self.options[way.effect]
-        singles = [w for w in ways if w.shape is not None and own.issuperset(w.picked)]
-        return min(singles, key=lambda w: float(self.losses(base + w.picked).sum()))
+    def single(self, option: Option, base: tuple[int, ...] = ()) -> Option:
+        """The option itself, or the best of the candidates that stand side by side in it."""
+        if option.candidate is not None:
+            return option
+        own = set(option.chosen)
+        choices = self.options[option.effect]
+        singles = [w for w in choices if w.candidate is not None and own.issuperset(w.chosen)]
+        return min(singles, key=lambda w: float(self.losses(base + w.chosen).sum()))
 
-    def in_place(self, way: Option, base: tuple[int, ...] = ()) -> Effect | None:
-        """The effect of a single shape at the amplitudes that it is given beside a base."""
-        key = (way.shape, base)
+    def in_place(self, option: Option, base: tuple[int, ...] = ()) -> Effect | None:
+        """A single candidate's effect at the amplitudes that it is given beside a base."""
+        key = (option.candidate, base)
         if key not in self.fitted:
-            amplitudes = self.validation.amplitudes(base + way.picked)[len(base) :]
-            self.fitted[key] = self.candidates[way.shape].with_amplitudes(amplitudes)
+            amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+            self.fitted[key] = self.candidates[option.candidate].with_amplitudes(amplitudes)
         return self.fitted[key]
 
     def starts(self, scores: Sequence[Score]) -> list[tuple[str, Effect]]:
-        """Effects, by name, in their best single shape at their amplitudes: starts of a fit."""
+        """Effects, by name, in their best single candidate at their amplitudes: starts of a fit."""
         found = [(s.effect, self.in_place(self.single(s.option))) for s in scores]
         return [(name, effect) for name, effect in found if effect is not None]
 
     def unique_gains(self, scores: list[Score]) -> dict[str, float]:
         """Share of the squared error above the floor that only this effect explains.
 
-        What comes back when it is left out of the best ways of all effects together.
+        What comes back when it is left out of the best forms of all effects together.
         """
-        together = {s.effect: s.option.picked for s in scores}
+        together = {s.effect: s.option.chosen for s in scores}
         total = self.excess(self.losses())
         everything = self.losses(sum(together.values(), ()))
         answer = {}
         for name in together:
-            rest = sum((picked for other, picked in together.items() if other != name), ())
+            rest = sum((chosen for other, chosen in together.items() if other != name), ())
             answer[name] = float((self.losses(rest).sum() - everything.sum()) / total)
         return answer
 
     def parameters(self, score: Score) -> dict:
-        """Name with unit -> value, of an effect in its best single shape as selection left it."""
-        single = [way for way in self.options[score.effect] if way.shape is not None]
-        way = max(
+        """Name with unit -> value, of an effect in its best single candidate."""
+        single = [option for option in self.options[score.effect] if option.candidate is not None]
+        option = max(
             single,
-            key=lambda w: float(self.log_ratio(self.losses(), self.losses(w.picked)).mean()),
+            key=lambda w: float(self.log_ratio(self.losses(), self.losses(w.chosen)).mean()),
         )
-        effect = self.in_place(way)
+        effect = self.in_place(option)
         return {} if effect is None else {q.name: q.value for q in effect.quantities()}
 
 
 # Relaxed forms ------------------------------------------------------------------------------
 
 Scaled = Callable[[ModelSelection, np.ndarray], np.ndarray]
-"""(S, n, 3, K) columns of what an effect explains (S, n, 3), each scaled by something."""
+"""(S, n, 3, K) sensitivities of what an effect explains (S, n, 3), each scaled by something."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,23 +333,23 @@ class RelaxedFit:
         )
 
 
-def relaxed_fit(selection: ModelSelection, ways: Sequence[Sequence[Score]]) -> RelaxedFit:
+def relaxed_fit(selection: ModelSelection, choices: Sequence[Sequence[Score]]) -> RelaxedFit:
     """What the best of several sets of effects explains more in its relaxed form.
 
-    ways: sets of effects that explain the error about as well; one set where nothing competes.
+    choices: sets of effects that explain the error about as well; one set where nothing competes.
     """
     tried = []
-    for named, scaled in itertools.product(ways, (_by_state, _by_time)):
-        columns = _relaxed_sensitivities(selection, named, scaled)
-        validation = CrossValidation.on(selection.validation.split, columns)
-        tried.append(validation.losses(range(columns.shape[3])))
+    for named, scaled in itertools.product(choices, (_by_state, _by_time)):
+        sensitivities = _relaxed_sensitivities(selection, named, scaled)
+        validation = CrossValidation.on(selection.validation.split, sensitivities)
+        tried.append(validation.losses(range(sensitivities.shape[3])))
     best = min(tried, key=np.sum)
-    beyond = [_beyond(selection, picked_by(named), best) for named in ways]
+    beyond = [_beyond(selection, chosen_by(named), best) for named in choices]
     return min(beyond, key=lambda one: one.worth)
 
 
-def _beyond(selection: ModelSelection, picked: tuple[int, ...], after: np.ndarray) -> RelaxedFit:
-    before = selection.losses(picked)
+def _beyond(selection: ModelSelection, chosen: tuple[int, ...], after: np.ndarray) -> RelaxedFit:
+    before = selection.losses(chosen)
     log_gain, chance = _fall(selection, before, after)
     share = (before.sum() - after.sum()) / selection.excess(selection.losses())
     return RelaxedFit(after, float(share), float(log_gain.mean()), chance)
@@ -358,14 +371,14 @@ def beside_relaxed(
 
     The chance counts this one effect alone: the others have been corrected for before.
     """
-    picked = further.option.picked
-    columns = [
+    chosen = further.option.chosen
+    sensitivities = [
         _relaxed_sensitivities(selection, named, _by_state),
-        selection.columns[..., list(picked)],
+        selection.sensitivities[..., list(chosen)],
     ]
-    together = np.concatenate(columns, axis=3)
+    together = np.concatenate(sensitivities, axis=3)
     validation, total = CrossValidation.on(selection.validation.split, together), together.shape[3]
-    before, after = (validation.losses(range(n)) for n in (total - len(picked), total))
+    before, after = (validation.losses(range(n)) for n in (total - len(chosen), total))
     log_gain, chance = _fall(selection, before, after)
     gain = float((before.sum() - after.sum()) / selection.excess(before))
     answer = Score(further.effect, further.option, after, log_gain, chance, gain)
@@ -375,16 +388,16 @@ def beside_relaxed(
 def _relaxed_sensitivities(
     selection: ModelSelection, named: Sequence[Score], scaled: Scaled
 ) -> np.ndarray:
-    """(S, n, 3, K) the named effects' columns, and what each of them explains, scaled."""
-    ways = [selection.freest(score) for score in named]
-    base = sum(ways, ())
+    """(S, n, 3, K) the named effects' sensitivities, and what each of them explains, scaled."""
+    choices = [selection.freest(score) for score in named]
+    base = sum(choices, ())
     amplitudes = selection.validation.amplitudes(base)
-    columns, first = [selection.columns[..., list(base)]], 0
-    for picked in ways:
-        part = selection.columns[..., list(picked)] @ amplitudes[first : first + len(picked)]
-        columns.append(scaled(selection, part))
-        first += len(picked)
-    return np.concatenate(columns, axis=3)
+    sensitivities, first = [selection.sensitivities[..., list(base)]], 0
+    for chosen in choices:
+        part = selection.sensitivities[..., list(chosen)] @ amplitudes[first : first + len(chosen)]
+        sensitivities.append(scaled(selection, part))
+        first += len(chosen)
+    return np.concatenate(sensitivities, axis=3)
 
 
 def _by_state(selection: ModelSelection, part: np.ndarray) -> np.ndarray:
@@ -429,9 +442,9 @@ def select_effects(
         again = names in seen
         if again:
             circle = list(seen.values())[list(seen).index(names) :]
-            named = min(circle, key=lambda some: float(selection.losses(picked_by(some)).sum()))
+            named = min(circle, key=lambda some: float(selection.losses(chosen_by(some)).sum()))
         seen[names] = named
-        following = selection.scores(picked_by(named), tuple(s.effect for s in named))
+        following = selection.scores(chosen_by(named), tuple(s.effect for s in named))
         if again:
             break
     return named, following
@@ -457,7 +470,7 @@ def _joins(selection: ModelSelection, first: list[Score], named: list[Score], s:
 def passes(selection: ModelSelection, first: list[Score], named: list[Score], s: Score) -> bool:
     """Whether one effect on top of the named ones is beyond chance and large enough."""
     start = selection.excess(selection.losses())
-    share = (selection.losses(picked_by(named)).sum() - s.losses.sum()) / start
+    share = (selection.losses(chosen_by(named)).sum() - s.losses.sum()) / start
     log_gain = s.log_gain.mean()
     if not named:
         if selection.in_fit(s.effect):
@@ -487,7 +500,7 @@ def exchanged(selection: ModelSelection, named: list[Score]) -> list[Score]:
             others = named[:place] + named[place + 1 :]
             if not others:
                 break
-            best = selection.scores(picked_by(others), tuple(s.effect for s in others))[0]
+            best = selection.scores(chosen_by(others), tuple(s.effect for s in others))[0]
             changed = changed or best.effect != named[place].effect
             named = [*named[:place], best, *named[place + 1 :]]
         if not changed:
@@ -500,11 +513,11 @@ def _in_order(selection: ModelSelection, named: list[Score]) -> list[Score]:
 
     def missed(score: Score) -> float:
         rest = [other for other in named if other is not score]
-        return -float(selection.losses(picked_by(rest)).sum())
+        return -float(selection.losses(chosen_by(rest)).sum())
 
     answer: list[Score] = []
     for score in sorted(named, key=missed):
-        found = selection.scores(picked_by(answer), tuple(s.effect for s in answer))
+        found = selection.scores(chosen_by(answer), tuple(s.effect for s in answer))
         again = next((s for s in found if s.effect == score.effect), score)
         answer.append(again)
     return answer
@@ -515,7 +528,7 @@ def _without_idle(selection: ModelSelection, first: list[Score], named: list[Sco
     while len(named) > 1:
         for score in reversed(named):
             others = [other for other in named if other is not score]
-            found = selection.scores(picked_by(others), tuple(s.effect for s in others))
+            found = selection.scores(chosen_by(others), tuple(s.effect for s in others))
             again = next((s for s in found if s.effect == score.effect), None)
             if again is None or not passes(selection, first, others, again):
                 named = _in_order(selection, others)
@@ -542,21 +555,21 @@ class StaticError:
 
 
 def static_error(
-    problem: Problem, selection: ModelSelection, picked: tuple[int, ...]
+    problem: Problem, selection: ModelSelection, chosen: tuple[int, ...]
 ) -> StaticError:
-    """The factor before and after the effects whose columns are picked."""
+    """The factor before and after the effects whose sensitivities are chosen."""
     whole = np.flatnonzero(np.isfinite(problem.residual).all((1, 2)))
     if len(whole) < 50:
         return StaticError(1.0, 1.0)
     rows = whole[:: max(1, round(len(whole) / STATIC_ROWS))]
-    losses = selection.losses(picked)
+    losses = selection.losses(chosen)
     left = float(losses.sum() / selection.validation.counts.sum())
     noise = np.sqrt(np.maximum(problem.noise_mm**2, left))
     prior = Prior.of(problem.pressure[rows], problem.direction[rows], problem.discrepancy_mm, noise)
     residual = problem.residual[rows]
-    columns = selection.columns[rows][..., list(picked)]
-    amplitude = selection.validation.amplitudes(picked)
-    return StaticError(_size(prior, residual), _size(prior, residual - columns @ amplitude))
+    sensitivities = selection.sensitivities[rows][..., list(chosen)]
+    amplitude = selection.validation.amplitudes(chosen)
+    return StaticError(_size(prior, residual), _size(prior, residual - sensitivities @ amplitude))
 
 
 def _size(prior: Prior, residual: np.ndarray) -> float:
@@ -588,9 +601,9 @@ class Selected:
         return self.selection.problem
 
     @property
-    def picked(self) -> tuple[int, ...]:
+    def chosen(self) -> tuple[int, ...]:
         """Sensitivities of the named effects."""
-        return picked_by(self.named)
+        return chosen_by(self.named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -647,7 +660,7 @@ def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
         competing=rivals,
         unique=selection.unique_gains(first),
         box=black_box(problem),
-        static=static_error(problem, selection, selected.picked),
+        static=static_error(problem, selection, selected.chosen),
         relaxed=_lack_of_fit(selection, first, named, rivals),
     )
 
@@ -658,7 +671,7 @@ def best_achievable(problem: Problem, box: BlackBox, selected: Selected | None) 
     square = np.where(seen, np.square(problem.residual).sum(2), 0.0)
     tried = [block_sums(square.sum(1), problem.block), box.losses, box.free_losses]
     if selected is not None:
-        tried += [selected.selection.losses(selected.picked)]
+        tried += [selected.selection.losses(selected.chosen)]
         tried += [score.losses for score in selected.first]
     losses = min(tried, key=np.sum)
     counts = block_sums(seen.sum(1).astype(float), problem.block)
@@ -701,7 +714,7 @@ def competing(selection: ModelSelection, first: list[Score], named: list[Score])
     answer = []
     for one in named:
         others = [other for other in named if other is not one]
-        found = selection.scores(picked_by(others), tuple(other.effect for other in others))
+        found = selection.scores(chosen_by(others), tuple(other.effect for other in others))
         own = next((score for score in found if score.effect == one.effect), None)
         answer += [] if own is None else _competing_with(selection, found, own)
     return list(dict.fromkeys(answer))

@@ -47,8 +47,8 @@ def test_columns_are_slopes_of_the_whole_prediction(problem, name):
     """Material, body and sensor effects exactly; line effects up to the plays behind them."""
     some = candidates(problem, [name])
     candidate = some[len(some) // 2]
-    count = candidate.columns.shape[3]
-    step = 1e-2 / max(float(np.abs(candidate.columns).max()), 1e-9)
+    count = candidate.sensitivities.shape[3]
+    step = 1e-2 / max(float(np.abs(candidate.sensitivities).max()), 1e-9)
     for k in range(min(count, 2)):
         amplitudes = np.zeros(count)
         amplitudes[k] = 20 * step
@@ -56,7 +56,7 @@ def test_columns_are_slopes_of_the_whole_prediction(problem, name):
         with torch.no_grad():
             model = with_effect(problem.model, name, effect)
             change = problem.rows(model.predict(problem.history)).numpy() - problem.predicted
-        column = candidate.columns[..., k]
+        column = candidate.sensitivities[..., k]
         off = np.abs(change / (20 * step) - column)
         tolerance = 0.35 if effect.stage == "line" else 0.06
         scale = np.sqrt(np.square(column).mean())
@@ -74,7 +74,7 @@ def test_more_of_an_effect_is_its_own_share(problem):
         more = model.network(trace.pressure + 1.1 * push, trace.direction)
         same = model.network(trace.pressure + push, trace.direction)
         change = problem.rows(more - same).numpy()
-    off = change / 0.1 - candidate.columns[..., 0]
+    off = change / 0.1 - candidate.sensitivities[..., 0]
     assert np.sqrt(np.square(off).mean()) < 0.05 * np.sqrt(np.square(change / 0.1).mean())
 
 

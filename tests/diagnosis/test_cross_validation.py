@@ -107,7 +107,7 @@ def test_further_columns_are_as_if_they_had_been_there(data):
     found = cross_validated(features, residual, columns[..., :1], *rest, *size)
     first = found.losses([0])
     found = found.extended(columns[..., 1:])
-    assert found.columns == COLUMNS
+    assert found.sensitivities == COLUMNS
     found.cache.clear()  # else what was known before would be compared with itself
     assert found.losses([0]) == pytest.approx(first, rel=1e-6)
     np.testing.assert_allclose(found.grams, whole.grams, rtol=1e-5, atol=1e-5)

@@ -82,7 +82,7 @@ def test_what_is_fitted_is_plausible_small_and_new(lagging):
     assert "line_lag" in names
     assert "hysteresis" not in names  # the model has it already
     assert all(candidate.effect.plausible() for candidate in fitted)
-    assert all(candidate.columns.shape[3] == 1 for candidate in fitted)
+    assert all(candidate.sensitivities.shape[3] == 1 for candidate in fitted)
     twice = next(c for c in fitted if c.name == "line_lag")
     half = twice.with_amplitudes(np.array([0.5]))
     assert half.share.item() == pytest.approx(0.5 * twice.effect.share.item())
@@ -117,6 +117,6 @@ def test_loops_do_not_stand_for_what_the_actuation_explains():
     for pressure, allowed in ((0.94 * commands, False), (behind, True)):
         problem = problem_of(default_arm(), [made(commands, pressure)])
         race = ModelSelection.of(problem, candidates(problem, ["hysteresis"]))
-        best = min(race.options["hysteresis"], key=lambda way: race.losses(way.picked).sum())
-        assert race.losses(best.picked).sum() < 0.2 * race.losses().sum()
+        best = min(race.options["hysteresis"], key=lambda way: race.losses(way.chosen).sum())
+        assert race.losses(best.chosen).sum() < 0.2 * race.losses().sum()
         assert race.plausible(best) == allowed

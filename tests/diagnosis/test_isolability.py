@@ -116,7 +116,7 @@ def test_less_noise_and_more_columns_of_the_rival_work_in_opposite_ways():
     for noise in (3.0, 1.0, 0.3):
         columns, x, d, uncertainty = small_case(noise=noise, signal=0.01)
         gram = Moments.of(columns, x, d, uncertainty, 2.0).gram()
-        left = unimitated(gram, draws.strengths, [np.array([1]), np.array([1, 2, 3])])[:, 0]
+        left = unimitated(gram, draws.amplitudes, [np.array([1]), np.array([1, 2, 3])])[:, 0]
         assert left[1] < left[0]
         evidence.append(left[0])
     assert evidence[0] < evidence[1] < evidence[2]

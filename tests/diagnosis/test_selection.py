@@ -27,10 +27,10 @@ class Table:
     floor = np.full(40, 1.0 / 40)
     whole_size = 3.0
 
-    def losses(self, picked=()):
+    def losses(self, chosen=()):
         rng = np.random.default_rng(0)
         share = rng.uniform(0.9, 1.1, 40)
-        return LOSS["".join(str(p) for p in sorted(set(picked)))] * share / 40
+        return LOSS["".join(str(p) for p in sorted(set(chosen)))] * share / 40
 
     def excess(self, losses):
         return float(losses.sum() - 1.0)
@@ -60,7 +60,7 @@ def table(monkeypatch):
     race = Table()
 
     def beside(race, named, further):
-        base = sum((s.option.picked for s in named), ())
+        base = sum((s.option.chosen for s in named), ())
         return float(race.losses(base).sum()), further
 
     monkeypatch.setattr(selection, "beside_relaxed", beside)

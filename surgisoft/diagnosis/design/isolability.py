@@ -27,7 +27,7 @@ from scipy import linalg
 from scipy.special import ndtr
 from torch import Tensor
 
-from surgisoft.diagnosis.candidates import Signals, columns_of, more_of, signals
+from surgisoft.diagnosis.candidates import Signals, more_of, sensitivities_of, signals
 from surgisoft.diagnosis.design.schedules import REFERENCE, draw_run, limits_within
 from surgisoft.diagnosis.discrepancy import body_covariance, kernel
 from surgisoft.diagnosis.residuals import noise_of
@@ -115,12 +115,12 @@ def sample_time(history: History) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Products of K columns and F features over the rows of one or more experiments."""
+    """Products of K sensitivities and F features over the rows of one or more experiments."""
 
     plain: np.ndarray
-    """(n, K, K) products of the columns, in each independent output."""
+    """(n, K, K) products of the sensitivities, in each independent output."""
     cross: np.ndarray
-    """(3, n, F, K) products of features and columns, in each coordinate and output."""
+    """(3, n, F, K) products of features and sensitivities, in each coordinate and output."""
     own: np.ndarray
     """(F, F) products of the features."""
     ratio: np.ndarray
@@ -131,20 +131,20 @@ class Moments:
     @classmethod
     def of(
         cls,
-        columns: np.ndarray,
+        sensitivities: np.ndarray,
         x: np.ndarray,
         d: np.ndarray,
         uncertainty: Uncertainty,
         seconds: float,
     ) -> "Moments":
-        """Of columns (S, n, 3, K) in mm at actuations x and directions d (S, m).
+        """Of sensitivities (S, n, 3, K) in mm at actuations x and directions d (S, m).
 
         seconds: time that all the rows stand for, s.
         """
-        rows, points, _, count = columns.shape
+        rows, points, _, count = sensitivities.shape
         weight = np.float32(np.sqrt(seconds / rows))
         mix, ratio = uncertainty.outputs
-        flat = np.ascontiguousarray(columns.transpose(1, 2, 0, 3), np.float32)
+        flat = np.ascontiguousarray(sensitivities.transpose(1, 2, 0, 3), np.float32)
         mixed = weight * (mix.astype(np.float32) @ flat.reshape(points, -1))
         mixed = mixed.reshape(points, 3, rows, count)
         features = weight * uncertainty.features(x, d).astype(np.float32)
@@ -168,7 +168,7 @@ class Moments:
         )
 
     def gram(self) -> np.ndarray:
-        """(K, K) products of the columns under Sigma: the model discrepancy is taken out."""
+        """(K, K) products of the sensitivities under Sigma: the model discrepancy is taken out."""
         answer = self.plain.sum(0)
         for output, ratio in enumerate(self.ratio):
             normal = self.own + np.eye(len(self.own)) / ratio
@@ -183,22 +183,22 @@ class Moments:
         return 0.5 * (answer + answer.T)
 
 
-def unimitated(gram: np.ndarray, signals: np.ndarray, shapes: list[np.ndarray]) -> np.ndarray:
-    """(J, D) squared length under Sigma of what no mixture of a shape's columns can imitate.
+def unimitated(gram: np.ndarray, signals: np.ndarray, forms: list[np.ndarray]) -> np.ndarray:
+    """(J, D) squared length under Sigma of what no mixture of a form's sensitivities can imitate.
 
-    gram: (K, K); signals: (K, D) amplitudes of D signals; shapes: the indices of the J shapes'
-    columns. Half of it is the expected log likelihood ratio of two Gaussian models (Hunter &
+    gram: (K, K); signals: (K, D) amplitudes of D signals; forms: the indices of the J forms'
+    sensitivities. Half of it is the expected log likelihood ratio of two Gaussian models (Hunter &
     Reiner 1965, eq. 3).
     """
     seen = gram @ signals
     whole = np.einsum("kd,kd->d", signals, seen)
     size = np.sqrt(np.maximum(np.diag(gram), 1e-30))
-    answer = np.empty((len(shapes), signals.shape[1]))
-    for j, shape in enumerate(shapes):
-        scaled = gram[np.ix_(shape, shape)] / size[shape][:, None] / size[shape][None]
+    answer = np.empty((len(forms), signals.shape[1]))
+    for j, form in enumerate(forms):
+        scaled = gram[np.ix_(form, form)] / size[form][:, None] / size[form][None]
         values, vectors = linalg.eigh(scaled, check_finite=False)
         kept = values > 1e-5 * max(values.max(), 1e-12)
-        turned = (vectors[:, kept] / np.sqrt(values[kept])).T @ (seen[shape] / size[shape][:, None])
+        turned = (vectors[:, kept] / np.sqrt(values[kept])).T @ (seen[form] / size[form][:, None])
         answer[j] = whole - (turned**2).sum(0)
     return np.clip(answer, 0.0, np.maximum(whole, 0.0))
 
@@ -206,11 +206,11 @@ def unimitated(gram: np.ndarray, signals: np.ndarray, shapes: list[np.ndarray]) 
 # Effects on schedules ---------------------------------------------------------------------------
 
 ROWS = 800
-"""Rows of a schedule whose columns are computed; memories follow every row."""
+"""Rows of a schedule whose sensitivities are computed; memories follow every row."""
 PERIOD_S = 0.1
 """Time between the rows of a planned schedule, s."""
 SHAPE_STEP = 0.02
-"""Step of a slope by a value of a shape, in units of max(1, the value)."""
+"""Step of a slope by a nonlinear parameter, in units of max(1, the value)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +241,8 @@ class Design:
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
-    """One effect with one choice of its shape."""
+class Form:
+    """One effect with one choice of its nonlinear parameters."""
 
     name: str
     """The effect's name."""
@@ -251,16 +251,16 @@ class Shape:
     more: bool = False
     """Whether it is the one that the model has already, stronger or weaker."""
     fitted: bool = False
-    """Whether it was fitted to recordings; then its shape, too, may be a little another."""
+    """Whether it was fitted to recordings; then its nonlinear parameters are uncertain too."""
 
 
-def shapes_of(
+def forms_of(
     model: ArmModel,
     reference: Design,
     names: list[str] | None = None,
     facts: ArmFacts | None = None,
-) -> list[Shape]:
-    """Every shape of the named effects (default: all known) that a diagnosis tries on a model.
+) -> list[Form]:
+    """Every form of the named effects (default: all known) that a diagnosis tries on a model.
 
     facts: those of the arm as it was recorded, where they are not the model's own.
     """
@@ -272,53 +272,55 @@ def shapes_of(
     for name in names:
         kind = known[name] if name in known else type(make_effect(name, facts))
         if name in model.effects:
-            answer.append(Shape(name, model.effects[name], True))
-        answer += [Shape(name, effect) for effect in hypothesis_of(kind).candidates(facts, points)]
+            answer.append(Form(name, model.effects[name], True))
+        answer += [Form(name, effect) for effect in hypothesis_of(kind).candidates(facts, points)]
     return answer
 
 
 @torch.no_grad()
-def columns_on(
-    design: Design, shapes: list[Shape], facts: ArmFacts | None = None
+def sensitivities_on(
+    design: Design, forms: list[Form], facts: ArmFacts | None = None
 ) -> list[np.ndarray]:
-    """(S, n, 3, K_j) change of the key points, mm, with each amplitude of each shape.
+    """(S, n, 3, K_j) change of the key points, mm, with each amplitude of each form.
 
-    Of a fitted one with each value of its shape too, at the amplitudes that it has.
+    Of a fitted one with each nonlinear parameter too, at the amplitudes that it has.
 
     facts: those of the arm as it stands in the experiment, where they are not the model's own.
     """
     signal = design.signals
     points = design.model.spec.key_points
     answer = []
-    for shape in shapes:
-        if shape.more:
-            found = more_of(design, signal, shape.name)
+    for form in forms:
+        if form.more:
+            found = more_of(design, signal, form.name)
             empty = np.zeros((len(design.index), points, 3, 1), np.float32)
-            answer.append(empty if found is None else found.columns)
+            answer.append(empty if found is None else found.sensitivities)
         else:
-            effect = shape.effect if facts is None else under(shape.effect, facts)
-            columns = columns_of(design, signal, effect)
-            if shape.fitted:
-                moved = _slopes(design, signal, effect, columns)
-                columns = np.concatenate([columns, moved], axis=3)
-            answer.append(columns)
+            effect = form.effect if facts is None else under(form.effect, facts)
+            sensitivities = sensitivities_of(design, signal, effect)
+            if form.fitted:
+                moved = _slopes(design, signal, effect, sensitivities)
+                sensitivities = np.concatenate([sensitivities, moved], axis=3)
+            answer.append(sensitivities)
     return answer
 
 
-def _slopes(design: Design, signal: Signals, effect: Effect, columns: np.ndarray) -> np.ndarray:
-    """(S, n, 3, P) change of the key points, mm, with each value of a fitted effect's shape.
+def _slopes(
+    design: Design, signal: Signals, effect: Effect, sensitivities: np.ndarray
+) -> np.ndarray:
+    """(S, n, 3, P) change of the key points, mm, with each value of a fitted effect's form.
 
-    columns: (S, n, 3, K) change with each of its amplitudes.
+    sensitivities: (S, n, 3, K) change with each of its amplitudes.
     """
-    strengths = torch.cat([p.flatten() for p in effect.amplitudes().values()]).numpy()
-    now, answer = columns @ strengths, []
+    amplitudes = torch.cat([p.flatten() for p in effect.amplitudes().values()]).numpy()
+    now, answer = sensitivities @ amplitudes, []
     for name, parameter in effect.nonlinear_parameters().items():
         for i, value in enumerate(parameter.flatten().tolist()):
             other = copy.deepcopy(effect)
             step = SHAPE_STEP * max(1.0, abs(value))
             other.get_parameter(name).view(-1)[i] += step
-            answer.append((columns_of(design, signal, other) @ strengths - now) / step)
-    return np.stack(answer, axis=3) if answer else columns[..., :0]
+            answer.append((sensitivities_of(design, signal, other) @ amplitudes - now) / step)
+    return np.stack(answer, axis=3) if answer else sensitivities[..., :0]
 
 
 def under(effect: Effect, facts: ArmFacts) -> Effect:
@@ -360,9 +362,9 @@ def planned_history(
     times, rows, start = [], [], 0.0
     for knots, commands in runs:
         t = np.arange(0.0, knots[-1] - knots[0] + 0.5 * period_s, period_s)
-        columns = [np.interp(t, knots - knots[0], column) for column in commands.T]
+        sensitivities = [np.interp(t, knots - knots[0], column) for column in commands.T]
         times.append(torch.from_numpy(start + t))
-        rows.append(torch.from_numpy(np.stack(columns, axis=1)))
+        rows.append(torch.from_numpy(np.stack(sensitivities, axis=1)))
         start += t[-1] + period_s
     void = [torch.full((len(t), model.spec.key_points, 3), torch.nan) for t in times]
     return pack(times, rows, void)
@@ -395,7 +397,7 @@ PLAUSIBLE_SHARE = 0.0075
 """Plausible size of an effect: RMS change of a key point on the varied reference schedule, as a
 share of the arm's length."""
 DRAWS = 6
-"""Random amplitude vectors for each shape of an effect with more than one amplitude."""
+"""Random amplitude vectors for each form of an effect with more than one amplitude."""
 CAMERA_SHARE = 0.001
 """RMS noise of a key point where nothing was measured yet, as a share of the arm's length."""
 LARGEST = 2.0
@@ -419,16 +421,16 @@ class Isolability:
     """(E,) expected log evidence, in nats, of each over the model discrepancy alone."""
     log_evidence: np.ndarray
     """(E, E) expected log evidence, in nats, of effect a (row), where it is true, over b (column)
-    with its best shape and amplitudes."""
+    with its best form and amplitudes."""
     separability: np.ndarray
     """(E, E) share of a's signal beyond the model discrepancy that b cannot imitate, 0 to 1."""
     distance: np.ndarray
     """(E, E) half the distance of a from b in standard deviations, b's misfit included."""
     confidence: np.ndarray
     """(E, E) expected chance, 0.5 to 1, to name a where it is true and b the only competing effect;
-    of those of a's shapes that can be seen at all."""
+    of those of a's forms that can be seen at all."""
     seen: np.ndarray
-    """(E,) share of a's shapes and amplitudes that can be seen at all."""
+    """(E,) share of a's forms and amplitudes that can be seen at all."""
     minutes: float
     """Length of the schedule, minutes."""
 
@@ -485,14 +487,16 @@ def isolability(
     """
     history, noise = _history(model, schedule)
     reference = reference_design(model)
-    shapes = shapes_of(model, reference, names)
-    size = Sizes.of(reference, columns_on(reference, shapes), shapes, size_mm)
+    forms = forms_of(model, reference, names)
+    size = Sizes.of(reference, sensitivities_on(reference, forms), forms, size_mm)
     design = design_of(model, history, rows)
     uncertainty = uncertainty_of(model, noise, size.profile_mm, sample_time(history))
-    columns = columns_on(design, size.shapes)
-    draws = size.limited(size.draws(), columns)
-    owners = [shape.name for shape in size.shapes]
-    return isolability_from(moments_of(design, columns, uncertainty), draws, owners, size.spans)
+    sensitivities = sensitivities_on(design, size.forms)
+    draws = size.limited(size.draws(), sensitivities)
+    owners = [form.name for form in size.forms]
+    return isolability_from(
+        moments_of(design, sensitivities, uncertainty), draws, owners, size.spans
+    )
 
 
 def isolability_from(
@@ -502,22 +506,22 @@ def isolability_from(
     spans: list[np.ndarray],
     misfit: np.ndarray | float = MISFIT,
 ) -> Isolability:
-    """The matrices from moments of columns, amplitudes that may be true, and J shapes.
+    """The matrices from moments of sensitivities, amplitudes that may be true, and J forms.
 
-    owners: the effect of each shape; spans: the indices of each shape's columns; misfit: as MISFIT,
+    owners: the effect of each form; spans: the indices of its sensitivities; misfit: as MISFIT,
     one for all or (E, E). Between two Gaussian models at distance u the right one is the likelier
     with chance Phi(u / 2); along u lies some of the true effect's own misfit too.
     """
     gram = moments.gram()
     names = tuple(dict.fromkeys(owners))
     count = len(names)
-    of_shape = np.array([names.index(owner) for owner in owners])
-    of_draw = of_shape[draws.shape]
+    of_form = np.array([names.index(owner) for owner in owners])
+    of_draw = of_form[draws.form]
     misfit = np.broadcast_to(np.asarray(misfit, float), (count, count))
-    # A competing effect takes whichever of its shapes imitates best.
-    rest = unimitated(gram, draws.strengths, spans)
-    best = np.stack([rest[of_shape == b].min(axis=0) for b in range(count)])
-    whole = np.maximum(np.einsum("kd,kd->d", draws.strengths, gram @ draws.strengths), 0.0)
+    # A competing effect takes whichever of its forms imitates best.
+    rest = unimitated(gram, draws.amplitudes, spans)
+    best = np.stack([rest[of_form == b].min(axis=0) for b in range(count)])
+    whole = np.maximum(np.einsum("kd,kd->d", draws.amplitudes, gram @ draws.amplitudes), 0.0)
     visible = ndtr(0.5 * np.sqrt(whole)) >= SURE
     half = 0.5 * np.sqrt(best / (1.0 + misfit[of_draw].T * whole))
     evidence, share, distance = (np.zeros((count, count)) for _ in range(3))
@@ -539,24 +543,24 @@ def isolability_from(
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Strengths that may be true."""
+    """Amplitudes that may be true."""
 
-    strengths: np.ndarray
-    """(K, D) amplitudes of all columns; those of other shapes are zero."""
-    shape: np.ndarray
-    """(D,) index of the shape that is true."""
+    amplitudes: np.ndarray
+    """(K, D) amplitudes of all sensitivities; those of other forms are zero."""
+    form: np.ndarray
+    """(D,) index of the form that is true."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
-    """How large the shapes' columns are on the reference schedule."""
+    """How large the forms' sensitivities are on the reference schedule."""
 
-    shapes: list[Shape]
-    """The J shapes that do anything there."""
+    forms: list[Form]
+    """The J forms that do anything there."""
     spans: list[np.ndarray]
-    """Indices of each one's columns among all of them."""
+    """Indices of each one's sensitivities among all of them."""
     gram_mm2: list[np.ndarray]
-    """(K_j, K_j) mean products of each shape's columns over rows and key points, mm^2."""
+    """(K_j, K_j) mean products of each form's sensitivities over rows and key points, mm^2."""
     profile_mm: np.ndarray
     """(n,) RMS size at each key point of plausible effects, mm."""
     plausible_mm: float
@@ -566,17 +570,21 @@ class Sizes:
     def of(
         cls,
         reference: Design,
-        columns: list[np.ndarray],
-        shapes: list[Shape],
+        sensitivities: list[np.ndarray],
+        forms: list[Form],
         size_mm: float | None = None,
     ) -> "Sizes":
-        """From the shapes' columns (S, n, 3, K_j) on the reference schedule, mm."""
-        kept = [j for j, c in enumerate(columns) if np.isfinite(c).all() and np.abs(c).max() > 1e-9]
+        """From the forms' sensitivities (S, n, 3, K_j) on the reference schedule, mm."""
+        kept = [
+            j
+            for j, c in enumerate(sensitivities)
+            if np.isfinite(c).all() and np.abs(c).max() > 1e-9
+        ]
         points = reference.model.spec.key_points
         gram, profiles, spans, at = [], [], [], 0
         plausible = size_mm or PLAUSIBLE_SHARE * length_of(reference.model)
         for j in kept:
-            c = columns[j].astype(float)
+            c = sensitivities[j].astype(float)
             rows, count = len(c), c.shape[3]
             flat = c.reshape(-1, count)
             gram.append(flat.T @ flat / (rows * points))
@@ -585,50 +593,52 @@ class Sizes:
             spans.append(np.arange(at, at + count))
             at += count
         profile = plausible * np.sqrt(np.mean(profiles, axis=0)) if kept else np.zeros(points)
-        return cls([shapes[j] for j in kept], spans, gram, profile, plausible)
+        return cls([forms[j] for j in kept], spans, gram, profile, plausible)
 
     def select(self, kept: list[int]) -> "Sizes":
-        """Only some of the shapes; plausible sizes stay."""
+        """Only some of the forms; plausible sizes stay."""
         ends = np.cumsum([len(self.spans[j]) for j in kept])
         spans = [
             np.arange(end - len(self.spans[j]), end) for j, end in zip(kept, ends, strict=True)
         ]
-        shapes, gram = [self.shapes[j] for j in kept], [self.gram_mm2[j] for j in kept]
-        return replace(self, shapes=shapes, spans=spans, gram_mm2=gram)
+        forms, gram = [self.forms[j] for j in kept], [self.gram_mm2[j] for j in kept]
+        return replace(self, forms=forms, spans=spans, gram_mm2=gram)
 
     @property
-    def columns(self) -> int:
-        """Number of all columns."""
+    def sensitivities(self) -> int:
+        """Number of all sensitivities."""
         return int(self.spans[-1][-1]) + 1 if self.spans else 0
 
     def draws(self, seed: int = 0) -> "Draws":
-        """Strengths of plausible size; random mixtures where an effect has more than one."""
+        """Amplitudes of plausible size; random mixtures where an effect has more than one."""
         rng = np.random.default_rng(seed)
-        strengths, owner = [], []
+        amplitudes, owner = [], []
         for j, span in enumerate(self.spans):
             unit = np.sqrt(np.maximum(np.diag(self.gram_mm2[j]), 1e-30))
             for _ in range(1 if len(span) == 1 else DRAWS):
                 mixture = np.ones(1) if len(span) == 1 else rng.normal(size=len(span))
-                full = np.zeros(self.columns)
+                full = np.zeros(self.sensitivities)
                 full[span] = self.plausible_mm * mixture / (unit * np.sqrt(len(span)))
-                strengths.append(full)
+                amplitudes.append(full)
                 owner.append(j)
-        return Draws(np.array(strengths).reshape(len(owner), -1).T, np.array(owner, int))
+        return Draws(np.array(amplitudes).reshape(len(owner), -1).T, np.array(owner, int))
 
-    def limited(self, draws: "Draws", columns: list[np.ndarray]) -> "Draws":
-        """Strengths made smaller where they would be implausible on columns (S, n, 3, K_j)."""
-        strengths = draws.strengths.copy()
-        for k, j in enumerate(draws.shape):
-            field = columns[j] @ strengths[self.spans[j], k]
+    def limited(self, draws: "Draws", sensitivities: list[np.ndarray]) -> "Draws":
+        """Amplitudes limited to plausible ones on sensitivities (S, n, 3, K_j)."""
+        amplitudes = draws.amplitudes.copy()
+        for k, j in enumerate(draws.form):
+            field = sensitivities[j] @ amplitudes[self.spans[j], k]
             rms = np.sqrt(np.mean(field**2) * 3.0)
-            strengths[:, k] *= min(1.0, LARGEST * self.plausible_mm / max(rms, 1e-12))
-        return Draws(strengths, draws.shape)
+            amplitudes[:, k] *= min(1.0, LARGEST * self.plausible_mm / max(rms, 1e-12))
+        return Draws(amplitudes, draws.form)
 
 
-def moments_of(design: Design, columns: list[np.ndarray], uncertainty: Uncertainty) -> Moments:
-    """Moments of the shapes' columns on a design."""
+def moments_of(
+    design: Design, sensitivities: list[np.ndarray], uncertainty: Uncertainty
+) -> Moments:
+    """Moments of the forms' sensitivities on a design."""
     return Moments.of(
-        np.concatenate(columns, axis=3),
+        np.concatenate(sensitivities, axis=3),
         design.pressure,
         design.direction,
         uncertainty,

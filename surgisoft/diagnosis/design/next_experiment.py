@@ -25,20 +25,20 @@ from surgisoft.diagnosis.design.isolability import (
     SURE,
     Design,
     Draws,
+    Form,
     Isolability,
     Moments,
-    Shape,
     Sizes,
     Uncertainty,
-    columns_on,
     design_of,
+    forms_of,
     isolability_from,
     length_of,
     moments_of,
     planned_history,
     reference_design,
     sample_time,
-    shapes_of,
+    sensitivities_on,
     uncertainty_of,
     under,
     unimitated,
@@ -79,8 +79,8 @@ CLEAR = 3.0
 """Log evidence in the recordings, nats, from which on an effect's amplitudes are taken from
 them."""
 KNOWN_ROWS = 800
-"""Rows of the recordings so far whose columns are computed."""
-MOST_SHAPES = 10
+"""Rows of the recordings so far whose sensitivities are computed."""
+MOST_FORMS = 10
 """Shapes of an effect that are looked at: those that fit best, or some of every kind."""
 WEAKEST = 0.2
 """Least size of the competing effects, as a share of the plausible one, that an experiment is
@@ -93,31 +93,31 @@ class Question:
 
     model: ArmModel
     """The model in question."""
-    shapes: list[Shape]
-    """The competing effects' shapes."""
+    forms: list[Form]
+    """The competing effects' forms."""
     owners: list[str]
-    """The competing effect of each shape."""
+    """The competing effect of each form."""
     spans: list[np.ndarray]
-    """Indices of the columns of each shape, with that of the own weight, which is open to all."""
+    """Indices of each form's sensitivities and of the arm's own weight, which is open to all."""
     draws: Draws
-    """Strengths that may be true."""
+    """Amplitudes that may be true."""
     uncertainty: Uncertainty
     """What signals must stand out from."""
     known: Moments | None
     """Moments of the recordings so far; the last column is the own weight."""
     gains: np.ndarray | None
-    """(J,) log evidence of each shape in the recordings, nats."""
+    """(J,) log evidence of each form in the recordings, nats."""
     misfit: np.ndarray | float
     """(E, E) misfit of the competing effects; larger where the recordings contradict the
     prediction."""
 
     def isolability(self, moments: Moments) -> Isolability:
-        """What moments of columns and own weight say about the competing effects."""
+        """What moments of sensitivities and own weight say about the competing effects."""
         return isolability_from(moments, self.draws, self.owners, self.spans, self.misfit)
 
 
 def pose_question(
-    model: ArmModel, problem: Problem | None, rivals: list[str] | None = None
+    model: ArmModel, problem: Problem | None, competing: list[str] | None = None
 ) -> Question:
     """The competing effects, with amplitudes from the recordings where those show them.
 
@@ -125,11 +125,11 @@ def pose_question(
     """
     reference = reference_design(model)
     facts = None if problem is None else facts_of(problem)
-    shapes = shapes_of(model, reference, rivals, facts)
+    forms = forms_of(model, reference, competing, facts)
     if problem is None:
-        shapes = _some_of_each(shapes)
-    sizes = Sizes.of(reference, columns_on(reference, shapes), shapes)
-    missing = [name for name in rivals or [] if name not in {shape.name for shape in sizes.shapes}]
+        forms = _some_of_each(forms)
+    sizes = Sizes.of(reference, sensitivities_on(reference, forms), forms)
+    missing = [name for name in competing or [] if name not in {form.name for form in sizes.forms}]
     if missing:
         raise InputError(
             f"effect '{missing[0]}' changes nothing on this arm, so it competes with no other; "
@@ -143,34 +143,34 @@ def pose_question(
     else:
         dt, noise = sample_time(problem.history), problem.noise_mm
         design, residual = _thinned(problem)
-        columns = columns_on(design, sizes.shapes)
+        sensitivities = sensitivities_on(design, sizes.forms)
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
-        gram = _with(residual, design, columns, uncertainty).gram()
+        gram = _with(residual, design, sensitivities, uncertainty).gram()
         fitted, gains = _fitted(gram, sizes)
-        sharp = _sharp(problem, sizes, fitted, gains) if rivals else []
+        sharp = _sharp(problem, sizes, fitted, gains) if competing else []
         if sharp:
-            sizes = Sizes.of(reference, columns_on(reference, shapes + sharp), shapes + sharp)
-            columns += columns_on(design, sizes.shapes[len(columns) :])
-            gram = _with(residual, design, columns, uncertainty).gram()
+            sizes = Sizes.of(reference, sensitivities_on(reference, forms + sharp), forms + sharp)
+            sensitivities += sensitivities_on(design, sizes.forms[len(sensitivities) :])
+            gram = _with(residual, design, sensitivities, uncertainty).gram()
             fitted, gains = _fitted(gram, sizes)
         best = int(np.argmax(gains))
-        rms = float(np.sqrt(3.0 * np.mean((columns[best] @ fitted[best]) ** 2)))
-        # Once more with the size that was found, and the shapes that matter.
+        rms = float(np.sqrt(3.0 * np.mean((sensitivities[best] @ fitted[best]) ** 2)))
+        # Once more with the size that was found, and the forms that matter.
         kept = _best_of_each(sizes, gains)
-        sizes, columns = sizes.select(kept), [columns[j] for j in kept]
+        sizes, sensitivities = sizes.select(kept), [sensitivities[j] for j in kept]
         scale = max(WEAKEST, rms / sizes.plausible_mm)
         uncertainty = uncertainty_of(model, noise, scale * sizes.profile_mm, dt)
-        known = _with(residual, design, columns, uncertainty)
+        known = _with(residual, design, sensitivities, uncertainty)
         gram = known.gram()
         fitted, gains = _fitted(gram, sizes)
         misfit = _misfit(gram, sizes, fitted, gains)
-        draws = _likely(sizes.limited(sizes.draws(), columns), sizes, fitted, gains)
+        draws = _likely(sizes.limited(sizes.draws(), sensitivities), sizes, fitted, gains)
         known = _without_last(known)
-    draws = Draws(np.pad(draws.strengths, ((0, 1), (0, 0))), draws.shape)
-    weight = np.array([sizes.columns])
+    draws = Draws(np.pad(draws.amplitudes, ((0, 1), (0, 0))), draws.form)
+    weight = np.array([sizes.sensitivities])
     return Question(
         model,
-        sizes.shapes,
+        sizes.forms,
         owners_of(sizes),
         [np.concatenate([span, weight]) for span in sizes.spans],
         draws,
@@ -182,33 +182,33 @@ def pose_question(
 
 
 def owners_of(sizes: Sizes) -> list[str]:
-    """The effect of each shape."""
-    return [shape.name for shape in sizes.shapes]
+    """The effect of each form."""
+    return [form.name for form in sizes.forms]
 
 
-def _some_of_each(shapes: list[Shape]) -> list[Shape]:
-    """At most MOST_SHAPES of each effect, evenly from first to last."""
+def _some_of_each(forms: list[Form]) -> list[Form]:
+    """At most MOST_FORMS of each effect, evenly from first to last."""
     answer = []
-    for name in dict.fromkeys(shape.name for shape in shapes):
-        mine = [shape for shape in shapes if shape.name == name]
-        places = np.linspace(0, len(mine) - 1, min(len(mine), MOST_SHAPES))
+    for name in dict.fromkeys(form.name for form in forms):
+        mine = [form for form in forms if form.name == name]
+        places = np.linspace(0, len(mine) - 1, min(len(mine), MOST_FORMS))
         answer += [mine[k] for k in np.unique(places.round().astype(int))]
     return answer
 
 
 def _best_of_each(sizes: Sizes, gains: np.ndarray) -> list[int]:
-    """Indices of the MOST_SHAPES shapes of each effect that fit best, in order."""
+    """Indices of the MOST_FORMS forms of each effect that fit best, in order."""
     owners = owners_of(sizes)
     kept: list[int] = []
     for name in dict.fromkeys(owners):
         mine = [j for j, owner in enumerate(owners) if owner == name]
-        kept += sorted(mine, key=lambda j: -gains[j])[:MOST_SHAPES]
+        kept += sorted(mine, key=lambda j: -gains[j])[:MOST_FORMS]
     return sorted(kept)
 
 
-def _with(residual, design: Design, columns, uncertainty: Uncertainty) -> Moments:
-    """Moments of the columns, with the residual (S, n, 3) as the last one."""
-    return moments_of(design, [*columns, residual[..., None]], uncertainty)
+def _with(residual, design: Design, sensitivities, uncertainty: Uncertainty) -> Moments:
+    """Moments of the sensitivities, with the residual (S, n, 3) as the last one."""
+    return moments_of(design, [*sensitivities, residual[..., None]], uncertainty)
 
 
 def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
@@ -232,16 +232,16 @@ def _thinned(problem: Problem) -> tuple[Design, np.ndarray]:
     return design, residual[rows]
 
 
-def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Shape]:
-    """Each competing effect's best shape fitted through the whole chain to the recordings, where it
+def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> list[Form]:
+    """Each competing effect's best form fitted through the whole chain to the recordings, where it
     can be."""
     owners, answer = owners_of(sizes), []
     for name in dict.fromkeys(owners):
-        mine = [j for j, owner in enumerate(owners) if owner == name and not sizes.shapes[j].more]
+        mine = [j for j, owner in enumerate(owners) if owner == name and not sizes.forms[j].more]
         best = max(mine, key=lambda j: gains[j], default=None)
         if best is None or gains[best] < CLEAR:
             continue
-        effect, first = copy.deepcopy(sizes.shapes[best].effect), 0
+        effect, first = copy.deepcopy(sizes.forms[best].effect), 0
         for parameter in effect.amplitudes().values():
             part = torch.from_numpy(fitted[best][first : first + parameter.numel()])
             parameter.data.copy_(part.view_as(parameter))
@@ -249,13 +249,13 @@ def _sharp(problem: Problem, sizes: Sizes, fitted: list[np.ndarray], gains) -> l
         model = with_fitted(problem, name, effect)
         if model is not None:
             found = model.effects[name].requires_grad_(False)
-            answer.append(Shape(name, found, fitted=True))
+            answer.append(Form(name, found, fitted=True))
     return answer
 
 
 def _spread(sizes: Sizes) -> np.ndarray:
     """(K,) plausible spread of each amplitude."""
-    answer = np.empty(sizes.columns)
+    answer = np.empty(sizes.sensitivities)
     for span, gram in zip(sizes.spans, sizes.gram_mm2, strict=True):
         unit = np.sqrt(np.maximum(np.diag(gram), 1e-30))
         answer[span] = 2.0 * sizes.plausible_mm / unit
@@ -263,35 +263,35 @@ def _spread(sizes: Sizes) -> np.ndarray:
 
 
 def _fitted(gram: np.ndarray, sizes: Sizes) -> tuple[list[np.ndarray], np.ndarray]:
-    """Strengths of each shape that explain the last column best, and their log evidence (J,)."""
-    strengths, gains, spread = [], [], _spread(sizes)
+    """Amplitudes of each form that explain the last column best, and their log evidence (J,)."""
+    amplitudes, gains, spread = [], [], _spread(sizes)
     for span in sizes.spans:
         scaled = gram[np.ix_(span, span)] * spread[span][:, None] * spread[span][None]
         pull = gram[span, -1] * spread[span]
         inner = np.eye(len(span)) + scaled
         amplitude = np.linalg.solve(inner, pull)
-        strengths.append(amplitude * spread[span])
+        amplitudes.append(amplitude * spread[span])
         gains.append(0.5 * pull @ amplitude - 0.5 * np.linalg.slogdet(inner)[1])
-    return strengths, np.array(gains)
+    return amplitudes, np.array(gains)
 
 
 def _likely(draws: Draws, sizes: Sizes, fitted, gains) -> Draws:
-    """Each competing effect's best-fitting shape with its amplitudes where it is clear, else
+    """Each competing effect's best-fitting form with its amplitudes where it is clear, else
     plausible ones."""
-    strengths, shape, owners = [], [], owners_of(sizes)
+    amplitudes, form, owners = [], [], owners_of(sizes)
     for name in dict.fromkeys(owners):
         mine = [j for j, owner in enumerate(owners) if owner == name]
         best = max(mine, key=lambda j: gains[j])
         if gains[best] >= CLEAR:
-            full = np.zeros(len(draws.strengths))
+            full = np.zeros(len(draws.amplitudes))
             full[sizes.spans[best]] = fitted[best]
-            strengths.append(full[:, None])
-            shape.append([best])
+            amplitudes.append(full[:, None])
+            form.append([best])
         else:
-            picked = np.isin(draws.shape, mine)
-            strengths.append(draws.strengths[:, picked])
-            shape.append(draws.shape[picked])
-    return Draws(np.concatenate(strengths, axis=1), np.concatenate(shape).astype(int))
+            chosen = np.isin(draws.form, mine)
+            amplitudes.append(draws.amplitudes[:, chosen])
+            form.append(draws.form[chosen])
+    return Draws(np.concatenate(amplitudes, axis=1), np.concatenate(form).astype(int))
 
 
 def _misfit(gram: np.ndarray, sizes: Sizes, fitted, gains) -> np.ndarray:
@@ -334,7 +334,7 @@ LEAST_RUNS = 2
 TARGET = 0.99
 """Expected chance for every pair at which no further run is added."""
 RUN_ROWS = 160
-"""Rows of a planned run whose columns are computed."""
+"""Rows of a planned run whose sensitivities are computed."""
 OWN_WEIGHT_MISFIT = 0.02
 """Mean square that is left, as a share, where the arm's own weight pulls otherwise and the beam's
 formula follows it: 0.65 of 4.5 mm on a simulated arm whose base was rolled by 90 degrees."""
@@ -380,17 +380,17 @@ def make_plans(
     runs = [draw_run(name, limits, 0) for name in SIGNALS]
     design = design_of(model, planned_history(model, runs), RUN_ROWS * len(runs))
     run = design.history.run_of_row[design.index].numpy()
-    own = columns_on(design, question.shapes)
+    own = sensitivities_on(design, question.forms)
     answer = []
     for name in dict.fromkeys([AS_IT_STANDS, *settings]):
         setting = SETUPS[name]
         if bench_minutes(LEAST_RUNS) > minutes - setting.minutes + 1e-9:
             continue
-        columns = own if name == AS_IT_STANDS else _changed(question, design, own, setting)
-        if columns is None:
+        sensitivities = own if name == AS_IT_STANDS else _changed(question, design, own, setting)
+        if sensitivities is None:
             continue
         weight, worth = _own_weight(question, design, setting)
-        stacked = np.concatenate([*columns, weight], axis=3)
+        stacked = np.concatenate([*sensitivities, weight], axis=3)
         parts = {
             figure: Moments.of(
                 stacked[run == k],
@@ -406,27 +406,27 @@ def make_plans(
 
 
 def _changed(question: Question, design: Design, own, setting: Setup):
-    """The columns in another setting; None where no competing effect changes or it cannot be
+    """The sensitivities in another setting; None where no competing effect changes or it cannot be
     computed."""
     gravity = question.model.facts.gravity
     if setting.moves_weight and gravity is None:
         return None
     facts = replace(question.model.facts, gravity=setting.gravity(gravity))
     removed = setting.removes
-    absent = [j for j, shape in enumerate(question.shapes) if shape.name in removed]
+    absent = [j for j, form in enumerate(question.forms) if form.name in removed]
     other = [
         j
-        for j, shape in enumerate(question.shapes)
+        for j, form in enumerate(question.forms)
         if setting.moves_weight
-        and not shape.more
-        and _differs(shape.effect, under(shape.effect, facts))
+        and not form.more
+        and _differs(form.effect, under(form.effect, facts))
     ]
     if not absent and not other:
         return None
     answer = list(own)
-    fresh = columns_on(design, [question.shapes[j] for j in other], facts) if other else []
-    for j, columns in zip(other, fresh, strict=True):
-        answer[j] = columns
+    fresh = sensitivities_on(design, [question.forms[j] for j in other], facts) if other else []
+    for j, sensitivities in zip(other, fresh, strict=True):
+        answer[j] = sensitivities
     for j in absent:
         answer[j] = np.zeros_like(own[j])
     return answer
@@ -454,7 +454,7 @@ def _own_weight(question: Question, design: Design, setting: Setup) -> tuple[np.
     known = hypothesis_of(load)
     amplitude = known.tip_mass if setting.payload_g else known.own_weight
     column = list(load.amplitudes()).index(amplitude)
-    motion = columns_on(design, [Shape(name, load)])[0][..., column : column + 1]
+    motion = sensitivities_on(design, [Form(name, load)])[0][..., column : column + 1]
     uncertainty = question.uncertainty
     change = float(np.linalg.norm(pull))
     if setting.payload_g:
@@ -632,7 +632,7 @@ def next_experiment(
 
 def recommend(
     problem: Problem,
-    rivals: list[str] | tuple[str, ...],
+    competing: list[str] | tuple[str, ...],
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
 ) -> Recommendation:
@@ -640,18 +640,20 @@ def recommend(
 
     settings: names of the experimental setups that may be asked for.
     """
-    return _recommend(problem.model, problem, list(rivals), minutes, settings)
+    return _recommend(problem.model, problem, list(competing), minutes, settings)
 
 
 def propose(
     model: ArmModel,
-    rivals: list[str] | tuple[str, ...] | None = None,
+    competing: list[str] | tuple[str, ...] | None = None,
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
 ) -> Recommendation:
     """The experiment that best tells the competing effects (default: all known effects) apart,
     before anything was recorded."""
-    return _recommend(model, None, None if rivals is None else list(rivals), minutes, settings)
+    return _recommend(
+        model, None, None if competing is None else list(competing), minutes, settings
+    )
 
 
 def likely_competing(problem: Problem, most: int = 4) -> list[str]:
@@ -670,10 +672,10 @@ def likely_competing(problem: Problem, most: int = 4) -> list[str]:
     return order[:2] if len(near) < 2 else near[:most]
 
 
-def _recommend(model, problem, rivals, minutes, settings) -> Recommendation:
-    rivals = None if rivals is None else list(dict.fromkeys(rivals))
-    _check(model, rivals, minutes)
-    question = pose_question(model, problem, rivals)
+def _recommend(model, problem, competing, minutes, settings) -> Recommendation:
+    competing = None if competing is None else list(dict.fromkeys(competing))
+    _check(model, competing, minutes)
+    question = pose_question(model, problem, competing)
     limits = _limits(model, problem)
     for name in settings:
         if name not in SETUPS:
@@ -705,13 +707,13 @@ def _limits(model: ArmModel, problem: Problem | None) -> np.ndarray:
     return limits
 
 
-def _check(model: ArmModel, rivals: list[str] | None, minutes: float) -> None:
-    for name in rivals or []:
+def _check(model: ArmModel, competing: list[str] | None, minutes: float) -> None:
+    for name in competing or []:
         if name not in known_effects():
             make_effect(name, model.facts)
-    if rivals is not None and len(rivals) < 2:
+    if competing is not None and len(competing) < 2:
         raise InputError(
-            f"effects {', '.join(rivals) or 'none'}: expected at least two different effects; "
+            f"effects {', '.join(competing) or 'none'}: expected at least two different effects; "
             "name them with --between A B"
         )
     if not minutes >= bench_minutes(LEAST_RUNS):

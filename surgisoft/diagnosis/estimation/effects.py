@@ -162,8 +162,8 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
             f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "
             "record motion that it would show in"
         )
-    ends = np.cumsum([0] + [candidate.columns.shape[-1] for candidate in tried])
-    sensitivities = np.concatenate([candidate.columns for candidate in tried], axis=-1)
+    ends = np.cumsum([0] + [candidate.sensitivities.shape[-1] for candidate in tried])
+    sensitivities = np.concatenate([candidate.sensitivities for candidate in tried], axis=-1)
     validation = cross_validation_of(problem, sensitivities)
     picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
     before = validation.losses().sum()

@@ -146,8 +146,8 @@ def _static(pressure: np.ndarray, values: np.ndarray) -> np.ndarray:
     terms = [np.ones(len(x))]
     for degree in (1, 2, 3):
         more = [
-            np.prod(x[:, list(picked)], axis=1)
-            for picked in itertools.combinations_with_replacement(range(x.shape[1]), degree)
+            np.prod(x[:, list(chosen)], axis=1)
+            for chosen in itertools.combinations_with_replacement(range(x.shape[1]), degree)
         ]
         if 10 * (len(terms) + len(more)) > len(x):
             break
@@ -199,12 +199,12 @@ def _spread(tips: np.ndarray) -> list[int]:
     """Indices of postures whose tips (S, 3) lie far apart (farthest-point sampling)."""
     if not len(tips):
         return []
-    picked = [int(np.linalg.norm(tips - tips.mean(0), axis=1).argmax())]
+    chosen = [int(np.linalg.norm(tips - tips.mean(0), axis=1).argmax())]
     distance = np.full(len(tips), np.inf)
-    while len(picked) < min(POSTURES, len(tips)):
-        distance = np.minimum(distance, np.linalg.norm(tips - tips[picked[-1]], axis=1))
-        picked.append(int(distance.argmax()))
-    return picked
+    while len(chosen) < min(POSTURES, len(tips)):
+        distance = np.minimum(distance, np.linalg.norm(tips - tips[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return chosen
 
 
 def error_over_time(table: ResidualTable, title: str = ""):

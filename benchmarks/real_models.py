@@ -173,6 +173,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--actuation", choices=("measured", "commanded"), default="measured")
     parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--judged", type=int, default=None, help="folds left out; default: all")
     parser.add_argument("--members", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=200)
     parser.add_argument("--effects", default="auto")
@@ -197,7 +198,7 @@ def main() -> None:
     names = group[history.valid].unique()
     order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
     every: dict[str, list[Fold]] = {}
-    for number in range(options.folds):
+    for number in range(options.judged or options.folds):
         left_out = torch.isin(group, order[number :: options.folds]) & history.valid
         for fold in judge(history, spec, left_out, config):
             every.setdefault(fold.name, []).append(fold)

@@ -130,6 +130,11 @@ def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     _set(setup, stolen=stolen)
 
 
+def _inertia(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    """A damper that holds less: the rod's own inertia lets the arm swing after a step."""
+    _set(setup, keep=setup.plant.keep ** math.exp(-1.2 * strength))
+
+
 def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     setup.body.mass[-1] += 0.03 * strength * setup.body.mass.sum()
 
@@ -220,6 +225,7 @@ HIDDEN: dict[str, Hidden] = {
     "dead_zone": Hidden("material", "folded membranes that have to unfold", _dead_zone),
     "gain_mismatch": Hidden("material", "one chamber of another area", _gain_mismatch),
     "coupling": Hidden("material", "chambers bulge into their neighbours", _coupling),
+    "inertia": Hidden("material", "less damping: the arm swings", _inertia),
     "payload": Hidden("body", "unweighed mass at the tip", _payload),
     "contact": Hidden("body", "a stiff wall beside the arm", _contact),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),

@@ -216,7 +216,7 @@ def test_flow_is_that_of_iso_6358(high, low):
 def test_a_narrow_tube_fills_its_chamber_in_the_time_of_the_integral():
     """t = int V dp / (C p_1 phi(p / p_1)), from the room to 40 kPa with the tube held at 50 kPa."""
     gas = Gas(
-        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 0.0
+        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 1e9, 0.0
     )  # a tube of a litre's tenth holds its pressure
     air = Air(np.array([50e3]), np.array([50e3]), np.zeros(1), np.array([2e-6]))
     one = AMBIENT_PA + 50e3

@@ -28,6 +28,7 @@ from surgisoft.rig.elastica.rod import (
     straight_body,
 )
 from surgisoft.rig.elastica.wall import Wall, new_memory, strain_wall
+from surgisoft.rig.interface import Rig, SimulatedRig
 
 PLAIN = Wall(np.zeros(2), np.ones(2), np.zeros(3), 0.0, 0.0, 0.0)
 """A linear wall."""
@@ -300,6 +301,10 @@ def brief(rig, seconds=2.0):
 
 
 def test_it_is_a_rig_that_collect_drives(rig):
+    members = {name for name in dir(SimulatedRig) if not name.startswith("_")}
+    assert {"command", "read", "read_beside_truth", "gravity"} <= members
+    for name in members | set(Rig.__annotations__):
+        assert hasattr(rig, name), name
     recording = collect(rig, brief(rig))
     assert recording.samples == round(2.0 / rig.period_s)
     assert recording.key_points == rig.key_planes

@@ -22,6 +22,8 @@ from surgisoft.surrogate.model import ArmModel
 
 NAMING = ("identified", "several", "ambiguous")
 """Kinds of verdicts that name effects."""
+CLAIMING = (*NAMING, SETUP)
+"""Kinds of verdicts that claim to know what changed."""
 CLAIMED = 0.8
 """Confidence from which a wrong name misleads (goal of the benchmark)."""
 MOST_NAMES = 2
@@ -93,10 +95,13 @@ def right(answer: Answer, truth: Sequence[str]) -> bool:
 
 
 def misleads(answer: Answer, truth: Sequence[str]) -> bool:
-    """Whether a wrong name stands first with a confidence that claims to be right."""
-    if answer.kind not in NAMING:
+    """Whether a wrong name stands first with a confidence that claims to be right.
+
+    A fault of the set-up is claimed as proven, without a confidence.
+    """
+    if answer.kind not in CLAIMING or answer.names[0] in truth:
         return False
-    return answer.names[0] not in truth and answer.confidence >= CLAIMED
+    return answer.kind == SETUP or answer.confidence >= CLAIMED
 
 
 def digest_of(recordings: Sequence[Recording], options: FitOptions, actuation: str) -> str:
@@ -145,8 +150,8 @@ Ask = Callable[[ArmModel, Sequence[Recording], Sequence[Recording] | None], Diag
 def ask(
     model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
 ) -> Diagnosis:
-    """The diagnosis of `surgisoft diagnose MODEL AFTER --reference BEFORE`."""
-    return diagnose(model, after, reference=before)
+    """The diagnosis of `surgisoft diagnose MODEL AFTER --before BEFORE`."""
+    return diagnose(model, after, before=before)
 
 
 def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:

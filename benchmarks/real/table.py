@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from benchmarks.real.study import CLAIMED, MOST_NAMES, NAMING, Outcome
+from benchmarks.real.study import CLAIMED, CLAIMING, MOST_NAMES, NAMING, Outcome
 
 HEADER = (
     "| entry | change | truth | verdict | names | conf. | truth named | error mm | amended mm "
@@ -78,10 +78,10 @@ def summary(ran: Sequence[Outcome]) -> list[str]:
         f"| wrong name with confidence >= {CLAIMED} | {sum(o.misled for o in ran)} of {len(ran)} "
         "| 0 |",
         f"| named where nothing changed | {sum(_names(o) for o in called)} of {len(clean)} | 0 |",
-        f"| called unknown or set-up where nothing changed | "
+        f"| called unknown where nothing changed | "
         f"{sum(not _names(o) for o in called)} of {len(clean)} | |",
     ]
 
 
 def _names(outcome: Outcome) -> bool:
-    return outcome.answer is not None and outcome.answer.kind in NAMING
+    return outcome.answer is not None and outcome.answer.kind in CLAIMING

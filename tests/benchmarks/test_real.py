@@ -164,12 +164,14 @@ def test_what_counts_as_named_and_as_misled():
     clean = outcome((), "nothing_missing", (), 0.0)
     false = outcome((), "identified", ("creep",), 0.6)
     strange = outcome((), "unknown_effect", ("unknown",), 0.1)
-    some = [alone, pair, three, wrong, unsure, clean, false, strange]
-    assert [each.named for each in some] == [True, True, False, False, False, True, False, False]
-    assert [each.misled for each in some] == [False, True, False, True] + 4 * [False]
+    turned = outcome((), "setup", ("setup",), 0.0)
+    some = [alone, pair, three, wrong, unsure, clean, false, strange, turned]
+    named = [True, True, False, False, False, True, False, False, False]
+    assert [each.named for each in some] == named
+    assert [each.misled for each in some] == [False, True, False, True] + 4 * [False] + [True]
     rows = summary(some)
     assert "| known change named, alone or in a set of 2 | 2 of 5 | 90% |" in rows
     assert "| ... alone | 1 of 5 | |" in rows
-    assert "| wrong name with confidence >= 0.8 | 2 of 8 | 0 |" in rows
-    assert "| named where nothing changed | 1 of 3 | 0 |" in rows
-    assert "| called unknown or set-up where nothing changed | 1 of 3 | |" in rows
+    assert "| wrong name with confidence >= 0.8 | 3 of 9 | 0 |" in rows
+    assert "| named where nothing changed | 2 of 4 | 0 |" in rows
+    assert "| called unknown where nothing changed | 1 of 4 | |" in rows

@@ -7,7 +7,6 @@ FOLDER/cases/CASE/truth.json          what changed, and the name of the robot
 """
 
 import json
-import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
@@ -21,8 +20,7 @@ from benchmarks.real.study import (
     CLAIMING,
     NAMING,
     Answer,
-    answer_of,
-    ask,
+    asked,
     fitted,
     misleads,
     right,
@@ -101,9 +99,7 @@ def judge(case: CaseFolder) -> Judged:
     model = load_model(case.robot / "model")
     before = load_recordings(case.robot / "before", lambda text: None)
     after = load_recordings(case.place / "after", lambda text: None)
-    begin = time.process_time()
-    found = ask(model, after, before)
-    return Judged(case, answer_of(model, found, time.process_time() - begin))
+    return Judged(case, asked(model, after, before))
 
 
 def run(cases: Sequence[CaseFolder], processes: int, report: Progress) -> list[Judged]:

@@ -24,6 +24,8 @@ NAMING = ("identified", "several", "ambiguous")
 """Kinds of verdicts that name effects."""
 CLAIMING = (*NAMING, SETUP)
 """Kinds of verdicts that claim to know what changed."""
+REFUSED = "refused"
+"""Kind of an answer where `diagnose` ended with an error; its line is the sentence."""
 CLAIMED = 0.8
 """Confidence from which a wrong name misleads (goal of the benchmark)."""
 MOST_NAMES = 2
@@ -173,6 +175,20 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
     )
 
 
+def asked(
+    model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
+) -> Answer:
+    """The answer of a diagnosis, or why it was refused."""
+    begin = time.process_time()
+    try:
+        found = ask(model, after, before)
+    except InputError as error:
+        nan, seconds = float("nan"), time.process_time() - begin
+        known = model.validation.rmse_mm
+        return Answer(REFUSED, (), 0.0, (), str(error), nan, nan, nan, known, seconds)
+    return answer_of(model, found, time.process_time() - begin)
+
+
 def run_entry(entry: Entry, data: Path, cache: Cache, tell: Progress) -> Outcome:
     """Import, fit, diagnose and amend for one entry; skipped where its files are absent."""
     try:
@@ -182,9 +198,9 @@ def run_entry(entry: Entry, data: Path, cache: Cache, tell: Progress) -> Outcome
         return Outcome(entry, skipped=str(error))
     model = fitted(before, entry.fit, entry.actuation, cache, tell)
     tell(1, 1, "diagnose")
-    begin = time.process_time()
-    found = ask(model, after, before if entry.after else None)
-    answer = answer_of(model, found, time.process_time() - begin)
+    answer = asked(model, after, before if entry.after else None)
+    if answer.kind == REFUSED:
+        return Outcome(entry, answer=answer)
     tell(1, 1, "amend")
     catalogue = [name for name in entry.truth if name not in (UNKNOWN, SETUP)]
     named = answer.names if answer.kind in NAMING else ()

@@ -1,5 +1,6 @@
 """Tables of the benchmark `real` as Markdown."""
 
+import math
 from collections.abc import Sequence
 
 from benchmarks.real.study import CLAIMED, CLAIMING, MOST_NAMES, NAMING, Outcome
@@ -47,10 +48,10 @@ def row_of(outcome: Outcome) -> str:
         joint.join(answer.names) if answer.kind in NAMING else "",
         f"{answer.confidence:.2f}",
         "yes" if outcome.named else "no",
-        f"{answer.before_mm:.2f}",
+        _mm(answer.before_mm),
         _mm(outcome.amended_mm),
         _mm(outcome.oracle_mm),
-        f"{answer.best_mm:.2f}",
+        _mm(answer.best_mm),
         f"{answer.validated_mm:.2f}",
         f"{answer.seconds:.0f}",
     ]
@@ -58,7 +59,7 @@ def row_of(outcome: Outcome) -> str:
 
 
 def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:.2f}"
 
 
 def summary(ran: Sequence[Outcome]) -> list[str]:

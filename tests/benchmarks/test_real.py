@@ -9,6 +9,7 @@ from benchmarks.real.entries import FOLDER, Source, files_of, load_entries, part
 from benchmarks.real.study import Answer, Outcome
 from benchmarks.real.table import summary
 from surgisoft.cli import run
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 
 ENTRY = """
@@ -97,6 +98,7 @@ def test_a_complete_run(lab, tmp_path, capsys):
         ('["gain_mismatch"]', '["setup", "creep"]', "alone, or names of effects"),
         ("[after]", "[later]", "unknown field"),
         ('["after.parquet"]', "[]", "after.files: got a list []; expected at least one file"),
+        ('["after.parquet"]', '["/after.parquet"]', "relative to the data folder"),
         ('["after.parquet"]', '["after.parquet"]\nmap = "m.toml"', "no such file 'm.toml'"),
         ('["after.parquet"]', '["after.parquet"]\npart = [0.5, 0.5]', "two shares"),
         ('licence = "none"', "", "licence: missing"),
@@ -145,6 +147,9 @@ def test_files_match_as_in_a_shell(tmp_path):
         (tmp_path / name).write_text("")
     found = files_of(Source(("run_*.csv",)), tmp_path)
     assert [path.name for path in found] == ["run_1.csv", "run_2.csv"]
+    assert len(files_of(Source(("run_*.csv", "run_1.csv")), tmp_path)) == 2
+    with pytest.raises(InputError, match="not a pattern of files"):
+        files_of(Source(("run**.csv",)), tmp_path)
 
 
 def outcome(truth: tuple[str, ...], kind: str, names: tuple[str, ...], confidence: float):

@@ -217,7 +217,7 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     verdict, change = result.verdict, both.change
     words = verdict.sentence
     if both.used and verdict.kind == "surrogate_undertrained":
-        words = sentence_of("unknown_effect", (), result.error_mm, 0.0, 0.0, None)
+        words = "something has changed and it is none of the known effects"
         verdict = replace(verdict, kind="unknown_effect")
     text = f"since {both.names}: {words}; {change.sentence}"
     track = both.track(found.problem, _explained(found, verdict)) if both.used else None

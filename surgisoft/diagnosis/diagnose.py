@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.data_quality import data_quality_warnings
@@ -215,11 +217,20 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     verdict, change = result.verdict, both.change
     words = verdict.sentence
     if both.used and verdict.kind == "surrogate_undertrained":
-        words = sentence_of("unknown_effect", (), result.error_mm, 0.0, 0.0, None)
+        words = "something has changed and it is none of the known effects"
         verdict = replace(verdict, kind="unknown_effect")
     text = f"since {both.names}: {words}; {change.sentence}"
-    track = both.track(found.problem, found.explained_mm) if both.used else None
+    track = both.track(found.problem, _explained(found, verdict)) if both.used else None
     return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def _explained(found: Findings, verdict: Verdict) -> np.ndarray:
+    """(S, n, 3) what the named effects explain, mm; of several that compete, the first."""
+    effects = verdict.effects[:1] if verdict.kind == "ambiguous" else verdict.effects
+    forms = {score.effect: score.option.chosen for score in found.first}
+    chosen = tuple(i for name in effects if name in forms for i in forms[name])
+    amplitudes = found.selection.validation.amplitudes(chosen)
+    return found.selection.sensitivities[..., list(chosen)] @ amplitudes
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
@@ -10,13 +11,13 @@ HOW = (
     "order in its amplitudes, beside a flexible function of actuation and direction that stands "
     "for the model discrepancy and has the size of the model's validated error. Effects are "
     "compared by the error on held-out blocks of time.\n\n"
-    "Alone: the share of the held-out squared error above the noise floor that this effect removes "
-    "by itself. Unique: the share that returns when it is left out of all effects together. Of "
-    "collinear effects, which predict nearly the same change, the first is large and the second "
-    "small.\n\n"
+    "Alone: the share of what can be explained of the held-out squared error (what lies above the "
+    "noise floor) that this effect removes by itself. Unique: the share that returns when it is "
+    "left out of all effects together. Of collinear effects, which predict nearly the same change, "
+    "the first is large and the second small.\n\n"
     "P-value: how often random signs of the blocks' gains give so large a gain in any of the "
-    "effects (family-wise). Confidence: how often such a result was right on virtual robots whose "
-    "missing effect was known; see the benchmark.\n\n"
+    "effects (family-wise). Confidence: the calibrated probability that the effect is missing, "
+    "fitted to robots whose missing effect was known; see the benchmark.\n\n"
     "Best achievable error: the least error on held-out blocks that the model, a black box or any "
     "effect reached.\n\n"
     "The diagnosis did not see the last quarter of each recording: `surgisoft amend` validates its "
@@ -39,6 +40,15 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     if found.checks:
         parts.append(Section("Checks of the data", [Text("\n\n".join(found.checks))]))
     parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+    if found.not_testable:
+        rows = [(each.effect, each.reason) for each in found.not_testable]
+        note = Text("These recordings cannot show these effects, so they are not ranked.")
+        parts.append(Section("Not testable", [note, Table(["effect", "reason"], rows)]))
+    if found.probabilities:
+        parts.append(_probabilities(found.probabilities))
+    if found.next_command:
+        command = found.next_command.format(model="MODEL", data="RECORDINGS")
+        parts.append(Section("What to do", [Text(f"`{command}`")]))
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
@@ -80,6 +90,19 @@ def _ranking(found: Diagnosis) -> Table:
     ]
     header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "p-value"]
     return Table(header, rows)
+
+
+def _probabilities(chances: Probabilities) -> Section:
+    """What may be true, with the calibrated probabilities."""
+    rows = [
+        ("nothing is missing", f"{chances.nothing:.2f}"),
+        ("nothing but a better network", f"{chances.network:.2f}"),
+        ("an effect of the list", f"{chances.known:.2f}"),
+        ("something outside the list", f"{chances.unknown:.2f}"),
+    ]
+    if chances.two:
+        rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))
+    return Section("Probabilities", [Table(["what may be true", "probability"], rows)])
 
 
 def _parameters(found: Diagnosis) -> Section:

@@ -5,15 +5,13 @@ processor time and is stored as one line of JSON, so that the decision is fitted
 repeating a diagnosis.
 """
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-import surgisoft
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.evidence import Evidence, evidence_of
+from surgisoft.diagnosis.evidence import VERSION, Evidence, evidence_of
 from surgisoft.diagnosis.inputs import identification_problem, open_inputs
 from surgisoft.diagnosis.selection import find
 from surgisoft.diagnosis.testability import testable
@@ -23,9 +21,9 @@ from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
-Label = Literal["known", "unknown", "clean", "network", "setup"]
+Label = Literal["known", "unknown", "clean", "network", "other_robot", "setup"]
 """What is true of a case: effects of the list are missing; one outside the list is; nothing; the
-network is off (undertrained, or fitted to another robot); the set-up is wrong."""
+network is undertrained; the model is that of another robot; the set-up is wrong."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,8 @@ class Labelled:
     """The evidence of the diagnosis."""
     seconds: float
     """Processor time of the diagnosis, s."""
-    code: str = ""
-    """Fingerprint of the code that made the evidence."""
+    version: int = VERSION
+    """Version of the evidence."""
 
     @property
     def size(self) -> float:
@@ -82,12 +80,14 @@ def evidence_on(
 
 
 def read(path: Path) -> list[Labelled]:
-    """The stored cases of a file; an incomplete last line is left out."""
+    """The stored cases of a file; an incomplete last line and other versions are left out."""
     answer = {}
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:
             values = json.loads(line)
         except json.JSONDecodeError:
+            continue
+        if values.get("version") != VERSION:
             continue
         values["truth"] = tuple(values["truth"])
         values["evidence"] = Evidence.from_json(values["evidence"])
@@ -100,15 +100,3 @@ def append(path: Path, one: Labelled) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         file.write(json.dumps(one.to_json()) + "\n")
-
-
-def fingerprint() -> str:
-    """Hash of the code that evidence depends on: diagnosis, surrogate and measurement."""
-    package = Path(surgisoft.__file__).parent
-    names = ("candidates", "cross_validation", "evidence", "selection", "black_box", "criteria")
-    files = [package / "diagnosis" / f"{name}.py" for name in names]
-    files += sorted((package / "surrogate").rglob("*.py"))
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

@@ -47,17 +47,18 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
             continue
         missing = case.label in ("known", "unknown")
         if name == "missing":
-            if missing and case.size < WEAK:
+            if (missing and case.size < WEAK) or case.label == "other_robot":
                 continue
             right = np.array(float(missing))
         elif name == "known":
-            if not missing or case.size < WEAK:
+            other = case.label == "other_robot"
+            if not other and (not missing or case.size < WEAK):
                 continue
             right = np.array(float(case.label == "known"))
         elif name == "network":
-            if missing:
+            if case.label == "known":
                 continue
-            right = np.array(float(case.label == "network"))
+            right = np.array(float(case.label in ("network", "other_robot")))
         elif name == "two":
             pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
             if case.label != "known" or not pair or case.size < WEAK:

@@ -7,12 +7,13 @@ recordings, and models that are asked about another robot than their own.
 
 import time
 from concurrent.futures import as_completed
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks.decision.evidence_log import Labelled, append, evidence_on, fingerprint, read
+from benchmarks.decision.evidence_log import Label, Labelled, append, evidence_on, read
 from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, MEMORY, PAIRS, UNKNOWN, Case
 from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
 from surgisoft.progress import Progress
@@ -38,7 +39,17 @@ FIRST_TAKE = 700_000
 """Number of the first trial; those of the benchmark `diagnosis` are below."""
 
 
-def draw(robots: list[int], undertrained: list[int], count: int, seed: int) -> list[tuple]:
+@dataclass(frozen=True)
+class Plan:
+    """The robots that cases are drawn on."""
+
+    robots: list[int]
+    """Seeds of the robots."""
+    undertrained: list[int]
+    """Seeds of those that also have an undertrained model."""
+
+
+def draw(plan: Plan, count: int, seed: int) -> list[tuple[Case, int]]:
     """(case, robot whose model is asked) of so many cases."""
     rng = np.random.default_rng([seed, FIRST_TAKE])
     every = {
@@ -57,7 +68,7 @@ def draw(robots: list[int], undertrained: list[int], count: int, seed: int) -> l
             strengths = PAIR_STRENGTHS if kind == "pair" else STRENGTHS
             hidden = tuple((name, float(rng.choice(strengths))) for name in queues[kind].pop())
         poor = kind == "undertrained"
-        robot = int(rng.choice(undertrained if poor else robots))
+        robot = int(rng.choice(plan.undertrained if poor else plan.robots))
         case = Case(
             robot=robot,
             hidden=hidden,
@@ -67,7 +78,7 @@ def draw(robots: list[int], undertrained: list[int], count: int, seed: int) -> l
             take=FIRST_TAKE + 10_000 * seed + number,
             undertrained=poor,
         )
-        others = [one for one in robots if one != robot]
+        others = [one for one in plan.robots if one != robot]
         asked = int(rng.choice(others)) if kind == "other_robot" else robot
         answer.append((case, asked))
     return answer
@@ -79,7 +90,7 @@ def name_of(case: Case, asked: int) -> str:
     return f"{case.robot}/{case.take}/{hidden}/{case.excitation}/model-{asked}"
 
 
-def run_case(case: Case, asked: int, folder: Path, code: str) -> Labelled:
+def run_case(case: Case, asked: int, folder: Path) -> Labelled:
     """Record, deform the surrogate, and collect the evidence."""
     torch.set_num_threads(1)
     recorded = record(case)
@@ -90,10 +101,9 @@ def run_case(case: Case, asked: int, folder: Path, code: str) -> Labelled:
     begin = time.process_time()
     evidence = evidence_on(model, [recorded.recording], known)
     seconds = time.process_time() - begin
-    off = case.undertrained or asked != case.robot
-    label = "clean"
-    if off:
-        label = "network"
+    label: Label = "network" if case.undertrained else "clean"
+    if asked != case.robot:
+        label = "other_robot"
     elif case.hidden:
         label = "unknown" if "unknown" in case.truth else "known"
     names = tuple(name for name, _ in case.hidden)
@@ -109,13 +119,11 @@ def run_case(case: Case, asked: int, folder: Path, code: str) -> Labelled:
         minutes=EXCITATIONS[case.excitation][1] / 1200.0,
         evidence=evidence,
         seconds=seconds,
-        code=code,
     )
 
 
 def run(
-    robots: list[int],
-    undertrained: list[int],
+    plan: Plan,
     count: int,
     seed: int,
     folder: Path,
@@ -124,15 +132,14 @@ def run(
     report: Progress,
 ) -> list[Labelled]:
     """Collect the evidence of so many cases; those that the log has are not repeated."""
-    code = fingerprint()
-    done = {one.case: one for one in read(log) if one.code == code}
-    plan = draw(robots, undertrained, count, seed)
-    missing = [(case, asked) for case, asked in plan if name_of(case, asked) not in done]
+    done = {one.case: one for one in read(log)}
+    drawn = draw(plan, count, seed)
+    missing = [(case, asked) for case, asked in drawn if name_of(case, asked) not in done]
     with workers(processes) as pool:
-        jobs = [pool.submit(run_case, case, asked, folder, code) for case, asked in missing]
+        jobs = [pool.submit(run_case, case, asked, folder) for case, asked in missing]
         for number, job in enumerate(as_completed(jobs)):
             one = job.result()
             append(log, one)
             done[one.case] = one
             report(number + 1, len(missing), f"{len(done)} cases")
-    return [done[name_of(case, asked)] for case, asked in plan]
+    return [done[name_of(case, asked)] for case, asked in drawn]

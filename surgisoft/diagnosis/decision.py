@@ -8,7 +8,8 @@ probabilities:
 - `first`: which effect of the list it is, given that it is in the list: a conditional logit over
   all effects (McFadden 1974), P(e) proportional to exp(w . x_e);
 - `two`: the two proposed effects are both missing, given that what is missing is in the list;
-- `network`: the network itself is off, given that nothing is missing.
+- `network`: the network is off, undertrained or that of another arm, given that no effect of the
+  list is missing.
 
 So P(e) = P(missing) P(known) P(e | known). Every weight has a fixed sign: more evidence for a
 statement never makes it less probable. The result is the one whose worth to its reader, weighed
@@ -353,6 +354,12 @@ NETWORK = (
         lambda e: abs(_log(e.error_over_validated, -1.0, 2.0)),
         "log of the error over the validated error, its absolute value",
     ),
+    Feature(
+        "over_box",
+        +1,
+        lambda e: _log(e.error_over_box, 0.0, 3.0),
+        "log of the error over what a black box with memory reaches",
+    ),
 )
 FEATURES = {"missing": MISSING, "known": KNOWN, "first": FIRST, "two": TWO, "network": NETWORK}
 """The features of each fitted model."""
@@ -444,7 +451,7 @@ class Probabilities:
     nothing: float
     """Nothing is missing."""
     network: float
-    """Nothing is missing but the network is off: undertrained, or of another arm."""
+    """The network is off, undertrained or of another arm, and no effect of the list is missing."""
     unknown: float
     """Something outside the list is missing."""
     effects: dict[str, float]
@@ -485,8 +492,8 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
     ordered = sorted(each.items(), key=lambda item: -item[1])
     return Probabilities(
         nothing=(1.0 - missing) * (1.0 - network),
-        network=(1.0 - missing) * network,
-        unknown=missing * (1.0 - known),
+        network=(1.0 - missing * known) * network,
+        unknown=missing * (1.0 - known) * (1.0 - network),
         effects={name: missing * known * p for name, p in ordered},
         pair=missing * known * both,
         two=pair[0] if pair else (),
@@ -553,25 +560,26 @@ def decide(
         value = quiet + (1.0 - quiet) * worth.wrong_nothing
         tried.append((value, "nothing_missing", (), quiet))
     off = chances.network if claimable(evidence, claim) else quiet
-    if _network_is_off(evidence, claim):
+    if _mostly_static(evidence):
         value = off + (1.0 - off) * worth.wrong_network
         tried.append((value, "surrogate_undertrained", (), off))
     value, kind, effects, sure = max(tried, key=lambda each: each[0])
     if value <= 0.0:
         return Decision("cannot_tell", (), max(sure, 0.0), chances, reason_of(evidence, chances))
+    beyond = evidence.error_over_validated > claim.most_over_validated
+    if kind == "surrogate_undertrained" and beyond:
+        return Decision("cannot_tell", (), sure, chances, "network")
     return Decision(kind, effects, sure, chances)
 
 
-def _network_is_off(evidence: Evidence, claim: Claim) -> bool:
-    """Whether what could be explained is a static function that the fit knew to be off."""
-    static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
-    return static and evidence.error_over_validated <= claim.most_over_validated
+def _mostly_static(evidence: Evidence) -> bool:
+    """Whether what can be explained is a static function for the most part."""
+    return evidence.free_static >= MOSTLY_STATIC * evidence.free_box
 
 
 def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
     """Why a diagnosis cannot tell."""
-    static = evidence.free_static >= MOSTLY_STATIC * evidence.free_box
-    if static and chances.network + chances.nothing >= chances.known:
+    if _mostly_static(evidence) and chances.network + chances.nothing >= chances.known:
         return "network"
     memory = evidence.free_box - evidence.free_static
     if evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:

@@ -15,6 +15,9 @@ from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
 from surgisoft.diagnosis.statistics import block_sums, studentised
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
+VERSION = 1
+"""Version of the evidence, raised when a number gets another meaning: stored evidence of another
+version is collected again."""
 COLLINEAR_RIDGE = 1e-6
 """Ridge, as a share of the mean power of the sensitivities, of the regression for collinearity."""
 

@@ -148,8 +148,9 @@ def test_probabilities_by_hand():
     first = chance(1.0) * chance(2.0) * chance(2.8)
     assert found.effects["creep"] == pytest.approx(first)
     assert found.effects["line_lag"] == pytest.approx(chance(1.0) * chance(2.0) * chance(-2.8))
-    assert found.unknown == pytest.approx(chance(1.0) * chance(-2.0))
+    assert found.unknown == pytest.approx(chance(1.0) * chance(-2.0) * chance(1.0))
     assert found.nothing == pytest.approx(chance(-1.0) * chance(1.0))
+    assert found.network == pytest.approx((1.0 - chance(1.0) * chance(2.0)) * chance(-1.0))
     total = found.nothing + found.network + found.unknown + found.known
     assert total == pytest.approx(1.0)
 

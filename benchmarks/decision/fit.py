@@ -131,7 +131,14 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in signs]
     bounds.append((0.0, 0.0) if joint else (None, None))
     start = np.append(0.1 * signs, 0.0)
-    found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    found = optimize.minimize(
+        loss,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"ftol": 1e-13, "gtol": 1e-8, "maxiter": 2000},
+    )
     return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
 
 

@@ -8,13 +8,15 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
+    Before,
     EffectFiles,
     Force,
     JsonFile,
     Model,
     NewModel,
+    Paired,
     Report,
     with_effect_files,
 )
@@ -38,6 +40,8 @@ def amend(
         typer.Option(metavar="REC...", help="Recordings (.csv, .parquet) or folders of them."),
     ],
     output: NewModel,
+    before: Before = None,
+    paired: Paired = "auto",
     json_file: JsonFile = None,
     report: Report = None,
     effect_files: EffectFiles = None,
@@ -66,6 +70,7 @@ def amend(
     check_folder(report)
     check_model(model)
     measured = read_recordings(data)
+    earlier = read_before(before, paired)
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.amend import amend as amend_model
@@ -78,7 +83,13 @@ def amend(
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
-            arm, measured, names, not keep_network, lambda text: tell(next(stages), 4, text)
+            arm,
+            measured,
+            names,
+            not keep_network,
+            lambda text: tell(next(stages), 4, text),
+            before=earlier,
+            paired=paired,
         )
     warn_all(result.notes)
     saved = result.claimed or anyway

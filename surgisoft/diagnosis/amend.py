@@ -16,8 +16,10 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
+from surgisoft.measurement.recordings import load_recordings
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
@@ -108,6 +110,12 @@ class Amendment:
     """Time that it took, s."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    change: Change | None = None
+    """How far the recordings differ from those before the change; where rows are paired, errors are
+    those of the paired difference, and None where no recordings from before were given."""
+    model_error: Fall | None = None
+    """The error of the model itself on the held-out rows, where the others are paired
+    differences."""
 
     @property
     def claimed(self) -> bool:
@@ -118,6 +126,11 @@ class Amendment:
     def sentence(self) -> str:
         """The outcome in words."""
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
+        if self.model_error is not None:
+            whole = self.model_error
+            text = text.replace("error ", f"change since {' + '.join(self.change.before)}: ", 1)
+            text += f"; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
+            return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
         return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned behind"
@@ -137,6 +150,9 @@ class Amendment:
             "network_retuned": self.retuned,
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "change": self.change and self.change.to_json(),
+            "error_model_mm": self.model_error
+            and asdict(self.model_error) | {"ci95": list(self.model_error.ci95)},
         }
 
 
@@ -147,6 +163,8 @@ def amend(
     effects: str | Iterable[str],
     retune_network: bool = True,
     progress: Progress | None = None,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
@@ -154,42 +172,54 @@ def amend(
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
-    effects alone make the error fall.
+    effects alone make the error fall. before: recordings from before a change. Where they were made
+    with the same actuation, effects are fitted to the paired difference (`pairs`), so that the
+    network's error does not enter; paired: as for `diagnose`.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
-    table = residual_table(model, recordings)
+    plain = table = residual_table(model, recordings)
+    both = None
+    if before is not None:
+        both = before_and_after(plain, load_recordings(before), paired).with_held_out_pairs()
+        notes, table = (*notes, *both.notes), both.table
     problem = table.training()
     tell(f"fitting {' + '.join(names)}")
     fitted = fit_effects(problem, names)
     better, retuned = fitted.model, False
     if retune_network:
         tell("re-tuning the network")
-        tried = retune(better, problem)
+        # The network is tuned to what was measured: its own error is not in a paired difference.
+        tried = retune(better, plain.training())
         better, retuned = tried.model, tried.kept
     tell("evaluating on the held-out part")
-    held_out = table.final_check()
+    held_out, whole = table.final_check(), plain.final_check()
     alone = fall_of(held_out, held_out.with_model(fitted.model))
-    if retuned and not (alone.claimed and fall_of(held_out, held_out.with_model(better)).claimed):
+    if retuned and not (alone.claimed and fall_of(whole, whole.with_model(better)).claimed):
         better, retuned = fitted.model, False
     # The residuals of the fit say nothing of a network that was re-tuned since.
     better.training_residuals = None if retuned else model.training_residuals
-    pairs = [(part, part.with_model(better)) for part in (problem, held_out)]
+    is_paired = both is not None and both.used
+    # The paired difference holds for the network that predicted BEFORE.
+    shown = fitted.model if is_paired else better
+    falls = [(part, part.with_model(shown)) for part in (problem, held_out)]
     return Amendment(
         model=better,
         effects=tuple(dict.fromkeys(names)),
         refitted=fitted.refitted,
         parameters=fitted.parameters,
-        held_out=fall_of(*pairs[1]),
+        held_out=fall_of(*falls[1]),
         alone=alone,
-        training=fall_of(*pairs[0]),
+        training=fall_of(*falls[0]),
         retuned=retuned,
-        tracks=(track_of(*pairs[0]), track_of(*pairs[1])),
+        tracks=(track_of(*falls[0]), track_of(*falls[1])),
         seconds=time.perf_counter() - begin,
         notes=notes,
+        change=None if both is None else both.change,
+        model_error=fall_of(whole, whole.with_model(better)) if is_paired else None,
     )
 
 

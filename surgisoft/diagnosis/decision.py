@@ -40,6 +40,7 @@ Kind = Literal[
     "unknown_effect",
     "surrogate_undertrained",
     "cannot_tell",
+    "setup",
 ]
 Reason = Literal["network", "learned", "few_data", "schedule"]
 """Why a diagnosis cannot tell: the network is not that of this arm; the network has learned part of
@@ -149,6 +150,15 @@ def _instead(evidence: Evidence, name: str) -> float:
     return min(getattr(pair[0], name), default=3.0) if pair else 0.0
 
 
+def _apart(effect: EffectEvidence) -> float:
+    """Sine of the angle between the best effect's change and what this effect can imitate of it.
+
+    No real effect has exactly the form of its model, so of two that do nearly the same the data
+    prefer one for what its form gets wrong, however sure the blocks are.
+    """
+    return math.sqrt(_between(1.0 - effect.collinear, 0.0, 1.0))
+
+
 def _single_lack_of_fit(evidence: Evidence) -> float:
     if not evidence.proposals:
         return 0.0
@@ -234,8 +244,9 @@ FIRST = (
     Feature(
         "margin",
         -1,
-        lambda x, e: _between(x.margin, -3.0, 6.0) / 3.0,
-        "studentised difference of the log gains of the best effect and this one",
+        lambda x, e: _between(x.margin, -3.0, 6.0) / 3.0 * _apart(x),
+        "studentised difference of the log gains of the best effect and this one, times the sine "
+        "of the angle between their changes",
     ),
     Feature(
         "gain", +1, lambda x, e: _between(x.gain, 0.0, 1.0), "share that the effect alone explains"

@@ -1,6 +1,7 @@
 """`diagnose`: which physical effect is the model missing?
 
-System identification of a grey-box model in five steps:
+What is wrong with the set-up of the recordings is tested first (`setup`): where a fault is proved,
+the diagnosis ends there. Else it is a system identification of a grey-box model in five steps:
 
 1. Residual table: the model's residuals on the training rows, thinned, in blocks (`residuals`).
 2. Sensitivities: what each effect, with each choice of its nonlinear parameters, would change in
@@ -27,10 +28,11 @@ from surgisoft.diagnosis.evidence import Evidence, evidence_of
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
-    identification_problem,
     open_inputs,
+    with_known_residuals,
 )
-from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -38,9 +40,11 @@ from surgisoft.diagnosis.selection import (
     find,
     rmse_interval,
 )
+from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.diagnosis.testability import NotTestable, testable
 from surgisoft.errors import unknown_name
-from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.histories import check_fits
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -154,12 +158,17 @@ class Diagnosis:
     probabilities: Probabilities | None = None
     """Calibrated probabilities of what is true."""
     next_command: str = ""
-    """What to do, as a command with `{model}` and `{data}` in the place of the files; empty where
-    nothing is to be done."""
+    """What to do, as a command with `{model}`, `{data}` and `{before}` (the option with recordings
+    from before, or nothing) in the place of the files; empty where nothing is to be done."""
+    setup: SetupResult | None = None
+    """What is wrong with the set-up of the recordings; None where no fault is proved."""
+    change: Change | None = None
+    """How far the recordings differ from those before the change; None where none were given."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        return asdict(self)
+        plain = asdict(replace(self, setup=None))
+        return plain | {"setup": self.setup.to_json() if self.setup else None}
 
 
 @torch_threads(1)
@@ -169,21 +178,53 @@ def diagnose(
     progress: Progress | None = None,
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     without: Collection[str] = (),
+    setup_tests: bool = True,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths. Where `setup_tests` prove a fault of the
+    set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
+    recordings.
 
     Only the training rows are looked at: the view of the residual table that is worked on holds no
-    other key points. reference: recordings from before a change in question; without them the
-    residuals that the model keeps of its fit. without: effects that cannot act, such as a contact
-    on a bench without anything to touch.
+    other key points. before: recordings from before a change in question. Where they were made with
+    the same actuation, the paired difference is explained (`pairs`), else the residuals of the
+    model, with those of `before` as what was known; paired: `auto`, `always` (too few common
+    motions are an error) or `never`. reference: recordings, as before; or residuals of the model
+    from before, default those that it keeps of its fit. without: effects that cannot act, such as a
+    contact on a bench without anything to touch.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    if setup_tests:
+        report("set-up")
+        wrong = find_setup_faults(model, recordings)
+        if wrong is not None:
+            return replace(with_setup(wrong), notes=notes, seconds=time.perf_counter() - begin)
+        check_fits(model.spec, recordings)
     report("predicting")
-    problem = identification_problem(model, recordings, reference)
+    table = residual_table(model, recordings)
+    if before is None and not isinstance(reference, TrainingResiduals | None):
+        before = reference
+    both = None
+    if before is not None:
+        both = before_and_after(table, load_recordings(before), paired)
+        problem, notes = both.training(), (*notes, *both.notes)
+    else:
+        problem = with_known_residuals(table.training(), reference)
+    result = diagnosis_of(problem, report, without)
+    if both is not None:
+        result = since(result, both.change)
+    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def diagnosis_of(
+    problem: Problem, report: Progress = lambda text: None, without: Collection[str] = ()
+) -> Diagnosis:
+    """The diagnosis of an identification problem."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -192,9 +233,23 @@ def diagnose(
     asked = [name for name in names if name not in without]
     tried, not_testable = testable(problem, candidates(problem, asked), asked)
     result = replace(result_of(find(problem, tried, report)), not_testable=not_testable)
-    if result.verdict.kind == "unknown_effect":
-        result = with_axis(result, problem)
-    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
+
+
+def since(result: Diagnosis, change: Change) -> Diagnosis:
+    """The diagnosis of a change: its sentence says since when, and how large the change is."""
+    text = f"since {' + '.join(change.before)}: {result.verdict.sentence}; {change.sentence}"
+    return replace(result, change=change, verdict=replace(result.verdict, sentence=text))
+
+
+def with_setup(wrong: SetupResult) -> Diagnosis:
+    """The diagnosis of recordings whose set-up is at fault."""
+    return Diagnosis(
+        verdict=Verdict("setup", (), wrong.sentence),
+        error_mm=ErrorLevels(wrong.before_mm, wrong.floor_mm, wrong.after_mm),
+        ranking=(),
+        setup=wrong,
+    )
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
@@ -350,10 +405,12 @@ def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
 
 
 def next_command(decision: Decision) -> str:
-    """What to do after a result, with `{model}` and `{data}` in the place of the files."""
+    """What to do after a result, with `{model}`, `{data}` and `{before}` for the files."""
     kind, names = decision.kind, decision.effects
     if kind in ("identified", "several"):
-        return f"surgisoft amend {{model}} --effect {' '.join(names)} --data {{data}} -o NEW"
+        return (
+            f"surgisoft amend {{model}} --effect {' '.join(names)} --data {{data}}{{before}} -o NEW"
+        )
     between = names or tuple(decision.probabilities.effects)[:2]
     plan = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(between)}"
     plan = f"{plan} -o SCHEDULE.csv"

@@ -138,7 +138,7 @@ def improve(
 
     going = True
     while going and len(added) < most_effects:
-        found = diagnose(models[-1], recordings, reference=reference)
+        found = diagnose(models[-1], recordings, reference=reference, setup_tests=not added)
         error = fall_of(problem, problem.with_model(models[-1])).after
         current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]

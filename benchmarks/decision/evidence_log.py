@@ -12,7 +12,9 @@ from typing import Literal
 
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.evidence import VERSION, Evidence, evidence_of
-from surgisoft.diagnosis.inputs import identification_problem, open_inputs
+from surgisoft.diagnosis.inputs import open_inputs, with_known_residuals
+from surgisoft.diagnosis.pairs import before_and_after
+from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.diagnosis.selection import find
 from surgisoft.diagnosis.testability import testable
 from surgisoft.files import json_safe
@@ -68,13 +70,20 @@ class Labelled:
 def evidence_on(
     model: ArmModel,
     recordings: list[Recording],
-    known: TrainingResiduals | None,
-    without: tuple[str, ...] = (),
+    known: TrainingResiduals | None = None,
+    before: list[Recording] | None = None,
 ) -> Evidence:
-    """The evidence of a diagnosis, as `diagnose` computes it."""
+    """The evidence of a diagnosis, as `diagnose` computes it.
+
+    known: residuals of the model from before; before: recordings from before a change.
+    """
     model, recordings, _ = open_inputs(model, recordings)
-    problem = identification_problem(model, recordings, known)
-    names = [name for name in known_effects() if name not in without]
+    table = residual_table(model, recordings)
+    if before is None:
+        problem = with_known_residuals(table.training(), known)
+    else:
+        problem = before_and_after(table, before).training()
+    names = list(known_effects())
     tried, _ = testable(problem, candidates(problem, names), names)
     return evidence_of(find(problem, tried, lambda text: None))
 

@@ -3,7 +3,8 @@
 A folder of a source holds, for each case, `after/*.parquet` and `truth.json` (robot, hidden
 effects, the names that a diagnosis should give, RMS change of the key points in mm), and for each
 robot `before/*.parquet` and optionally `model/`, in `ROBOT` or `robots/ROBOT`. One model is fitted
-for each robot to its recordings before the change, unless it is there already.
+for each robot to its recordings before the change, unless it is there already. The question is what
+has changed since: the recordings before the change are given to the diagnosis too.
 """
 
 import json
@@ -62,8 +63,9 @@ def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelle
     truth = json.loads(truth_file.read_text())
     model = load_model(model_folder(folder, truth["robot"], work))
     recordings = load_recordings(truth_file.parent / "after")
+    before = load_recordings(robot_folder(folder, truth["robot"]) / "before")
     begin = time.process_time()
-    evidence = evidence_on(model, recordings, None)
+    evidence = evidence_on(model, recordings, before=before)
     seconds = time.process_time() - begin
     named = tuple(truth["truth"])
     label: Label = "clean"

@@ -70,7 +70,7 @@ class Worth:
     """The missing effect is one of two that are named as a set."""
     half_pair: float = -1.0
     """One of two effects that are named together is missing, the other not."""
-    first_of_pair: float = 0.5
+    first_of_pair: float = 0.8
     """One effect is named, and another one is missing too."""
     wrong_unknown: float = -1.0
     """An effect of the list, or none, is called unknown: no model is changed for it."""

@@ -55,6 +55,9 @@ FEW_MOTIONS = 24
 LEARNED = 0.1
 """Share of what can be explained that memory must explain beyond any static function before the
 network is said to have learned part of what is missing."""
+LEAST_LEFT = 0.02
+"""Share of what can be explained that no proposal is taken to fall below: a fiftieth is within what
+the noise floor is known."""
 MOSTLY_STATIC = 0.8
 """Share of what a black box with memory explains that a static function must explain before the
 network alone is said to be off."""
@@ -103,6 +106,11 @@ def _explained(evidence: Evidence) -> float:
     return _between(_most(evidence, "gain", 0.0), 0.0, 1.0)
 
 
+def _unexplained(evidence: Evidence) -> float:
+    """-log of the share of what can be explained that the best proposal leaves, over 2."""
+    return -0.5 * math.log(1.0 - _explained(evidence) + LEAST_LEFT)
+
+
 def _left_size(evidence: Evidence) -> float:
     """Error above the floor that the best proposal leaves, in units of the discrepancy."""
     some = [each.left_size for each in evidence.proposals]
@@ -112,7 +120,7 @@ def _left_size(evidence: Evidence) -> float:
 def _box_better(evidence: Evidence) -> float:
     """Log gain of the black box over the best proposal."""
     some = [each.left_log_box for each in evidence.proposals]
-    return _between(min([evidence.box_log_gain, *some]), 0.0, 1.0)
+    return _between(min([evidence.box_log_gain, *some]), -1.0, 1.0)
 
 
 def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
@@ -207,7 +215,12 @@ MISSING = (
     ),
 )
 KNOWN = (
-    Feature("explained", +1, _explained, "share of what can be explained by the best proposal"),
+    Feature(
+        "explained",
+        +1,
+        _unexplained,
+        "-log of the share of what can be explained that the best proposal leaves",
+    ),
     Feature(
         "left_size",
         -1,

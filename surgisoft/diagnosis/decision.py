@@ -58,6 +58,9 @@ network is said to have learned part of what is missing."""
 LEAST_LEFT = 0.02
 """Share of what can be explained that no proposal is taken to fall below: a fiftieth is within what
 the noise floor is known."""
+FORM_SHARE = 0.02
+"""Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
+changes differ by less are not told apart by how sure the blocks are."""
 MOSTLY_STATIC = 0.8
 """Share of what a black box with memory explains that a static function must explain before the
 network alone is said to be off."""
@@ -158,13 +161,30 @@ def _instead(evidence: Evidence, name: str) -> float:
     return min(getattr(pair[0], name), default=3.0) if pair else 0.0
 
 
-def _apart(effect: EffectEvidence) -> float:
-    """Sine of the angle between the best effect's change and what this effect can imitate of it.
+def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
+    """Log of what an effect leaves over what the best one leaves, over 2, as shares.
+
+    What the form of the right effect gets wrong is added to both.
+    """
+    own, best = (1.0 - min(one.gain, 1.0) + FORM_SHARE for one in (effect, evidence.effects[0]))
+    return _between(0.5 * math.log(own / best), -0.5, 2.0)
+
+
+def _margin(effect: EffectEvidence, evidence: Evidence) -> float:
+    """Margin of the best effect, in units of 3 standard errors.
 
     No real effect has exactly the form of its model, so of two that do nearly the same the data
-    prefer one for what its form gets wrong, however sure the blocks are.
+    prefer one for what its form gets wrong, however sure the blocks are: the margin counts up to
+    the ratio of what the other effect cannot imitate to what the form gets wrong.
     """
-    return math.sqrt(_between(1.0 - effect.collinear, 0.0, 1.0))
+    apart = math.sqrt(_between(1.0 - effect.collinear, 0.0, 1.0) / FORM_SHARE)
+    return _between(min(effect.margin, apart), -3.0, 6.0) / 3.0
+
+
+def _proposed(effect: EffectEvidence, evidence: Evidence) -> float:
+    """What the second of two effects explains, for either of them; 0 for others."""
+    own = any(effect.effect in each.effects for each in evidence.proposals[1:])
+    return own * _between(_last(evidence, "own_gain"), 0.0, 1.0)
 
 
 def _single_lack_of_fit(evidence: Evidence) -> float:
@@ -251,15 +271,15 @@ FIRST = (
     Feature(
         "left",
         -1,
-        lambda x, e: _between(x.left, -0.5, 2.0),
-        "log of what the effect leaves over what the best one leaves",
+        _leaves_more,
+        "log of the share that the effect leaves over the share that the best one leaves",
     ),
     Feature(
         "margin",
         -1,
-        lambda x, e: _between(x.margin, -3.0, 6.0) / 3.0 * _apart(x),
-        "studentised difference of the log gains of the best effect and this one, times the sine "
-        "of the angle between their changes",
+        _margin,
+        "studentised difference of the log gains of the best effect and this one, at most what the "
+        "angle between their changes allows",
     ),
     Feature(
         "gain", +1, lambda x, e: _between(x.gain, 0.0, 1.0), "share that the effect alone explains"
@@ -274,8 +294,8 @@ FIRST = (
     Feature(
         "proposed",
         +1,
-        lambda x, e: float(any(x.effect in each.effects for each in e.proposals[1:])),
-        "whether it is one of the two proposed effects",
+        _proposed,
+        "for one of the two proposed effects what the second explains beside the relaxed first",
     ),
     Feature(
         "lack_of_fit",

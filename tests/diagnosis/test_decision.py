@@ -139,15 +139,17 @@ def test_nothing_is_claimed_near_the_floor_or_near_the_black_box_alone():
 
 
 def test_probabilities_by_hand():
-    """P(creep) = P(missing) P(known) / (1 + exp(-1.4 x 2)): the rival leaves 1.4 more, weight 2."""
+    """The rival leaves 0.52 of what the best one leaves 0.07, so log(0.52 / 0.07) / 2, weight 2."""
     found = probabilities(GOOD, given_odds(1.0, 2.0, network=-1.0, first=(("left", -2.0),)))
 
     def chance(odds):
         return 1.0 / (1.0 + math.exp(-odds))
 
-    first = chance(1.0) * chance(2.0) * chance(2.8)
+    first = chance(1.0) * chance(2.0) * chance(math.log(0.52 / 0.07))
     assert found.effects["creep"] == pytest.approx(first)
-    assert found.effects["line_lag"] == pytest.approx(chance(1.0) * chance(2.0) * chance(-2.8))
+    assert found.effects["line_lag"] == pytest.approx(
+        chance(1.0) * chance(2.0) * chance(-math.log(0.52 / 0.07))
+    )
     assert found.unknown == pytest.approx(chance(1.0) * chance(-2.0) * chance(1.0))
     assert found.nothing == pytest.approx(chance(-1.0) * chance(1.0))
     assert found.network == pytest.approx((1.0 - chance(1.0) * chance(2.0)) * chance(-1.0))
@@ -185,14 +187,24 @@ def test_more_that_is_explained_makes_nothing_less_probable(values, constant, lo
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.floats(0.0, 2.0), st.floats(0.0, 2.0))
-def test_an_effect_that_leaves_more_is_less_probable(a, b):
-    low, high = sorted((a, b))
+@given(st.sampled_from(["gain", "margin", "collinear"]), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_an_effect_is_less_probable_the_less_it_does(name, a, b):
+    """With the weights in force: that explains less, or that the best one beats by more."""
+    worse, better = sorted((a, b), reverse=name == "margin")
     chances = [
-        probabilities(replace(GOOD, effects=(CREEP, replace(LAG, left=left)))).effects["line_lag"]
-        for left in (low, high)
+        probabilities(replace(GOOD, effects=(CREEP, replace(LAG, **{name: value})))).effects
+        for value in (worse, better)
     ]
-    assert chances[1] <= chances[0] + 1e-12
+    assert chances[0]["line_lag"] <= chances[1]["line_lag"] + 1e-12
+
+
+def test_how_sure_the_blocks_are_does_not_tell_two_apart_that_do_the_same():
+    """At an angle of 0.1 the margin counts up to sqrt(0.01 / 0.02) standard errors."""
+    twin = replace(LAG, gain=CREEP.gain, collinear=0.99)
+    place = [feature.name for feature in FEATURES["first"]].index("margin")
+    for margin in (2.0, 20.0):
+        rows = features_of("first", replace(GOOD, effects=(CREEP, replace(twin, margin=margin))))
+        assert rows[1, place] == pytest.approx(math.sqrt(0.5) / 3.0)
 
 
 def test_the_weights_in_force_have_the_signs_of_their_features():

@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.criteria import SEARCH
+from surgisoft.diagnosis.criteria import CLAIM, SEARCH
 from surgisoft.diagnosis.data_quality import data_quality_warnings
 from surgisoft.diagnosis.decision import Decision, Kind, Probabilities, Reason, decide
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
@@ -31,7 +31,7 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
-from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
@@ -164,11 +164,18 @@ class Diagnosis:
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
     """How far the recordings differ from those before the change; None where none were given."""
+    track: ChangeTrack | None = None
+    """Key points before and after and what the named effects explain, for pictures; None without
+    pairs."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        plain = asdict(replace(self, setup=None))
-        return plain | {"setup": self.setup.to_json() if self.setup else None}
+        plain = asdict(replace(self, setup=None, track=None, change=None))
+        del plain["track"]
+        return plain | {
+            "setup": self.setup.to_json() if self.setup else None,
+            "change": self.change.to_json() if self.change else None,
+        }
 
 
 @torch_threads(1)
@@ -215,16 +222,19 @@ def diagnose(
         problem, notes = both.training(), (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
-    result = diagnosis_of(problem, report, without)
+    found, not_testable = findings_of(problem, report, without)
+    result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
-        result = since(result, both.change)
+        result = since(result, both, found)
+    if result.verdict.kind == "unknown_effect":
+        result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
 
 
-def diagnosis_of(
-    problem: Problem, report: Progress = lambda text: None, without: Collection[str] = ()
-) -> Diagnosis:
-    """The diagnosis of an identification problem."""
+def findings_of(
+    problem: Problem, report: Progress, without: Collection[str]
+) -> tuple[Findings, tuple[NotTestable, ...]]:
+    """What model selection finds on an identification problem, and which effects it cannot show."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -232,14 +242,34 @@ def diagnosis_of(
             raise unknown_name("effect", name, names)
     asked = [name for name in names if name not in without]
     tried, not_testable = testable(problem, candidates(problem, asked), asked)
-    result = replace(result_of(find(problem, tried, report)), not_testable=not_testable)
-    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
+    return find(problem, tried, report), not_testable
 
 
-def since(result: Diagnosis, change: Change) -> Diagnosis:
-    """The diagnosis of a change: its sentence says since when, and how large the change is."""
-    text = f"since {' + '.join(change.before)}: {result.verdict.sentence}; {change.sentence}"
-    return replace(result, change=change, verdict=replace(result.verdict, sentence=text))
+def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
+    """The diagnosis of a change: since when, how large it is, and what of it is explained.
+
+    The network's own error is not in a paired difference: what no effect explains there is no
+    network that was fitted too little, but something that has changed.
+    """
+    verdict, change = result.verdict, both.change
+    chances = result.probabilities
+    if both.used and verdict.kind == "surrogate_undertrained" and chances is not None:
+        known = result.statistics is not None and within_repeatability(result.statistics)
+        sure = 1.0 - chances.known
+        kind: Kind = "nothing_missing" if known else "unknown_effect"
+        words = sentence_of(Decision(kind, (), sure, chances), result.error_mm, 0.0)
+        verdict = replace(verdict, kind=kind, sentence=words)
+        result = replace(result, next_command="")
+    text = f"since {both.names}: {verdict.sentence}; {change.sentence}"
+    track = None
+    if both.used:
+        track = both.track(found.problem, found.explained_mm(verdict.effects))
+    return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def within_repeatability(evidence: Evidence) -> bool:
+    """Whether a paired difference is about as large as what BEFORE does not repeat."""
+    return evidence.error_over_validated <= CLAIM.most_over_validated
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

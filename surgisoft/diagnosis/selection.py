@@ -520,6 +520,14 @@ class Selected:
         """The identification problem."""
         return self.selection.problem
 
+    def explained_mm(self, effects: Sequence[str]) -> np.ndarray:
+        """(S, n, 3) what some effects explain of the residual together, mm; 0 for none."""
+        same = [p.chosen for p in self.proposals if set(p.effects) == set(effects)]
+        alone = [score.option.chosen for score in self.first if score.effect in effects[:1]]
+        chosen = next(iter(same + alone), ())
+        amplitudes = self.selection.validation.amplitudes(chosen)
+        return self.selection.sensitivities[..., list(chosen)] @ amplitudes
+
 
 @dataclass(frozen=True, eq=False)
 class Findings(Selected):

@@ -68,10 +68,11 @@ class Worth:
     """An effect that is not missing is named, alone or in a set."""
     right_set: float = 0.8
     """The missing effect is one of two that are named as a set."""
-    half_pair: float = -1.0
-    """One of two effects that are named together is missing, the other not."""
-    first_of_pair: float = 0.8
-    """One effect is named, and another one is missing too."""
+    half_pair: float = 0.0
+    """One of two effects that are named together is missing, the other not: what is right of it and
+    what is wrong cancel, since `amend` shows that the other one does nothing."""
+    first_of_pair: float = 0.5
+    """One effect is named, alone or in a set, and another one is missing too."""
     wrong_unknown: float = -1.0
     """An effect of the list, or none, is called unknown: no model is changed for it."""
     wrong_nothing: float = -2.0

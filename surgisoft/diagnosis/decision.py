@@ -136,9 +136,9 @@ def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
     return math.sqrt(_between(gain, 0.0, 1.0) * _between(log_gain, 0.0, 1.0))
 
 
-def _least_lack_of_fit(evidence: Evidence) -> float:
+def _most_lack_of_fit(evidence: Evidence) -> float:
     some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in evidence.proposals]
-    return min(some, default=0.0)
+    return max(some, default=0.0)
 
 
 def _exact_left(evidence: Evidence) -> float:
@@ -251,8 +251,8 @@ KNOWN = (
     Feature(
         "lack_of_fit",
         -1,
-        _least_lack_of_fit,
-        "what relaxed forms of the proposal explain besides (root of gain x log gain)",
+        _most_lack_of_fit,
+        "what relaxed forms of a proposal explain besides (root of gain x log gain)",
     ),
     Feature(
         "exact_left",
@@ -583,15 +583,15 @@ def decide(
     names = list(chances.effects)
     known, pair = chances.known, chances.pair
     tried: list[tuple[float, Kind, tuple[str, ...], float]] = []
+    both = pair / known if known and names[0] in chances.two else 0.0
+    whole = 1.0 - both * (1.0 - worth.first_of_pair)
     if names:
         first = chances.effects[names[0]]
-        both = pair / known if names[0] in chances.two and known else 0.0
-        right = 1.0 - both * (1.0 - worth.first_of_pair)
-        value = first * right + (1.0 - first) * worth.wrong_name
+        value = first * whole + (1.0 - first) * worth.wrong_name
         tried.append((value, "identified", (names[0],), first))
     if len(names) > 1:
         either = chances.effects[names[0]] + chances.effects[names[1]]
-        value = either * worth.right_set + (1.0 - either) * worth.wrong_name
+        value = either * whole * worth.right_set + (1.0 - either) * worth.wrong_name
         tried.append((value, "ambiguous", (names[0], names[1]), either))
     if chances.two:
         half = max(known - pair, 0.0)

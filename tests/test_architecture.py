@@ -55,7 +55,7 @@ FLOORS = {
         ("cross_validation",),
         ("black_box", "candidates"),
         ("estimation",),
-        ("selection",),
+        ("selection", "refit"),
         ("decision",),
         ("design",),
         ("diagnose",),

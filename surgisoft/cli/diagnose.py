@@ -9,10 +9,12 @@ from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
+    REFIT_PROCESSES,
     EffectFiles,
     JsonFile,
     Model,
     Recordings,
+    Refit,
     Report,
     with_effect_files,
 )
@@ -42,6 +44,7 @@ def diagnose(
             help="Effects to exclude, because the setup rules them out, such as contact.",
         ),
     ] = None,
+    refit: Refit = "auto",
     effect_files: EffectFiles = None,
 ) -> None:
     """Diagnose a model: name the physical effect that it lacks, or report why none can be named.
@@ -61,7 +64,14 @@ def diagnose(
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(
-            arm, measured, lambda text: tell(next(stages), 5, text), before, without or ()
+            arm,
+            measured,
+            lambda text: tell(next(stages), 5, text),
+            before,
+            without or (),
+            refit=refit,
+            refit_progress=tell,
+            processes=REFIT_PROCESSES,
         )
     warn_all(found.notes)
     written = []
@@ -84,6 +94,8 @@ def diagnose(
     elif found.verdict.kind in ("identified", "several"):
         effects = " ".join(found.verdict.effects)
         command = f"surgisoft amend {model} --effect {effects} --data {data} -o NEW"
+        if found.refit is not None and found.refit.winner is not None:
+            command += " --refit always"
         print(f"next: {with_effect_files(command)}")
 
 
@@ -104,8 +116,26 @@ def _show(found) -> None:
             f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "
             f"{100 * row.gain_unique:6.1f}% {row.heldout_rmse_mm:10.4f} [{low:.4f}, {high:.4f}] mm"
         )
+    if found.refit is not None:
+        _show_refit(found.refit)
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
         print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, tells {pairs}")
     print(f"{found.seconds:.1f} s")
+
+
+def _show_refit(refit) -> None:
+    """Print the candidates that were fitted together with the network."""
+    print(f"fitted together with the network, because {refit.reason}:")
+    print(f"{'effect':18s} {'left of the network alone':>28s} {'difference, 95 %':>28s} {'p':>7s}")
+    for row in refit.candidates:
+        low, high = row.ci95_mm
+        note = "" if row.plausible else "  implausible parameters"
+        print(
+            f"{row.effect:18s} {row.heldout_rmse_mm:10.4f} of {row.rival_mm:8.4f} mm "
+            f"{row.difference_mm:12.4f} [{low:.4f}, {high:.4f}] mm {row.p_value:7.4f}{note}"
+        )
+    rates = [name for name, why in refit.not_tried if why.startswith("steady-state")]
+    if rates:
+        print(f"not tried, because steady-state samples cannot show them: {', '.join(rates)}")

@@ -1,6 +1,6 @@
 """`diagnose`: which physical effect is the model missing?
 
-System identification of a grey-box model in five steps:
+System identification of a grey-box model in six steps:
 
 1. Residual table: the model's residuals on the training rows, thinned, in blocks (`residuals`).
 2. Sensitivities: what each effect, with each choice of its nonlinear parameters, would change in
@@ -8,7 +8,9 @@ System identification of a grey-box model in five steps:
 3. Model selection: held-out errors of every effect, the model discrepancy always beside it; effects
    are named one by one while they are beyond chance and large enough (`selection`).
 4. Decision: what the evidence amounts to, and how sure that is (`decision`).
-5. Experiment design, where effects cannot be told apart (`design`).
+5. Refit: where the error is large and no larger than the validated one, candidates are fitted
+   together with the network, and held-out data decide (`refit`).
+6. Experiment design, where effects cannot be told apart (`design`).
 """
 
 import time
@@ -18,7 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.data_quality import data_quality_warnings
-from surgisoft.diagnosis.decision import Evidence, Kind, decide, evidence_of
+from surgisoft.diagnosis.decision import Evidence, Kind, decide, evidence_of, unnamed
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
@@ -28,6 +30,8 @@ from surgisoft.diagnosis.inputs import (
     identification_problem,
     open_inputs,
 )
+from surgisoft.diagnosis.refit import Refit, refit_reason
+from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.selection import (
     Findings,
@@ -38,6 +42,8 @@ from surgisoft.diagnosis.selection import (
 )
 from surgisoft.errors import unknown_name
 from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress as RefitProgress
+from surgisoft.progress import silent
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -120,10 +126,13 @@ class Diagnosis:
     """Time that it took, s."""
     statistics: Evidence | None = None
     """The numbers that the decision was made from."""
+    refit: Refit | None = None
+    """What candidates did that were fitted together with the network; None where none was."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        return asdict(self)
+        together = None if self.refit is None else self.refit.to_json()
+        return asdict(replace(self, refit=None)) | {"refit": together}
 
 
 @torch_threads(1)
@@ -133,6 +142,9 @@ def diagnose(
     progress: Progress | None = None,
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     without: Collection[str] = (),
+    refit: str = "auto",
+    refit_progress: RefitProgress = silent,
+    processes: int = 1,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
@@ -141,13 +153,17 @@ def diagnose(
     Only the training rows are looked at: the view of the residual table that is worked on holds no
     other key points. reference: recordings from before a change in question; without them the
     residuals that the model keeps of its fit. without: effects that cannot act, such as a contact
-    on a bench without anything to touch.
+    on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates together
+    with the network (`surgisoft.diagnosis.refit`); refit_progress: called while that goes on;
+    processes: how many trainings then run at once, with the same result. More than one starts new
+    Python processes, so a script has to guard its start by `if __name__ == "__main__"`.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
     model, recordings, notes = open_inputs(model, recordings)
     report("predicting")
     problem = identification_problem(model, recordings, reference)
+    reason = refit_reason(problem, refit)
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -155,6 +171,14 @@ def diagnose(
             raise unknown_name("effect", name, names)
     tried = candidates(problem, [name for name in names if name not in without])
     result = result_of(find(problem, tried, report))
+    if reason:
+        result = with_refit(
+            result,
+            fit_candidates_together(
+                problem, reason, without, progress=refit_progress, processes=processes
+            ),
+            problem,
+        )
     if result.verdict.kind == "unknown_effect":
         result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
@@ -167,6 +191,51 @@ def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
         return result
     text = f"{result.verdict.sentence}; it depends most on {axis.axis} ({100 * axis.share:.0f} %)"
     return replace(result, axis=axis.axis, verdict=replace(result.verdict, sentence=text))
+
+
+def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
+    """The diagnosis in which the refit decides about the effects that it tried.
+
+    A winner is named, alone or with what competes with it. Without one, effects that the residuals
+    name are not named any more if all of them were tried: the network alone does as well.
+    """
+    error = f"error {result.error_mm.before:.3g} mm, floor {result.error_mm.floor:.3g} mm"
+    verdict, ranking, plan, checks = result.verdict, result.ranking, None, result.checks
+    tried = {candidate.effect for candidate in joint.candidates}
+    if joint.winner is not None:
+        sure = joint.confidence
+        kind: Kind = "ambiguous" if joint.ambiguous else "identified"
+        effects = joint.names if joint.ambiguous else (joint.winner,)
+        head = f"cannot tell {' from '.join(effects)} with these recordings"
+        if kind == "identified":
+            head = f"{joint.winner} is missing (confidence {sure:.2f})"
+        verdict = Verdict(kind, effects, f"{head}: {joint.sentence}; {error}")
+        order = sorted(ranking, key=lambda row: row.effect not in joint.names)
+        order.sort(key=lambda row: row.effect != joint.winner)
+        most = min(sure, 1.0 - sure)
+        ranking = tuple(
+            replace(row, confidence=round(sure if place == 0 else min(row.confidence, most), 4))
+            for place, row in enumerate(order)
+        )
+        if kind == "ambiguous":
+            plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+    else:
+        checks = (*checks, joint.sentence)
+        if verdict.effects and tried.issuperset(verdict.effects) and result.statistics is not None:
+            without = unnamed(result.statistics)
+            left = result.error_mm.before
+            sentence = sentence_of(without, (), result.error_mm, left, 0.0, None)
+            verdict = Verdict(without, (), sentence)
+            ranking = tuple(replace(row, confidence=0.0) for row in ranking)
+    return replace(
+        result,
+        verdict=verdict,
+        ranking=ranking,
+        ambiguous_with=joint.competing if joint.winner is not None else (),
+        next_experiment=plan,
+        checks=checks,
+        refit=joint,
+    )
 
 
 def result_of(found: Findings) -> Diagnosis:

@@ -110,7 +110,7 @@ def hidden_effect(
     effects: Annotated[
         str, typer.Option(help="Effects that the model lacks, with commas; one study each.")
     ] = "creep,line_lag,payload,hysteresis",
-    specimen: Annotated[int, typer.Option(min=0, help="Seed of the robot.")] = 0,
+    robot_seed: Annotated[int, typer.Option(min=0, help="Seed of the robot.")] = 0,
     strength: Annotated[float, typer.Option(help="Amplitude of the hidden effects.")] = 1.0,
     steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 2_000_000,
     episodes: Annotated[int, typer.Option(min=2, help="Episodes of each policy.")] = 10,
@@ -133,12 +133,12 @@ def hidden_effect(
 
     check_folder(work)
     check_folder(images)
-    config = StudyConfig(specimen, strength, steps, seed, episodes)
+    config = StudyConfig(robot_seed, strength, steps, seed, episodes)
     torch.set_num_threads(1)
     with progress("hidden-effect") as report:
         outcomes = run(effects.split(","), config, work, report)
     command = (
-        f"surgisoft benchmark hidden-effect --effects {effects} --specimen {specimen} "
+        f"surgisoft benchmark hidden-effect --effects {effects} --robot-seed {robot_seed} "
         f"--strength {strength:g} --steps {steps} --episodes {episodes} --seed {seed}"
     )
     shown = ""

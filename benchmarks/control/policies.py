@@ -78,9 +78,9 @@ def cost(run: RunFolder) -> Cost:
     return Cost(last["steps"], last["wall_s"], last["cpu_s"])
 
 
-def played(
+def evaluated(
     task: str,
-    driver: str,
+    policy: str,
     episodes: int,
     seed: int,
     rig: RigConfig | None = None,
@@ -89,7 +89,7 @@ def played(
 ) -> dict[str, dict]:
     """Evaluation of a policy: name with unit -> fields of `Summary`; contact is checked by FCL.
 
-    driver: `scripted`, `random` or a run's folder. rig: None for simulation.
+    policy: `scripted`, `random` or a run's folder. rig: None for simulation.
     """
     config = config_of(task)
     if arm is not None:
@@ -97,8 +97,8 @@ def played(
     place = make_task(task, config)
     if rig is not None:
         place = on_rig(place, rig)
-    opened = open_policy(driver, place)
-    found = evaluate(place, driver, opened, episodes, seed, progress=noted(report, "rollout"))
+    opened = open_policy(policy, place)
+    found = evaluate(place, policy, opened, episodes, seed, progress=noted(report, "rollout"))
     return found.to_json()["overall"]
 
 

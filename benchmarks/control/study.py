@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.cache import Cache
-from benchmarks.control.policies import Cost, cost, plan_of, played, trained
+from benchmarks.control.policies import Cost, cost, evaluated, plan_of, trained
 from benchmarks.control.two_processes import trained_by_two
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import PAPER_STEPS
@@ -75,14 +75,14 @@ class Trained:
 
 
 @dataclass(frozen=True)
-class Played:
+class Evaluated:
     """Evaluation of one policy on one task and plant."""
 
     task: str
     """Name of the task."""
     place: str
     """`simulation` or `rig`."""
-    driver: str
+    policy: str
     """`learned, seed N`, `scripted` or `random`."""
     numbers: dict[str, dict]
     """name with unit -> fields of `Summary`."""
@@ -94,7 +94,7 @@ class Results:
 
     runs: tuple[Trained, ...]
     """All training runs."""
-    played: tuple[Played, ...]
+    evaluated: tuple[Evaluated, ...]
     """Evaluations of all policies on all plants."""
     paper: Cost | None
     """The run that measures the rate of preset `paper`."""
@@ -110,24 +110,24 @@ def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
     alone = 25 * bool(config.rate_steps) + 100 * bool(whole)
     meter = Stages(report, 100 * len(learned) + alone + 5 * (plays + 2 * bool(whole)))
     folder.mkdir(parents=True, exist_ok=True)
-    drivers, runs, both = [], [], None
+    policies, runs, both = [], [], None
     if whole:
         place = folder / f"{RATE_TASK}-{whole}-steps"
         both = trained_by_two(place, RATE_TASK, whole, meter.stage(100, f"train {place.name}"))
-        drivers.append((RATE_TASK, f"learned, {whole:,} steps", str(place)))
+        policies.append((RATE_TASK, f"learned, {whole:,} steps", str(place)))
     for task, seed in learned:
         place = folder / f"{task}-seed-{seed}"
         one = _learned(place, task, seed, meter.stage(100, f"train {place.name}"))
         runs.append(one)
-        drivers.append((task, f"learned, seed {one.seed}", str(place)))
+        policies.append((task, f"learned, seed {one.seed}", str(place)))
     paper = _paper(config, folder, meter) if config.rate_steps else None
-    drivers += [(task, name, name) for task in config.tasks for name in ("scripted", "random")]
+    policies += [(task, name, name) for task in config.tasks for name in ("scripted", "random")]
     kept, shown = Cache(folder / "results"), []
     for where in PLACES:
-        for task, name, driver in drivers:
+        for task, name, policy in policies:
             tell = meter.stage(5, f"{task}: {name}, {where}")
             shown.append(
-                Played(task, where, name, _played(config, kept, task, where, driver, tell))
+                Evaluated(task, where, name, _evaluated(config, kept, task, where, policy, tell))
             )
     return Results(tuple(runs), tuple(shown), paper, cost(both) if both else None)
 
@@ -149,22 +149,24 @@ def _paper(config: ControlConfig, folder: Path, meter: Stages) -> Cost:
     return cost(trained(place, plan, meter.stage(25, "rate of preset paper")))
 
 
-def _played(config: ControlConfig, kept: Cache, task: str, where: str, driver: str, tell) -> dict:
+def _evaluated(
+    config: ControlConfig, kept: Cache, task: str, where: str, policy: str, report: Progress
+) -> dict:
     """Evaluation of one policy, from the cache where it is there."""
     rig = RigConfig() if where == "rig" else None
     count = config.episodes if rig is None else config.rig_episodes
     about = {
         "task": task,
         "config": to_table(config_of(task)),
-        "driver": driver,
+        "policy": policy,
         "rig": rig and to_table(rig),
         "episodes": count,
         "seed": config.episode_seed,
     }
-    if driver not in ("scripted", "random"):
-        content = RunFolder(driver).checkpoint(BEST).read_bytes()
-        about["driver"] = hashlib.sha256(content).hexdigest()
+    if policy not in ("scripted", "random"):
+        content = RunFolder(policy).checkpoint(BEST).read_bytes()
+        about["policy"] = hashlib.sha256(content).hexdigest()
     name = f"{task}-{where}"
     return kept.values(
-        name, about, lambda: played(task, driver, count, config.episode_seed, rig, report=tell)
+        name, about, lambda: evaluated(task, policy, count, config.episode_seed, rig, report=report)
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.control.study import PLACES, RATE_TASK, ControlConfig, Played, Results
+from benchmarks.control.study import PLACES, RATE_TASK, ControlConfig, Evaluated, Results
 from benchmarks.control.two_processes import arguments
 from surgisoft.agents.evaluate import RATES
 from surgisoft.agents.presets import PAPER_STEPS, steps_for
@@ -72,7 +72,7 @@ def markdown(results: Results, config: ControlConfig) -> str:
     for place in PLACES:
         parts.append(f"## {'In simulation' if place == 'simulation' else 'On the virtual rig'}")
         for task in config.tasks:
-            some = [p for p in results.played if (p.task, p.place) == (task, place)]
+            some = [p for p in results.evaluated if (p.task, p.place) == (task, place)]
             parts += [f"### {task}", _numbers(some)]
     return "\n\n".join(parts) + "\n"
 
@@ -80,10 +80,10 @@ def markdown(results: Results, config: ControlConfig) -> str:
 def _setting(config: ControlConfig) -> str:
     return (
         f"{config.episodes} episodes in simulation and {config.rig_episodes} on the rig for each "
-        f"driver, seed {config.episode_seed}, which no training saw. Mean over the episodes with "
-        "its 95 % interval; in a scene FCL is the referee. The rig is specimen 0, on which the "
+        f"policy, seed {config.episode_seed}, which no training saw. Mean over the episodes with "
+        "its 95 % interval; in a scene FCL checks for contact. The rig is robot 0, on which the "
         "default arm was fitted; policies and scripts have never seen its pumps and cameras. The "
-        "scripted solvers know the true state in simulation, and what is measured on the rig."
+        "scripted experts know the true state in simulation, and what is measured on the rig."
     )
 
 
@@ -94,12 +94,12 @@ def _goals(results: Results) -> str:
         "|---|---|---|---|---|---|",
     ]
     for goal in GOALS:
-        some = [p for p in results.played if (p.task, p.place) == (goal.task, goal.place)]
+        some = [p for p in results.evaluated if (p.task, p.place) == (goal.task, goal.place)]
         if not some:
             continue
-        seeds = [_met(p, goal) for p in some if p.driver.startswith("learned, seed")]
+        seeds = [_met(p, goal) for p in some if p.policy.startswith("learned, seed")]
         script, chance = (
-            ", ".join(_met(p, goal) for p in some if p.driver == name)
+            ", ".join(_met(p, goal) for p in some if p.policy == name)
             for name in ("scripted", "random")
         )
         sign = ">=" if goal.at_least else "<="
@@ -110,9 +110,9 @@ def _goals(results: Results) -> str:
     return "\n".join(lines) + "\n\nBold: reached."
 
 
-def _met(played: Played, goal: Goal) -> str:
+def _met(evaluated: Evaluated, goal: Goal) -> str:
     """A number, bold where it reaches the goal."""
-    value = (played.numbers.get(goal.number) or {}).get("mean")
+    value = (evaluated.numbers.get(goal.number) or {}).get("mean")
     if value is None:
         return "-"
     text = f"{value:.1%}" if goal.number in RATES else f"{value:.3g}"
@@ -179,11 +179,11 @@ def _paper(results: Results, config: ControlConfig) -> str:
     return text
 
 
-def _numbers(some: list[Played]) -> str:
+def _numbers(some: list[Evaluated]) -> str:
     """All measures of one task on one plant, one column per policy."""
     names = [n for n in NUMBERS if any(_applies(p.numbers.get(n)) for p in some)]
     lines = [
-        "| | " + " | ".join(p.driver for p in some) + " |",
+        "| | " + " | ".join(p.policy for p in some) + " |",
         "|---|" + "---|" * len(some),
     ]
     for name in names:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from benchmarks.cache import Cache, model_digest
-from benchmarks.control.policies import cost, plan_of, played, trained
+from benchmarks.control.policies import cost, evaluated, plan_of, trained
 from surgisoft.agents.on_rig import RigConfig
 from surgisoft.config import to_table
 from surgisoft.progress import Stages
@@ -26,7 +26,7 @@ class PolicyEvaluation:
 
     kept: Cache
     """Folder of policies and results."""
-    specimen: int
+    robot_seed: int
     """Seed of the virtual robot."""
     hidden: tuple[tuple[str, float], ...]
     """Hidden effects of the rig and their amplitudes."""
@@ -51,22 +51,22 @@ class PolicyEvaluation:
         run = trained(self.kept.place(f"policies/{TASK}", inputs), plan, tell)
         found = {}
         for sight in SIGHTS:
-            rig = RigConfig(self.specimen, self.hidden, cameras=sight == "cameras")
+            rig = RigConfig(self.robot_seed, self.hidden, cameras=sight == "cameras")
             for name in names:
-                driver = str(run.path) if name == "learned" else name
+                policy = str(run.path) if name == "learned" else name
                 tell = meter.stage(PLAY, f"{title}: {name} on the rig, {sight}")
-                found[f"{name}/{sight}"] = self._played(
-                    f"{title.split(',')[0]}-{name}", driver, inputs, arm, rig, tell
+                found[f"{name}/{sight}"] = self._evaluated(
+                    f"{title.split(',')[0]}-{name}", policy, inputs, arm, rig, tell
                 )
         return found, asdict(cost(run))
 
-    def _played(
-        self, name: str, driver: str, inputs: dict, arm: Path, rig: RigConfig, tell
+    def _evaluated(
+        self, name: str, policy: str, inputs: dict, arm: Path, rig: RigConfig, tell
     ) -> dict:
         """Summary of the mean error of each episode on the rig, mm."""
         about = {
             "plan": inputs,
-            "learned": driver not in ("scripted", "random"),
+            "learned": policy not in ("scripted", "random"),
             "rig": to_table(rig),
             "episodes": self.episodes,
             "seed": self.seed,
@@ -74,7 +74,9 @@ class PolicyEvaluation:
         return self.kept.values(
             f"driven/{name}",
             about,
-            lambda: played(TASK, driver, self.episodes, self.seed, rig, arm, tell)["error_mean_mm"],
+            lambda: evaluated(TASK, policy, self.episodes, self.seed, rig, arm, tell)[
+                "error_mean_mm"
+            ],
         )
 
 

@@ -54,7 +54,7 @@ class Bench:
 
     kept: Cache
     """Folder of the recordings."""
-    specimen: int
+    robot_seed: int
     """Seed of the robot."""
     hidden: tuple[tuple[str, float], ...]
     """Hidden effects and their amplitudes."""
@@ -65,17 +65,17 @@ class Bench:
     def about(self) -> dict:
         """Inputs that determine a result on this rig, for the cache."""
         hidden = [list(pair) for pair in self.hidden]
-        return {"specimen": self.specimen, "hidden": hidden, "samples": self.samples}
+        return {"robot_seed": self.robot_seed, "hidden": hidden, "samples": self.samples}
 
     def mixed(self, take: int, report: Progress = _silent) -> Recording:
         """A recording of the `mixed` protocol; another trial has another schedule and noise."""
-        limits = VirtualRig(self.specimen).limits
+        limits = VirtualRig(self.robot_seed).limits
         protocol = make_protocol("mixed", limits, self.samples, seed=take)
         return self.record(protocol, take, report=report)
 
     def circles(self, take: int, report: Progress = _silent) -> Recording:
         """A recording of slow circles of the tip, at the pace of the tracking tasks."""
-        limits = VirtualRig(self.specimen).limits
+        limits = VirtualRig(self.robot_seed).limits
         return self.record(circles(self.samples, limits, take), take, report=report)
 
     def record(
@@ -88,7 +88,7 @@ class Bench:
         if not file.is_file():
             change = SETUPS[setting]
             rig = VirtualRig(
-                self.specimen,
+                self.robot_seed,
                 gravity=tuple(-x for x in MOUNT) if change.flipped else MOUNT,
                 roll_deg=change.roll_deg,
                 payload_g=change.payload_g,

@@ -32,7 +32,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.fit import FitConfig, fit
 
-DEFAULT_SPECIMEN = 0
+DEFAULT_ROBOT = 0
 """Seed of the robot that the default arm model was fitted to."""
 ORACLE_TAKES = 3
 """Number of recordings for the oracle; the diagnosis has one."""
@@ -72,7 +72,7 @@ start."""
 class StudyConfig:
     """Size of the study."""
 
-    specimen: int = DEFAULT_SPECIMEN
+    robot_seed: int = DEFAULT_ROBOT
     """Seed of the robot."""
     strength: float = 1.0
     """Amplitude of the hidden effects; 1 moves the tip by about 1 mm."""
@@ -117,7 +117,7 @@ class Outcome:
     paced: dict | None
     """Where policies got worse: the results of amending on circles at the task's pace instead."""
     driven: dict[str, dict]
-    """MODEL/DRIVER/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
+    """MODEL/POLICY/SIGHT -> fields of `Summary` of the episodes' mean errors, mm."""
     training: dict[str, dict]
     """MODEL -> `Cost` of its policy."""
 
@@ -133,7 +133,7 @@ class Study:
         case, config = CASES[name], self.config
         hidden = ((case.effect, config.strength),) if case.hidden else ()
         before = self.base(case.hidden, meter.stage(15, f"{name}: base model"))
-        bench = Bench(self.kept, config.specimen, hidden, config.samples)
+        bench = Bench(self.kept, config.robot_seed, hidden, config.samples)
         tell = meter.stage(15, f"{name}: recording and diagnosis")
         seen = bench.mixed(TAKE, tell)
         found = self._diagnosed(name, before, bench, seen)
@@ -146,13 +146,13 @@ class Study:
         rates = self.kept.values(
             f"rates/{name}", about, lambda: by_rate(models, bench.mixed(JUDGING_TAKE))
         )
-        drivers = PolicyEvaluation(
-            self.kept, config.specimen, hidden, config.steps, config.seed, config.episodes
+        policies = PolicyEvaluation(
+            self.kept, config.robot_seed, hidden, config.steps, config.seed, config.episodes
         )
-        driven, training = self._driven(name, models, drivers, meter)
+        driven, training = self._driven(name, models, policies, meter)
         paced = None
         if worse(driven):
-            paced = self._paced(name, before, found["effects"], bench, drivers, meter)
+            paced = self._paced(name, before, found["effects"], bench, policies, meter)
         return Outcome(
             case=name,
             verdicts=tuple(found["verdicts"]),
@@ -170,14 +170,14 @@ class Study:
     def base(self, memory: bool, report: Progress) -> Path:
         """A model of the robot without hidden effects: with hysteresis, or from pressure alone."""
         config = self.config
-        about = {"specimen": config.specimen, "memory": memory, "points": config.grid_points}
+        about = {"robot_seed": config.robot_seed, "memory": memory, "points": config.grid_points}
         name = "models/base" if memory else "models/pressure-only"
-        if memory and config.specimen == DEFAULT_SPECIMEN:
+        if memory and config.robot_seed == DEFAULT_ROBOT:
             return self._model("models/default", {}, lambda: (default_arm(), None))
 
         def make():
-            rig = VirtualRig(config.specimen)
-            seed, wanted = config.specimen, {"grid": config.grid_points, "validation": None}
+            rig = VirtualRig(config.robot_seed)
+            seed, wanted = config.robot_seed, {"grid": config.grid_points, "validation": None}
             train, valid = (
                 rig.record(make_protocol(key, rig.limits, points, seed=seed))[0]
                 for key, points in wanted.items()
@@ -286,17 +286,19 @@ class Study:
 
         return self.kept.values(f"errors/{name}", about, make)
 
-    def _driven(self, name: str, models: dict[str, Path], drivers: PolicyEvaluation, meter: Stages):
-        """MODEL/DRIVER/SIGHT -> summary, MODEL -> cost of its policy."""
+    def _driven(
+        self, name: str, models: dict[str, Path], policies: PolicyEvaluation, meter: Stages
+    ):
+        """MODEL/POLICY/SIGHT -> summary, MODEL -> cost of its policy."""
         driven, training = {}, {}
         for key, arm in models.items():
             names = ("learned", "scripted", "random") if key == "before" else LASTING
-            found, training[key] = drivers.on_model(f"{name}, model {key}", arm, meter, names)
+            found, training[key] = policies.on_model(f"{name}, model {key}", arm, meter, names)
             driven |= {f"{key}/{which}": summary for which, summary in found.items()}
         return driven, training
 
     def _paced(
-        self, name: str, before: Path, effects, bench: Bench, drivers: PolicyEvaluation, meter
+        self, name: str, before: Path, effects, bench: Bench, policies: PolicyEvaluation, meter
     ):
         """Results of amending by the same effects on circles at the task's pace, where needed."""
         about = {"model": model_digest(before), "effects": effects, **bench.about, "paced": True}
@@ -315,7 +317,7 @@ class Study:
 
         amended = self.kept.values(f"amendments/{name}-paced", about, make)
         beside = Stages(lambda done, total, note: meter.stage(0, note), 1.0)
-        found, _ = drivers.on_model(f"{name}, model paced", folder, beside, LASTING)
+        found, _ = policies.on_model(f"{name}, model paced", folder, beside, LASTING)
         return {
             "claim": amended["sentence"],
             "parameters": amended["parameters"],

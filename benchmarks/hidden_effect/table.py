@@ -27,11 +27,11 @@ WORDS = {
 
 def markdown(outcomes: list[Outcome], config: StudyConfig) -> str:
     """All tables as Markdown."""
-    parts = [_setting(outcomes, config), "## The model", _models(outcomes), *_said(outcomes)]
+    parts = [_setting(outcomes, config), "## The model", _models(outcomes), *_verdicts(outcomes)]
     parts.append("## The policy")
     for sight in SIGHTS:
         parts += [f"On the rig, {WORDS[sight]}.", _driven(outcomes, sight)]
-    parts += ["### What retraining brought", "\n".join(_brought(outcomes)), *_why(outcomes)]
+    parts += ["### Effect of retraining", "\n".join(_brought(outcomes)), *_why(outcomes)]
     parts.append(_costs(outcomes))
     return "\n\n".join(parts) + "\n"
 
@@ -43,17 +43,17 @@ def _setting(outcomes: list[Outcome], config: StudyConfig) -> str:
     own = " hysteresis: the friction that the arm has anyway; the model without it is HAW-NN on "
     own += "pressure alone, its oracle HAW-NN fitted with the effect on the same settled points."
     return (
-        f"Specimen {config.specimen} of the virtual rig."
+        f"Robot {config.robot_seed} of the virtual rig."
         + (hidden if names else "")
         + (own if any(not CASES[o.case].hidden for o in outcomes) else "")
         + f" Diagnosed and amended on one `mixed` recording of {config.samples / 1200:g} minutes; "
         "`after` is amended by what the diagnosis named first, whether that is right or not. "
-        "The oracle was told the effect's name and has three such recordings. All models are "
-        "judged on another `mixed` recording. "
+        "The oracle is given the effect's name and has three such recordings. All models are "
+        "evaluated on another `mixed` recording. "
         f"Policies: `{TASK}`, preset `fast`, {config.steps:,} steps each, seed {config.seed}; "
-        f"{config.episodes} episodes of each driver on the rig. The circle lies where the driver's "
-        "own model has the tip at 20 kPa, so each model has its own. One specimen, one seed: "
-        "differences of a few hundredths of a millimetre between policies are not told apart."
+        f"{config.episodes} episodes of each policy on the rig. The circle lies where the policy's "
+        "own model has the tip at 20 kPa, so each model has its own. One robot, one seed: "
+        "differences of a few hundredths of a millimetre between policies are not distinguished."
     )
 
 
@@ -74,29 +74,33 @@ def _models(outcomes: list[Outcome]) -> str:
             + " | ".join(f"{e[key]:.3f}" for key in (*MODELS, "floor"))
             + f" | {fall['fall']:.3f} ({low:.3f} to {high:.3f}) | {100 * share:.0f} % |"
         )
-    lines += ["", "RMS distance of a key point in mm, on a recording that took no part."]
+    lines += [
+        "",
+        "RMS distance of a key point in mm, on a recording not used for the fit.",
+    ]
     return "\n".join(lines)
 
 
-def _verdict(said: dict) -> str:
-    verdict = said["verdict"]
-    sure = said["ranking"][0]["confidence"] if said["ranking"] else 0.0
+def _verdict(result: dict) -> str:
+    verdict = result["verdict"]
+    sure = result["ranking"][0]["confidence"] if result["ranking"] else 0.0
     names = ", ".join(verdict["effects"])
     return f"{verdict['kind']}: {names} ({sure:.2f})" if names else verdict["kind"]
 
 
-def _said(outcomes: list[Outcome]) -> list[str]:
+def _verdicts(outcomes: list[Outcome]) -> list[str]:
     """Verdict on each effect, in words."""
     paragraphs = []
     for o in outcomes:
         lines = [f"**{o.case}**"]
-        lines += [f"- diagnose: {said['verdict']['sentence']}" for said in o.verdicts[:1]]
+        lines += [f"- diagnose: {result['verdict']['sentence']}" for result in o.verdicts[:1]]
         if o.experiment:
             plan = o.experiment
             pairs = ", ".join(" from ".join(pair) for pair in plan["separates"]) or "no pair surely"
             lines.append(
-                f"- next experiment: {plan['name']}, {plan['minutes']:g} minutes, expected to tell "
-                f"{pairs}; played on the rig"
+                f"- next experiment: {plan['name']}, {plan['minutes']:g} minutes, expected to "
+                f"distinguish "
+                f"{pairs}; recorded on the rig"
             )
             lines.append(f"- diagnose with it: {o.verdicts[-1]['verdict']['sentence']}")
             if o.verdicts[-1]["verdict"]["kind"] == "ambiguous":
@@ -120,8 +124,8 @@ def _driven(outcomes: list[Outcome], sight: str) -> str:
     ]
     for o in outcomes:
         cells = [
-            _interval(o.driven[f"{key}/{driver}/{sight}"])
-            for driver in ("learned", "scripted")
+            _interval(o.driven[f"{key}/{policy}/{sight}"])
+            for policy in ("learned", "scripted")
             for key in MODELS
         ]
         cells.append(f"{o.driven[f'before/random/{sight}']['mean']:.1f}")
@@ -162,7 +166,7 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             continue
         lines = [
             f"**Why {o.case} gets worse.** By how much the arm trails the model (negative: the "
-            "model trails the arm), and the model's error, on the judging recording:",
+            "model trails the arm), and the model's error, on the test recording:",
             "",
             "| fastest chamber, kPa/s | rows | " + " | ".join(f"{key}" for key in MODELS) + " |",
             "|---|---|" + "---|" * len(MODELS),
@@ -178,10 +182,10 @@ def _why(outcomes: list[Outcome]) -> list[str]:
             paragraphs.append(FORMS[o.case])
         found = o.paced["driven"]
         cells = [
-            f"{driver} {_interval(found[f'{driver}/{sight}'])} mm {word}"
+            f"{policy} {_interval(found[f'{policy}/{sight}'])} mm {word}"
             for sight, word in (("blind", "without cameras"), ("cameras", "with them"))
-            for driver in ("learned", "scripted")
-            if f"{driver}/{sight}" in found
+            for policy in ("learned", "scripted")
+            if f"{policy}/{sight}" in found
         ]
         values = ", ".join(
             f"{p['name']} {values_text(p['value'])} {p['unit']}".strip()
@@ -189,7 +193,7 @@ def _why(outcomes: list[Outcome]) -> list[str]:
         )
         paragraphs.append(
             "**Amended at the task's own pace.** The same effect, fitted to as long a recording of "
-            f"slow circles instead: {o.paced['claim']} ({values}). On the mixed judging recording, "
+            f"slow circles instead: {o.paced['claim']} ({values}). On the mixed test recording, "
             f"which is quicker, this model is off by {o.paced['mixed_mm']:.3f} mm. Policy trained "
             f"on it and script, on the rig: {'; '.join(cells)}."
         )

@@ -17,6 +17,7 @@ from surgisoft.agents.rollout import BATCH, Instant, Rollout, rollout
 from surgisoft.files import json_safe
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.world.scene import SceneEngine
 
 RESAMPLES = 2000
 """Bootstrap resamples of an interval."""
@@ -150,8 +151,9 @@ def episode_table(
 
 def _in_view(task: Task, result: Rollout) -> Tensor:
     """(N,) share of the steps at which the endoscope sees as much as the scene requires."""
-    seen = result.measures["view_fraction"]
-    enough = (seen >= task.world.scene.spec.limits.view_fraction).float()
+    seen, scene = result.measures["view_fraction"], task.world.scene
+    assert isinstance(scene, SceneEngine), "only a whole scene has a view"
+    enough = (seen >= scene.spec.limits.view_fraction).float()
     return enough.where(seen.isfinite(), seen).nanmean(1)
 
 
@@ -179,4 +181,4 @@ def bootstrap(values: np.ndarray) -> tuple[float, float]:
 
 def _contact(check: EpisodeCheck) -> dict | None:
     found = check.contact
-    return found and {"time_s": found.time_s, "between": list(found.between)}
+    return None if found is None else {"time_s": found.time_s, "between": list(found.between)}

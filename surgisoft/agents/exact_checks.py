@@ -7,6 +7,7 @@ batched geometry finds the least clearance.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass, field
 
@@ -14,10 +15,11 @@ import numpy as np
 import torch
 
 from surgisoft.agents.rollout import Instant
+from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.tasks.base import Task, TaskState
-from surgisoft.tasks.world.scene import LASER
+from surgisoft.tasks.world.scene import LASER, SceneEngine
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are computed."""
@@ -74,9 +76,13 @@ class ExactChecks:
     def __init__(self, task: Task):
         """task: a task whose world has obstacles, see `has_obstacles`."""
         around = task.world.scene
+        if around is None:
+            raise InputError(
+                f"task {task.name}: its world is empty, expected bodies to check against"
+            )
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.checker = CollisionChecker(around.geometry.bodies)
-        self.beam_mm = around.beam_mm if LASER in task.world.arms else None
+        self.beam_mm = around.beam_mm if isinstance(around, SceneEngine) else math.nan
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
 
     def __call__(self, now: Instant) -> None:
@@ -101,6 +107,7 @@ class ExactChecks:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         notes.steps += 1
         clearance = world.scene.clearance
+        assert clearance is not None, "a world with bodies has a clearance"
         notes.contact_differs += bool(found) != bool(clearance.collides[row])
         notes.closest.append((float(clearance.least_mm[row]), step, arms))
         notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
@@ -110,6 +117,7 @@ class ExactChecks:
     def _look_along(self, notes: _Notes, state: TaskState, row: int, arms) -> None:
         """Compare the beam's exact end with that of the batched geometry."""
         beam, hit = state.world.arms[LASER], state.world.scene.hit
+        assert hit is not None, "a world with a laser has the beam's hit"
         origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
         exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=LASER)
         if int(exact.struck) != int(hit.struck[row]):

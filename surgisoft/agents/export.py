@@ -78,7 +78,7 @@ def _onnx(actor: ScaledActor, width: int, file: Path) -> Path:
     _check(
         actor,
         width,
-        lambda seen: torch.from_numpy(session.run(None, {"observation": seen.numpy()})[0]),
+        lambda seen: torch.from_numpy(next(iter(session.run(None, {"observation": seen.numpy()})))),
         file,
     )
     return file

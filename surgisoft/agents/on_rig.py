@@ -25,7 +25,7 @@ from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig, VirtualRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.arm import Arm, ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -202,8 +202,9 @@ class RigArm:
             sample, truth = rig.read_beside_truth()
             rows.append((sample.measured, sample.key_points_mm, truth.noise_free_mm[0]))
         columns = (np.stack(column) for column in zip(*rows, strict=True))
-        row = {"dtype": torch.float32, "device": self.device}
-        reading = Reading(*(torch.tensor(column, **row) for column in columns))
+        reading = Reading(
+            *(torch.tensor(each, dtype=torch.float32, device=self.device) for each in columns)
+        )
         model, points = self.simulated.bent(part, reading.pressure, self.period_s)
         plant = replace(part.plant, target_kPa=target)
         part = replace(part, arm=model, points_mm=points, pressure=reading.pressure, plant=plant)
@@ -239,6 +240,11 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtua
     config = config or RigConfig()
     world, moved = copy.copy(task.world), copy.copy(task)
     dt_s = world.config.dt_s
-    world.arms = {name: RigArm(arm, config, dt_s, build) for name, arm in world.arms.items()}
+    arms: dict[str, Arm] = {}
+    for name, arm in world.arms.items():
+        if not isinstance(arm, ModelArm):
+            raise InputError(f"arm '{name}' is on a rig already, expected a simulated arm")
+        arms[name] = RigArm(arm, config, dt_s, build)
+    world.arms = arms
     moved.world = world
     return moved

@@ -84,7 +84,8 @@ def error_chart(log: EpisodeLog) -> Picture | None:
 
 def progress_chart(log: EpisodeLog) -> Picture | None:
     """Share of the ring that is cut and seen, over time, with the beam's times shaded."""
-    if log.beam is None or "completion" not in log.measures:
+    seen = log.view_fraction
+    if log.beam is None or seen is None or "completion" not in log.measures:
         return None
     with drawing():
         figure, axis = plt.subplots()
@@ -92,7 +93,7 @@ def progress_chart(log: EpisodeLog) -> Picture | None:
             log.time_s, 0, 1.05, where=log.beam.on, color=GREEN, alpha=0.15, lw=0, label="beam on"
         )
         axis.plot(log.time_s, log.measures["completion"], c=BLUE, label="cut")
-        axis.plot(log.time_s, log.view_fraction, c=AMBER, lw=1.0, label="in sight")
+        axis.plot(log.time_s, seen, c=AMBER, lw=1.0, label="in sight")
         axis.axhline(log.limits["view_fraction"], c=MUTED, lw=0.8, ls="--")
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_ylim(0.0, 1.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -96,6 +97,10 @@ def _extreme(values: Tensor, of: Callable, empty: float) -> Tensor:
     return found.where(known.any(1), found.new_tensor(torch.nan))
 
 
+def _report_from(progress: Progress, before: int, total: int, steps: int) -> None:
+    progress(before + steps, total)
+
+
 def rollout(
     task: Task,
     policy: Policy,
@@ -123,7 +128,7 @@ def rollout(
                 seed,
                 first + done,
                 count,
-                lambda k, n=before: progress(n + k, total),
+                partial(_report_from, progress, before, total),
                 watch,
             )
         )
@@ -212,7 +217,7 @@ class EpisodeRecorders:
     ):
         """policy, seed, on: what the logs state about their origin; only: one episode's number."""
         self.task, self.only = task, only
-        self._about = {"driver": policy, "seed": seed, "on": on}
+        self.policy, self.seed, self.on = policy, seed, on
         self._recorders: dict[int, EpisodeRecorder] = {}
 
     def __call__(self, now: Instant) -> None:
@@ -220,9 +225,15 @@ class EpisodeRecorders:
         live = now.live if self.only is None else now.live & (now.episodes == self.only)
         for row in live.nonzero()[:, 0].tolist():
             number = int(now.episodes[row])
-            if now.outcome is None:
+            if now.outcome is None or now.actions is None:
                 self._recorders[number] = EpisodeRecorder(
-                    self.task, now.state, row, episode=number, **self._about
+                    self.task,
+                    now.state,
+                    row,
+                    driver=self.policy,
+                    seed=self.seed,
+                    on=self.on,
+                    episode=number,
                 )
             else:
                 self._recorders[number].step(now.state, now.outcome, now.actions, row)

@@ -145,7 +145,7 @@ class RunFolder:
     def plan(self) -> Plan:
         """The plan of the run; its world is built from the parts in the folder."""
         c = self.config
-        parameters = {
+        parameters: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value
             for key, value in c["hyper_parameters"].items()
         }

@@ -136,7 +136,12 @@ class Training:
         Worlds and random numbers are those of every process, in the order of their ranks.
         """
         parts: list[Tensor] = []
-        tree_map(lambda value: parts.append(value.detach().cpu().clone()) or value, self.env.state)
+
+        def kept(value: Tensor) -> Tensor:
+            parts.append(value.detach().cpu().clone())
+            return value
+
+        tree_map(kept, self.env.state)
         device, random = self.task.world.device, {"cpu": torch.get_rng_state()}
         if device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(device)

@@ -9,9 +9,24 @@ import torch
 from torch import Tensor
 
 from surgisoft.experiments.task import Condition, ExperimentTask, Row
+from surgisoft.scene.camera import View
+from surgisoft.scene.capsules import BatchClearance
 from surgisoft.scene.folder import Scene
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.world.scene import SceneEngine
+
+
+def _view(state: TaskState) -> View:
+    view = state.world.scene.view
+    assert view is not None, "a circle ablation has an endoscope"
+    return view
+
+
+def _clearance(state: TaskState) -> BatchClearance:
+    clearance = state.world.scene.clearance
+    assert clearance is not None, "a circle ablation has bodies"
+    return clearance
 
 
 class AblationSupervision:
@@ -22,15 +37,15 @@ class AblationSupervision:
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the endoscope sees as much of the ring as the scene requires."""
-        return state.world.scene.view.fraction >= self.task.spec.limits.view_fraction
+        return _view(state).fraction >= self.task.spec.limits.view_fraction
 
     def clearance_mm(self, state: TaskState) -> Tensor:
         """(B,) mm: least clearance to bodies and between arms."""
-        return state.world.scene.clearance.least_mm
+        return _clearance(state).least_mm
 
     def collides(self, state: TaskState) -> Tensor:
         """(B,) bool: an arm touches a body, the other arm or itself."""
-        return state.world.scene.clearance.collides
+        return _clearance(state).collides
 
     def fires(self, state: TaskState) -> Tensor:
         """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
@@ -50,7 +65,7 @@ class AblationSupervision:
 
 
 def _centred(task: CircleAblation, state: TaskState, within: float) -> Tensor:
-    view = state.world.scene.view
+    view = _view(state)
     return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
 
 
@@ -59,7 +74,10 @@ def _aimed(task: CircleAblation, state: TaskState, within: float) -> Tensor:
 
 
 def _cut(task: CircleAblation, state: TaskState, within: float) -> Tensor:
-    return task.scene.ablation.report(state.world.scene.dose).completion >= within
+    dose = state.world.scene.dose
+    assert dose is not None, "a circle ablation has a dose map"
+    assert isinstance(task.scene, SceneEngine), "a circle ablation takes place in a scene"
+    return task.scene.ablation.report(dose).completion >= within
 
 
 def _retracted(task: CircleAblation, state: TaskState, within: float) -> Tensor:

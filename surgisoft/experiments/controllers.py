@@ -84,7 +84,8 @@ class PhaseControllers:
 
     def __init__(self, spec: Experiment, task: PhasedTask, policy: str):
         """policy: acts in phases whose controller is `policy`; a training run must fit the task."""
-        self.policy: Policy = Nominal() if policy == NOMINAL else open_policy(policy, task.base)
+        self.policy: Nominal | Policy
+        self.policy = Nominal() if policy == NOMINAL else open_policy(policy, task.base)
         self.scripted = open_policy("scripted", task)
         self.defined: dict[tuple[str, str], Controller] = {}
         for agent in task.agents:

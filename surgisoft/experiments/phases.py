@@ -52,12 +52,8 @@ class PhasedTask:
     def __init__(self, supervision: Supervision, spec: Experiment):
         self.supervision, self.experiment = supervision, spec
         base = self.base = supervision.task
-        self.name, self.agents, self.world, self.config = (
-            base.name,
-            base.agents,
-            base.world,
-            base.config,
-        )
+        self.name, self.agents, self.world = base.name, base.agents, base.world
+        self.config: Any = getattr(base, "config", None)
         dt_s, limits, device = base.world.config.dt_s, spec.limits, base.world.device
         self.dt_s, self.steps = dt_s, round(limits.time_s / dt_s)
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
@@ -129,11 +125,11 @@ class PhasedTask:
         """Phases and limits after a step that led to `after`, a state of the underlying task."""
         supervision = self.supervision
         holds = torch.zeros_like(after.world.failed)
-        for number, phase in enumerate(self.phases):
+        for number, spec in enumerate(self.phases):
             here = old.phase == number
             if here.any():
-                known = EXPERIMENT_TASK.conditions[phase.until]
-                within = known.within if phase.within < 0.0 else phase.within
+                known = EXPERIMENT_TASK.conditions[spec.until]
+                within = known.within if spec.within < 0.0 else spec.within
                 holds = holds | (here & known.holds(self.base, after, within))
         since, held = old.since + 1, (old.held + 1) * holds
         lost = (old.lost + 1) * (self.beam[old.phase] & ~supervision.in_sight(after))

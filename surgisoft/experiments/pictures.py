@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.agents.report_charts import episode_charts
+from surgisoft.errors import InputError
 from surgisoft.experiments.results import Results
 from surgisoft.files import write_atomically
 from surgisoft.report import Picture
@@ -24,10 +25,12 @@ def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
 
     from surgisoft.replay.endoscope import jpegs
 
+    if log.camera is None:
+        raise InputError("the episode has no endoscope, so it has no pictures")
     on = np.flatnonzero(log.beam.on) if log.beam is not None else np.array([], int)
     ends = (int(on[0]), int(on[-1])) if len(on) > 1 else (0, log.rows - 1)
     rows = np.unique(np.append(np.linspace(*ends, count - 1).astype(int), log.rows - 1))
-    frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, rows)]
+    frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, log.camera, rows)]
     side = frames[0].width
     strip = Image.new("RGB", (len(frames) * (side + GAP_PX) - GAP_PX, side), "white")
     for place, frame in enumerate(frames):

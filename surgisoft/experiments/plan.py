@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.config import Where, merged, to_table
@@ -176,7 +177,9 @@ def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     config = dataclasses.replace(config, arm=arm, scene=spec.scene)
     base = EXPERIMENT_TASK.build(config, scene_of(spec, setting))
     rig = rig_config(setting, Where(Path(spec.name)))
-    varied = {f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")}
+    varied: dict[str, Any] = {
+        f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")
+    }
     faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
     spec = dataclasses.replace(spec, faults=faults)
     return PhasedTask(EXPERIMENT_TASK.supervise(base if rig is None else on_rig(base, rig)), spec)

@@ -12,10 +12,9 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from surgisoft.scene.folder import Scene
 from surgisoft.tasks.base import Task, TaskState
 
-Row = dict[str, float | int | str | None]
+Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""
 
 
@@ -74,9 +73,9 @@ class ExperimentTask:
     """Class of its configuration."""
     conditions: Mapping[str, Condition]
     """Every condition by the name that phases use."""
-    build: Callable[[Any, Scene], Task]
+    build: Callable[..., Task]
     """Builds the task of a configuration in a scene that is already open."""
-    supervise: Callable[[Any], Supervision]
+    supervise: Callable[..., Supervision]
     """Lays supervision over a built task."""
     numbers: Mapping[str, str]
     """Numbers of an episode in the report's main table -> their titles, in order."""

@@ -53,7 +53,8 @@ def series_colour(number: int) -> tuple[int, int, int]:
 
 def paler(colour: tuple[int, int, int], share: float = 0.5) -> tuple[int, int, int]:
     """The colour mixed with the plot's dark background."""
-    return tuple(round(share * part + (1.0 - share) * 40) for part in colour)
+    red, green, blue = (round(share * part + (1.0 - share) * 40) for part in colour)
+    return red, green, blue
 
 
 def tissue_colours(heat: np.ndarray, base: np.ndarray | tuple[int, int, int]) -> np.ndarray:

@@ -19,7 +19,7 @@ from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.render import Renderer
-from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.log import CameraLog, EpisodeLog
 from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 
 CAMERA = "/endoscope/camera"
@@ -44,12 +44,13 @@ SAMPLE_MM = 0.4
 def log_camera(
     columns: Columns,
     log: EpisodeLog,
+    camera: CameraLog,
     rows: np.ndarray,
     looks: np.ndarray,
     report: Progress = silent,
 ) -> None:
     """Log the camera's pose in the log's `rows`, and its picture in rows `looks`."""
-    arm, half = log.arms[ENDOSCOPE], 0.5 * log.camera.fov_rad
+    arm, half = log.arms[ENDOSCOPE], 0.5 * camera.fov_rad
     pinhole = rr.Pinhole(
         resolution=[PIXELS, PIXELS],
         focal_length=0.5 * PIXELS / math.tan(half),
@@ -65,20 +66,22 @@ def log_camera(
             translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
         )
         columns.send(entity, rows, moving)
-    pictures = jpegs(log, looks, report)
+    pictures = jpegs(log, camera, looks, report)
     style = rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="linear")
     columns.recording.log(f"{CAMERA}/picture", style, static=True)
     shown = rr.EncodedImage.columns(blob=pictures)
     columns.send(f"{CAMERA}/picture", looks, shown)
 
 
-def jpegs(log: EpisodeLog, rows: np.ndarray, report: Progress = silent) -> list[bytes]:
+def jpegs(
+    log: EpisodeLog, camera: CameraLog, rows: np.ndarray, report: Progress = silent
+) -> list[bytes]:
     """The endoscope's round picture in each of the log's `rows`, as JPEG files."""
     from PIL import Image
 
     bodies = [Body(b.name, b.role, Mesh(b.vertices_mm, b.faces)) for b in log.bodies]
-    camera = Camera(log.camera.fov_rad, tuple(log.camera.range_mm))
-    renderer = Renderer(bodies, camera, PIXELS, PIXELS)
+    low, high = camera.range_mm
+    renderer = Renderer(bodies, Camera(camera.fov_rad, (low, high)), PIXELS, PIXELS)
     paint, files = _Paint(log), []
     poses = frames.pose_from_z(
         log.arms[ENDOSCOPE].line_mm[:, -1].astype(float), log.arms[ENDOSCOPE].tip_direction

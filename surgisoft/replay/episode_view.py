@@ -29,10 +29,10 @@ from surgisoft.replay.endoscope import CAMERA, PICTURES_HZ, log_camera
 from surgisoft.replay.plots import Plot, plots_of
 from surgisoft.replay.recording import STEP, TIME, Columns, new_recording
 from surgisoft.replay.shapes import creased
-from surgisoft.replay.surfaces import dosed_surface
+from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
-from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.episodes.log import BeamLog, DoseLog, EpisodeLog
 from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
 
 SCENE = "Scene"
@@ -78,7 +78,8 @@ def _view_names(part: rrb.Container | rrb.View) -> Iterator[str]:
 
 def _cells(plots: tuple[Plot, ...]) -> list:
     """One view for each plot; the plots of a group become tabs."""
-    cells, groups = [], {}
+    cells: list[rrb.TimeSeriesView | list[rrb.TimeSeriesView]] = []
+    groups: dict[str, list[rrb.TimeSeriesView]] = {}
     for plot in plots:
         legend = rrb.PlotLegend(visible=False)
         if plot.legend:
@@ -139,9 +140,9 @@ def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
     alone = len(log.arms) == 1
     lines = [arm.line_mm for arm in log.arms.values()]
     lines = [line[:, 0 if alone else line.shape[1] // 3 :] for line in lines]
-    points = [line[np.isfinite(line).all((1, 2))].reshape(-1, 3) for line in lines]
+    bodies = [line[np.isfinite(line).all((1, 2))].reshape(-1, 3) for line in lines]
     work = log.path_mm if len(log.path_mm) else log.target_mm
-    points = np.concatenate((*points, work[np.isfinite(work).all(1)]))
+    points = np.concatenate((*bodies, work[np.isfinite(work).all(1)]))
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     towards, above, distance = np.array([0.3, -1.0, 0.0]), 1.0, 1.2
@@ -223,9 +224,9 @@ def write_replay(
             log_arm(columns, name, arm, moments)
         _log_paths(columns, log, moments)
         if log.beam is not None:
-            _log_beam(columns, log, moments)
+            _log_beam(columns, log, log.beam, moments)
         if log.camera is not None and ENDOSCOPE in log.arms:
-            log_camera(columns, log, moments, finite_rows(log, pictures_hz), report)
+            log_camera(columns, log, log.camera, moments, finite_rows(log, pictures_hz), report)
         for line in (line for plot in plots for line in plot.lines):
             columns.plot(line)
         _log_events(recording, log)
@@ -251,7 +252,7 @@ def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
         if log.dose is not None and log.dose.body == body.name:
             surface = dosed_surface(mesh, log.dose)
             kept[surface.replaced] = False
-            _log_dosed(columns, log, surface, f"{entity}/dose", ROLE_COLOURS[body.role])
+            _log_dosed(columns, log, log.dose, surface, f"{entity}/dose", ROLE_COLOURS[body.role])
         vertices, faces, normals = creased(mesh)
         plain = rr.Mesh3D(
             vertex_positions=vertices,
@@ -262,7 +263,9 @@ def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
         columns.recording.log(entity, plain, static=True)
 
 
-def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) -> None:
+def _log_dosed(
+    columns: Columns, log: EpisodeLog, dose: DoseLog, surface: DosedSurface, entity: str, base
+) -> None:
     still = rr.Mesh3D(
         vertex_positions=surface.vertices_mm,
         triangle_indices=surface.faces,
@@ -270,12 +273,12 @@ def _log_dosed(columns: Columns, log: EpisodeLog, surface, entity: str, base) ->
     )
     columns.recording.log(entity, still, static=True)
     moments = np.union1d(finite_rows(log, DOSE_HZ), [0])
-    before = np.searchsorted(log.dose.rows, moments, side="right")
+    before = np.searchsorted(dose.rows, moments, side="right")
     rows = moments[np.diff(before, prepend=-1) > 0]
     tint = LESION_TINT * surface.inside[:, None]
     untouched = (1.0 - tint) * np.array(base) + tint * np.array(LESION_COLOUR)
     colours = [
-        tissue_colours(surface.heat(log.dose.at(int(row)), log.dose.threshold_j_per_mm2), untouched)
+        tissue_colours(surface.heat(dose.at(int(row)), dose.threshold_j_per_mm2), untouched)
         for row in rows
     ]
     count = len(surface.vertices_mm)
@@ -296,8 +299,8 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
     pieces = np.stack((log.actual_mm[ends - 1], log.actual_mm[ends]), axis=1)
     if len(ends):
-        style = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
-        columns.recording.log(TRAIL, style, static=True)
+        line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
+        columns.recording.log(TRAIL, line, static=True)
         columns.send(TRAIL, ends, rr.LineStrips3D.columns(strips=list(pieces)))
     count = log.targets_mm.shape[1]
     style = rr.Points3D.from_fields(colors=PLAN_COLOUR, radii=0.55)
@@ -329,10 +332,10 @@ def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: flo
     columns.send("/path/target_body", rows, strips.partition([count] * len(rows)))
 
 
-def _log_beam(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
+def _log_beam(columns: Columns, log: EpisodeLog, beam: BeamLog, rows: np.ndarray) -> None:
     """Log the beam from the tip to its end: thick while the laser is on, thin while it aims."""
-    ends = np.stack((log.arms[LASER].line_mm[:, -1], log.beam.end_mm), axis=1)[rows]
-    on = log.beam.on[rows]
+    ends = np.stack((log.arms[LASER].line_mm[:, -1], beam.end_mm), axis=1)[rows]
+    on = beam.on[rows]
     strips = rr.LineStrips3D.columns(
         strips=list(ends),
         radii=np.where(on, 0.4, 0.08),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -24,6 +25,10 @@ SHOWN_ELSEWHERE = (
     "beam_unsafe",
 )
 """Measures that events or another plot show; from `phase` on those of experiments."""
+
+
+Corner = Literal["lefttop", "leftbottom", "righttop", "rightbottom"]
+"""A corner of a plot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +55,7 @@ class Plot:
     """What it shows, with the unit."""
     lines: tuple[Line, ...]
     """Its lines."""
-    legend: str | None = None
+    legend: Corner | None = None
     """Corner of the legend; None: no legend."""
     group: str = ""
     """Plots of one group share a place in the layout, as tabs."""
@@ -81,7 +86,7 @@ def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:
     return tuple(made)
 
 
-def _corner(series: Mapping[str, np.ndarray], corner: str) -> str | None:
+def _corner(series: Mapping[str, np.ndarray], corner: Corner) -> Corner | None:
     """The corner of the legend if there is more than one line, else None."""
     return corner if len(series) > 1 else None
 
@@ -106,6 +111,8 @@ def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
 
 def _clearance(log: EpisodeLog) -> tuple[Line, ...]:
     where = "/plots/clearance"
+    if log.clearance_mm is None:
+        return ()
     held = Line(f"{where}/clearance_mm", "clearance_mm", log.clearance_mm, series_colour(0))
     if not log.limits:
         return (held,)

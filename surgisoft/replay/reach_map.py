@@ -7,7 +7,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
-from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
+from surgisoft.scene.check import REASONS, Patch, SceneCheck, Work, sentence
 from surgisoft.scene.folder import Scene
 
 REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
@@ -22,13 +22,16 @@ def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) 
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: suffix '{path.suffix}', expected .png")
+    work = verdict.work
+    if work is None:
+        raise InputError("the ring does not lie on the organ, so there is no map to draw")
     figure = Figure(figsize=(12.0, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
-    _draw_patch(figure, left, scene, verdict, patch)
+    _draw_patch(figure, left, scene, work, patch)
     rows = right.get_subplotspec().subgridspec(3, 1)
     right.remove()
-    _draw_ring([figure.add_subplot(row) for row in rows], scene, verdict)
+    _draw_ring([figure.add_subplot(row) for row in rows], scene, work)
     figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
@@ -36,7 +39,7 @@ def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) 
     write_atomically(path, buffer.getvalue())
 
 
-def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -> None:
+def _draw_patch(figure, axes, scene: Scene, work: Work, patch: Patch) -> None:
     from matplotlib.tri import Triangulation
 
     triangles = Triangulation(*patch.flat_mm.T)
@@ -55,8 +58,8 @@ def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -
         axes.scatter(*bad.T, s=26, marker="s", color=REASON_COLOURS[code], label=REASONS[code])
     closed = np.vstack((patch.ring_flat_mm, patch.ring_flat_mm[:1]))
     axes.plot(*closed.T, color="white", lw=3.5)
-    for code in np.unique(verdict.work.reason):
-        here = verdict.work.reason == code
+    for code in np.unique(work.reason):
+        here = work.reason == code
         axes.scatter(
             *patch.ring_flat_mm[here].T,
             s=14,
@@ -68,19 +71,19 @@ def _draw_patch(figure, axes, scene: Scene, verdict: SceneCheck, patch: Patch) -
     axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
 
 
-def _draw_ring(axes, scene: Scene, verdict: SceneCheck) -> None:
+def _draw_ring(axes, scene: Scene, work: Work) -> None:
     """Clearance, incidence and length of the beam over the angle around the ring."""
-    angle = 360.0 * np.arange(len(verdict.work.reason)) / len(verdict.work.reason)
+    angle = 360.0 * np.arange(len(work.reason)) / len(work.reason)
     limits, laser = scene.spec.limits, scene.spec.laser
-    cut = verdict.work.cut
+    cut = work.cut
     rows = (
-        ("clearance (mm)", verdict.work.clearance_mm, (limits.clearance_mm,)),
+        ("clearance (mm)", work.clearance_mm, (limits.clearance_mm,)),
         ("incidence (deg)", np.degrees(cut.incidence_rad), (laser.max_incidence_deg,)),
         ("beam length (mm)", cut.standoff_mm, laser.standoff_mm),
     )
     for one, (label, values, bounds) in zip(axes, rows, strict=True):
         one.plot(angle, values, color="#333333", lw=1.2)
-        colours = [REASON_COLOURS[code] for code in verdict.work.reason]
+        colours = [REASON_COLOURS[code] for code in work.reason]
         one.scatter(angle, values, s=9, c=colours, zorder=3)
         for bound in bounds:
             one.axhline(bound, color="#c1121f", lw=0.9, ls="--")

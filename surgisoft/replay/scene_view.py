@@ -123,11 +123,12 @@ def _log_lesion(recording, scene: Scene) -> None:
         circle_on(mesh, ring.centre_mm, int(face[0]), share * lesion.diameter_mm)
         for share in np.linspace(0.15, 0.85, 6)
     ]
-    if any(circle is None for circle in circles):
+    whole = [circle for circle in circles if circle is not None]
+    if len(whole) < len(circles):
         return
-    lifted = [circle.points_mm + LIFT_MM * circle.normals for circle in circles]
+    lifted = [circle.points_mm + LIFT_MM * circle.normals for circle in whole]
     vertices, faces = polar_patch(lifted, ring.centre_mm + LIFT_MM * ring.normal)
-    normals = np.vstack((ring.normal[None], *(circle.normals for circle in circles)))
+    normals = np.vstack((ring.normal[None], *(circle.normals for circle in whole)))
     recording.log(
         "/lesion/tissue",
         rr.Mesh3D(

@@ -57,18 +57,18 @@ def dosed_surface(mesh: Mesh, dose: DoseLog, edge_mm: float = EDGE_MM) -> DosedS
     parts = np.where(
         _near(pieces, tree, edge_mm), np.ceil(_longest(pieces) / edge_mm).astype(int), 1
     )
-    vertices, faces, count = [], [], 0
+    vertices, triples, count = [], [], 0
     for n in np.unique(parts):
         weights, triangles = _grid(int(n))
         made = np.einsum("wc,qcsx->qwsx", weights, pieces[parts == n])
         vertices.append(made.reshape(-1, 2, 3))
         first = count + len(weights) * np.arange(len(made))
-        faces.append((first[:, None, None] + triangles).reshape(-1, 3))
+        triples.append((first[:, None, None] + triangles).reshape(-1, 3))
         count += made.shape[0] * made.shape[1]
     points, normals = np.moveaxis(np.concatenate(vertices), 1, 0)
     _, samples = tree.query(points, NEIGHBOURS, distance_upper_bound=NEAR_MM)
     inside = np.append(dose.zone == LESION, False)[samples[:, 0]]
-    faces = np.concatenate(faces)
+    faces = np.concatenate(triples)
     return DosedSurface(points, faces, frames.normalise(normals), replaced, samples, inside)
 
 

@@ -4,8 +4,8 @@ import pytest
 
 from benchmarks.control import study as control
 from benchmarks.control import two_processes
-from benchmarks.control.policies import Cost, cost, plan_of, played, trained
-from benchmarks.control.study import ControlConfig, Played, Results, Trained, run
+from benchmarks.control.policies import Cost, cost, evaluated, plan_of, trained
+from benchmarks.control.study import ControlConfig, Evaluated, Results, Trained, run
 from benchmarks.control.table import markdown
 from benchmarks.control.two_processes import trained_by_two
 from surgisoft.errors import InputError
@@ -30,11 +30,11 @@ def test_a_run_that_is_there_is_taken_as_it_is(folder, monkeypatch):
     first = run(TINY, folder, nothing)
     assert first.runs[0].cost.steps == 12288
     assert (folder / "track_circle-seed-4" / "checkpoints" / "best.pt").read_bytes() == weights
-    shown = {(p.place, p.driver): p.numbers["error_mean_mm"]["mean"] for p in first.played}
+    shown = {(p.place, p.policy): p.numbers["error_mean_mm"]["mean"] for p in first.evaluated}
     assert len(shown) == 6
     assert shown["simulation", "scripted"] < 0.1 < shown["simulation", "learned, seed 4"]
     assert shown["rig", "scripted"] < 0.5 < shown["rig", "random"]
-    monkeypatch.setattr(control, "played", lambda *_: pytest.fail("played again"))
+    monkeypatch.setattr(control, "evaluated", lambda *_: pytest.fail("evaluated again"))
     assert run(TINY, folder, nothing) == first
 
 
@@ -55,7 +55,7 @@ def test_another_plan_is_not_taken_for_the_wanted_one(folder):
 
 def test_every_task_has_numbers_and_those_with_bodies_a_referee():
     """A task whose bodies meet no beam, and one with nothing around."""
-    keyhole, circle = (played(name, "scripted", 1, 0) for name in ("keyhole", "track_circle"))
+    keyhole, circle = (evaluated(name, "scripted", 1, 0) for name in ("keyhole", "track_circle"))
     assert keyhole["collided"]["mean"] == 0.0
     assert 0.0 < keyhole["clearance_mm"]["mean"] < 20.0
     assert "collided" not in circle
@@ -67,20 +67,20 @@ def test_cost_is_that_of_the_last_turn(folder):
     assert Cost(6000, 10.0, 3.0).steps_per_s == 2000.0
 
 
-def _played(task, place, driver, **means):
+def _evaluated(task, place, policy, **means):
     numbers = {name: {"mean": v, "low": v, "high": v} for name, v in means.items()}
-    return Played(task, place, driver, numbers)
+    return Evaluated(task, place, policy, numbers)
 
 
 def test_goals_are_bold_where_they_are_reached_and_only_there():
     shown = (
-        _played("track_circle", "simulation", "learned, seed 1", error_mean_mm=0.005),
-        _played("track_circle", "simulation", "learned, seed 2", error_mean_mm=0.0051),
-        _played("track_circle", "simulation", "scripted", error_mean_mm=0.001),
-        _played("track_circle", "simulation", "random", error_mean_mm=30.0),
-        _played("circle_ablation", "simulation", "learned, seed 1", success=0.98, collided=0.0),
-        _played("circle_ablation", "simulation", "scripted", success=1.0, collided=0.01),
-        _played("circle_ablation", "simulation", "random", success=0.0, collided=1.0),
+        _evaluated("track_circle", "simulation", "learned, seed 1", error_mean_mm=0.005),
+        _evaluated("track_circle", "simulation", "learned, seed 2", error_mean_mm=0.0051),
+        _evaluated("track_circle", "simulation", "scripted", error_mean_mm=0.001),
+        _evaluated("track_circle", "simulation", "random", error_mean_mm=30.0),
+        _evaluated("circle_ablation", "simulation", "learned, seed 1", success=0.98, collided=0.0),
+        _evaluated("circle_ablation", "simulation", "scripted", success=1.0, collided=0.01),
+        _evaluated("circle_ablation", "simulation", "random", success=0.0, collided=1.0),
     )
     one = Trained("track_circle", 1, "fast", Cost(4_000_000, 400.0, 200.0), {"error_mm": 0.005})
     whole = Cost(20_000_000, 240.0, 230.0)

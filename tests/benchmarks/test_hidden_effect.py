@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks.cache import Cache, digest, model_digest
-from benchmarks.hidden_effect import policies as hidden_effect_drivers
+from benchmarks.hidden_effect import policies as hidden_effect_policies
 from benchmarks.hidden_effect import study as hidden_effect
 from benchmarks.hidden_effect.rates import trails_s
 from benchmarks.hidden_effect.rigs import Bench, circles
@@ -90,7 +90,7 @@ def payload(tmp_path_factory):
     """The outcome of a payload with policies that hardly learned anything, and its folder."""
     folder = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hidden_effect_drivers, "SIGHTS", ("blind",))
+        patch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
         patch.setattr(hidden_effect, "ORACLE_TAKES", 1)
         yield run(["payload"], SMALL, folder, nothing)[0], folder
 
@@ -118,11 +118,11 @@ def test_the_script_tracks_the_hidden_payload_better_with_the_amended_model(payl
 
 def test_a_study_that_was_done_is_not_done_again(payload, monkeypatch):
     outcome, folder = payload
-    monkeypatch.setattr(hidden_effect_drivers, "SIGHTS", ("blind",))
+    monkeypatch.setattr(hidden_effect_policies, "SIGHTS", ("blind",))
     monkeypatch.setattr(hidden_effect, "ORACLE_TAKES", 1)
     for name in ("diagnose", "amend", "fit", "fall_of"):
         monkeypatch.setattr(hidden_effect, name, lambda *_, name=name: pytest.fail(name))
-    monkeypatch.setattr(hidden_effect_drivers, "played", lambda *_: pytest.fail("played"))
+    monkeypatch.setattr(hidden_effect_policies, "evaluated", lambda *_: pytest.fail("evaluated"))
     assert run(["payload"], SMALL, folder, nothing) == [outcome]
 
 
@@ -159,9 +159,9 @@ def _outcome(name: str, after: float, kind: str = "identified") -> Outcome:
     """A made-up outcome: the policy before is at 1.0 +- 0.1 mm."""
     policy = {"before": 1.0, "after": after, "oracle": 0.2}
     driven = {
-        f"{key}/{driver}/{sight}": _summary(value, 0.1)
+        f"{key}/{policy}/{sight}": _summary(value, 0.1)
         for key, value in policy.items()
-        for driver in ("learned", "scripted", "random")
+        for policy in ("learned", "scripted", "random")
         for sight in ("blind", "cameras")
     }
     verdict = {"kind": kind, "effects": [name], "sentence": f"{name} is missing"}

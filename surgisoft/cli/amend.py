@@ -10,11 +10,13 @@ from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended,
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
+    REFIT_PROCESSES,
     EffectFiles,
     Force,
     JsonFile,
     Model,
     NewModel,
+    Refit,
     Report,
     with_effect_files,
 )
@@ -56,6 +58,7 @@ def amend(
             "effects if that lowers the error on held-out data.",
         ),
     ] = False,
+    refit: Refit = "auto",
 ) -> None:
     """Amend a model: add a physical effect and validate it on held-out data.
 
@@ -78,7 +81,14 @@ def amend(
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
-            arm, measured, names, not keep_network, lambda text: tell(next(stages), 4, text)
+            arm,
+            measured,
+            names,
+            not keep_network,
+            lambda text: tell(next(stages), 4, text),
+            refit=refit,
+            refit_progress=tell,
+            processes=REFIT_PROCESSES,
         )
     warn_all(result.notes)
     saved = result.claimed or anyway
@@ -100,6 +110,8 @@ def amend(
     show_parameters(result.parameters)
     if result.retuned:
         print("the network's last layer was fitted again, which lowers the error on held-out data")
+    if result.refit is not None:
+        print(f"{result.refit.sentence}, with parts of the training data left out")
     for path in written:
         print(f"wrote {path}")
     print(result.sentence)

@@ -234,6 +234,12 @@ def _trainable(model: ArmModel) -> bool:
     return not isinstance(model.network, RecurrentArm)
 
 
+def can_hide(name: str) -> bool:
+    """Whether a network can hide an effect by imitation: one with memory that acts in front."""
+    kind = known_effects()[name]
+    return kind.stage in ("line", "material") and not issubclass(kind, Memoryless)
+
+
 def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], dict[str, str]]:
     """The effects that a refit can decide about, and why it cannot about the others.
 
@@ -269,7 +275,7 @@ class Job:
     model: ArmModel
     """The model to start from, the effect in place."""
     effects: tuple[str, ...]
-    """The effects that the given model lacks; none: the rival."""
+    """Effects whose parameters are held in their plausible ranges."""
     part: int | None
     """The part that is left out; None: none is."""
     epochs: int
@@ -708,6 +714,10 @@ class JointFit:
     """The effects' parameters; intervals are not known, so their ends are the values."""
 
 
+ALL_ROWS = 10**9
+"""More rows than any recording has: no row is left out of the last fit."""
+
+
 @torch_threads(1)
 def fit_together(
     problem: Problem,
@@ -719,20 +729,22 @@ def fit_together(
     """Fit effects together with the network to all rows of a problem, and the network alone.
 
     Both are trained for the epochs of both rungs of a refit. validated: the result of these effects
-    in that refit, whose held-out error becomes the new model's validated error.
+    in that refit, whose held-out error becomes the new model's validated error. Effects that the
+    model has already are trained on in both.
     """
     effects = tuple(dict.fromkeys(effects))
     check_trainable(problem.model, effects)
-    split = Split.of(problem, config)
-    lacked = tuple(name for name in effects if name not in problem.model.effects)
+    split = Split.of(problem, replace(config, rows=ALL_ROWS))
+    starts_of = {
+        f"network and {JOIN.join(effects)}": starting_model(problem, effects),
+        "the network alone": problem.model,
+    }
     trained = []
-    for number, (start, added) in enumerate(
-        ((starting_model(problem, effects), lacked), (problem.model, ()))
-    ):
-        note = f"network and {JOIN.join(effects)}" if added else "the network alone"
-        for rung, epochs in enumerate((config.first_epochs, config.epochs)):
-            progress(2 * number + rung, 4, f"fitted together to all rows: {note}")
-            start = run_job(split, Job(start, added, None, epochs, config.seed)).model
+    for number, (note, start) in enumerate(starts_of.items()):
+        held = tuple(name for name in effects if name in start.effects)
+        progress(number, len(starts_of), f"fitted to all rows: {note}")
+        for epochs in (config.first_epochs, config.epochs):
+            start = run_job(split, Job(start, held, None, epochs, config.seed)).model
         trained.append(start)
     validation = Validation(
         rmse_mm=validated.heldout_rmse_mm,

@@ -113,8 +113,8 @@ def _refit(refit: Refit) -> Section:
     left = "; ".join(f"{name}: {why}" for name, why in refit.not_tried)
     text = (
         f"{refit.sentence[:1].upper()}{refit.sentence[1:]}. Done because {refit.reason}. "
-        f"{refit.trainings} trainings on {refit.rows} rows; {refit.unit} were left out in turn, and "
-        "the network alone was trained for as many epochs."
+        f"{refit.trainings} trainings on {refit.rows} rows; {refit.unit} were left out in turn, "
+        "and the network alone was trained for as many epochs."
     )
     return Section(
         "Fitted together", [Text(text), Table(header, rows), Text(f"Not tried: {left}.")]

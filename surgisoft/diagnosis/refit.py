@@ -26,7 +26,6 @@ from typing import Literal
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
 from surgisoft.diagnosis.estimation.effects import shrink, starts
 from surgisoft.diagnosis.estimation.intervals import Parameter
@@ -76,6 +75,40 @@ REFIT = RefitConfig()
 
 
 @dataclass(frozen=True)
+class RefitCriteria:
+    """What starts a refit, and what decides in it.
+
+    The values are those of the selection among residuals (`criteria`), which were set on virtual
+    robots; none was set by looking at a refit.
+    """
+
+    over_floor: float = 2.0
+    """Factor on the noise floor from which an error is far above it."""
+    within: float = 1.2
+    """Most error above the floor, in units of the model discrepancy, that the fit validated."""
+    p_value: float = 0.02
+    """Largest family-wise p-value of an effect that is named."""
+    gain: float = 0.25
+    """Least share of the rival's squared error above the noise floor that has to go."""
+    log_gain: float = 0.08
+    """Least mean of log(error of the rival / error with the effect)."""
+    competing_gain: float = 0.8
+    """Gain, as a share of the winner's, from which another effect can compete with it."""
+    win_share: float = 0.9
+    """Share of bootstrap samples in which the winner must beat a competing effect."""
+    tie_of_gain: float = 0.02
+    """Difference of two gains, as a share of the better one, up to which they are alike."""
+    tie_of_left: float = 0.3
+    """The same as a share of what the better one leaves; the smaller of both counts."""
+    most_confidence: float = 0.81
+    """Most confidence where others do about as well (`criteria.Calibration.ambiguous`)."""
+
+
+ASKED = RefitCriteria()
+"""The criteria in force."""
+
+
+@dataclass(frozen=True)
 class RefitCandidate:
     """One effect, fitted together with the network."""
 
@@ -111,9 +144,8 @@ class RefitCandidate:
     @property
     def named(self) -> bool:
         """Whether the effect meets the acceptance criteria of significance and size."""
-        asked = CRITERIA.selection
-        large = self.gain >= asked.first_gain and self.log_gain >= asked.log_gain
-        return self.plausible and large and self.p_value <= asked.p_value
+        large = self.gain >= ASKED.gain and self.log_gain >= ASKED.log_gain
+        return self.plausible and large and self.p_value <= ASKED.p_value
 
 
 @dataclass(frozen=True)
@@ -214,14 +246,13 @@ def reason_to_refit(problem: Problem) -> str:
     The error is far above the noise floor, and no larger than the validated error: an effect that
     the network has learned to imitate would look like this.
     """
-    asked = CRITERIA.decision
     error, floor = problem.rmse_mm, problem.floor_mm
     seen = np.isfinite(problem.residual).all(2).sum(0)
     validated = float(np.sqrt(seen @ np.square(problem.discrepancy_mm) / seen.sum()))
     excess = float(np.sqrt(max(error**2 - floor**2, 0.0)))
-    if error < asked.undertrained_over_floor * floor:
+    if error < ASKED.over_floor * floor:
         return ""
-    if excess > CRITERIA.selection.far_size * validated or not _trainable(problem.model):
+    if excess > ASKED.within * validated or not _trainable(problem.model):
         return ""
     return (
         f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and no larger "
@@ -401,7 +432,7 @@ def least_units() -> int:
     its share of the asked one (Bonferroni's bound).
     """
     family = sum(not issubclass(kind, Memoryless) for kind in known_effects().values())
-    return int(np.ceil(np.log2(family / CRITERIA.selection.p_value)))
+    return int(np.ceil(np.log2(family / ASKED.p_value)))
 
 
 @torch_threads(1)
@@ -670,15 +701,15 @@ def _decided(
     named = [score for score in ahead if score.named]
     if not named:
         return None, (), False, 0.0
-    asked, best = CRITERIA.selection, named[0]
+    best = named[0]
     gains = {score.effect: _gains_of(split, rungs[score.effect], score.effect) for score in ahead}
-    tie = min(asked.tie_of_gain * best.gain, asked.tie_of_left * (1.0 - best.gain))
+    tie = min(ASKED.tie_of_gain * best.gain, ASKED.tie_of_left * (1.0 - best.gain))
     competing = []
     for other in ahead:
-        if other is best or other.gain < asked.competing_gain * best.gain:
+        if other is best or other.gain < ASKED.competing_gain * best.gain:
             continue
         shares = win_shares(-np.stack([gains[best.effect], gains[other.effect]]))
-        if best.gain - other.gain < tie or shares[0] < asked.win_share:
+        if best.gain - other.gain < tie or shares[0] < ASKED.win_share:
             competing.append(other)
     line = [score for score in (best, *competing) if score.named and score.effect == LINE]
     of_line = bool(line and competing and split.problem.model.spec.actuation == "commanded")
@@ -689,7 +720,7 @@ def _decided(
     shares = win_shares(-np.stack([gains[best.effect], *others]))
     sure = max(float(shares[0]) - best.p_value, 0.0)
     if competing:
-        sure = min(sure, CRITERIA.calibration.ambiguous)
+        sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure
 
 

@@ -6,11 +6,12 @@ from typing import Annotated
 
 import typer
 
-from surgisoft.cli.files import check_folder
+from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.options import JsonFile
 from surgisoft.cli.progress import progress
-from surgisoft.files import write_atomically
+from surgisoft.files import write_atomically, write_json
 
-app = typer.Typer(help="Long studies on the virtual rig.", no_args_is_help=True)
+app = typer.Typer(help="Long studies whose results are committed.", no_args_is_help=True)
 
 Images = Annotated[Path | None, typer.Option(metavar="DIR", help="Write pictures to this folder.")]
 """Option of the studies with pictures."""
@@ -182,3 +183,106 @@ def control(
     command += f" --tasks {tasks}" if tasks else ""
     command += f" --episodes {episodes} --rig-episodes {rig_episodes}"
     _show("Control results", command, markdown(results, config), output)
+
+
+@app.command()
+def real(
+    entries: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[ENTRY.toml...]",
+            help="Entries, or folders of them; default: those of the project.",
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
+        ),
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Run this one entry of them.")
+    ] = None,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
+    ] = Path("runs/benchmark-real"),
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Known changes of real robots: a model fitted before, diagnosed after, beside the truth."""
+    from benchmarks.real.entries import data_folder, load_entries
+    from benchmarks.real.study import run, to_json
+    from benchmarks.real.table import markdown
+
+    check_free(json_file, "entries")
+    check_folder(work)
+    some = load_entries(entries or [], only)
+    folder = data_folder(data)
+    with progress("real") as report:
+        outcomes = run(some, folder, work, report)
+    command = " ".join(
+        ["surgisoft benchmark real", *map(str, entries or []), "--data FOLDER"]
+        + (["--only", only] if only else [])
+    )
+    if json_file:
+        write_json(json_file, to_json(outcomes))
+    _show("Real robots: known changes", command, markdown(outcomes), output)
+
+
+@app.command()
+def inject(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the cases.")
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
+        ),
+    ] = None,
+    robots: Annotated[
+        str | None, typer.Option(help="Robots, with commas; default: all of them.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the cases.")] = 1,
+) -> None:
+    """Inject effects into real recordings: cases with a known truth and real noise."""
+    from benchmarks.injected.cases import ROBOTS, make_cases
+    from benchmarks.real.entries import data_folder
+
+    check_folder(output)
+    names = robots.split(",") if robots else list(ROBOTS)
+    folder = data_folder(data)
+    with progress("inject") as report:
+        lines = make_cases(names, folder, output, seed, report)
+    print(*lines, sep="\n")
+
+
+@app.command()
+def cases(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of cases, as `inject` writes it.")
+    ],
+    only: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
+    ] = None,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Diagnose a folder of cases with a known truth; one model is fitted for each robot."""
+    from benchmarks.injected.study import find_cases, markdown, run, to_json
+    from surgisoft.errors import InputError
+
+    check_free(json_file, "cases")
+    found = find_cases(folder)
+    some = [case for case in found if only is None or only in str(case.place)]
+    if not some:
+        raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
+    with progress("cases") as report:
+        judged = run(some, processes, report)
+    if json_file:
+        write_json(json_file, to_json(judged))
+    command = "surgisoft benchmark cases DIR" + (f" --only {only}" if only else "")
+    _show("Cases with a known truth", command, markdown(judged), output)

@@ -52,8 +52,9 @@ FLOORS = {
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("pairs",),
         ("cross_validation",),
-        ("black_box", "candidates"),
+        ("black_box", "candidates", "setup"),
         ("estimation",),
         ("selection", "refit"),
         ("decision",),
@@ -91,6 +92,17 @@ FLOORS = {
 
 ROOMS = {
     "diagnosis/design": ("schedules", "isolability", "next_experiment"),
+    "diagnosis/setup": (
+        "alignment",
+        "channels",
+        "sample",
+        "arrangements",
+        "search",
+        "words",
+        "blind",
+        "correction",
+        "result",
+    ),
 }
 """Modules of a folder in order: each imports from those before it only."""
 

@@ -36,13 +36,14 @@ COMMANDS = (
 """Modules of commands, in the order of the help."""
 
 MANY = {
-    *("--between", "--data", "--effect", "--effect-file", "--effects", "--hidden", "--policy"),
-    *("--reference", "--strength", "--valid", "--without"),
+    *("--before", "--between", "--data", "--effect", "--effect-file", "--effects", "--hidden"),
+    *("--policy", "--strength", "--valid", "--without"),
 }
 """Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
 
 
 OLD_NAMES = {
+    "--reference": "--before",
     "--specimen": "--robot-seed",
     "--take": "--trial",
     "--trust": "--observer-gain",

@@ -8,14 +8,16 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
 from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
+    Before,
     EffectFiles,
     Force,
     JsonFile,
     Model,
     NewModel,
+    Paired,
     Refit,
     Report,
     with_effect_files,
@@ -40,6 +42,8 @@ def amend(
         typer.Option(metavar="REC...", help="Recordings (.csv, .parquet) or folders of them."),
     ],
     output: NewModel,
+    before: Before = None,
+    paired: Paired = "auto",
     json_file: JsonFile = None,
     report: Report = None,
     effect_files: EffectFiles = None,
@@ -69,6 +73,7 @@ def amend(
     check_folder(report)
     check_model(model)
     measured = read_recordings(data)
+    earlier = read_before(before, paired)
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.amend import amend as amend_model
@@ -86,6 +91,8 @@ def amend(
             names,
             not keep_network,
             lambda text: tell(next(stages), 4, text),
+            before=earlier,
+            paired=paired,
             refit=refit,
             refit_progress=tell,
             processes=REFIT_PROCESSES,

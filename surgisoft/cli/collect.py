@@ -1,4 +1,4 @@
-"""`surgisoft collect`: record a protocol on the virtual rig."""
+"""`surgisoft collect`: record a protocol on a simulated rig."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,11 +11,11 @@ from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
 
-def _list_hidden(value: bool) -> None:
+def _list_hidden(context: typer.Context, value: bool) -> None:
     if value:
-        from surgisoft.rig.hidden import HIDDEN
+        from surgisoft.rig.trial import hidden_of
 
-        for name, effect in HIDDEN.items():
+        for name, effect in hidden_of(context.params.get("rig", "virtual")).items():
             print(f"{name:18s}{effect.place:10s}{effect.about}")
         raise typer.Exit
 
@@ -41,6 +41,15 @@ def collect(
         Path,
         typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
     ],
+    rig: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            is_eager=True,
+            help="Simulated rig: virtual, or elastica (PyElastica's Cosserat rod; other robots, "
+            "other physics).",
+        ),
+    ] = "virtual",
     seed: Annotated[
         int,
         typer.Option(
@@ -48,7 +57,8 @@ def collect(
             "--robot-seed",
             min=0,
             max=SEED_MAX,
-            help="Seed of the robot; another seed is another arm of the same design.",
+            help="Seed of the robot; another seed is another arm of the same design (elastica: "
+            "of another design).",
         ),
     ] = 0,
     trial: Annotated[
@@ -94,7 +104,10 @@ def collect(
     list_hidden: Annotated[
         bool,
         typer.Option(
-            "--list-hidden", callback=_list_hidden, is_eager=True, help="List the hidden effects."
+            "--list-hidden",
+            callback=_list_hidden,
+            is_eager=True,
+            help="List the hidden effects of the rig (give --rig first).",
         ),
     ] = False,
     list_protocols: Annotated[
@@ -104,7 +117,7 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording on the virtual rig: the paper's arm, pumps and motion capture."""
+    """Collect a recording on a simulated rig: the paper's arm, pumps and motion capture."""
     from surgisoft.measurement.recordings import save_recording
     from surgisoft.rig.trial import collect as collect_recording
 
@@ -119,6 +132,7 @@ def collect(
     with progress(f"collect {protocol}") as report:
         recording = collect_recording(
             protocol,
+            rig,
             seed=seed,
             trial=trial,
             points=points,

@@ -4,11 +4,13 @@ import math
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
+    Before,
     EffectFiles,
     JsonFile,
     Model,
+    Paired,
     Recordings,
     Replay,
     Report,
@@ -26,6 +28,8 @@ LEAST_SHOWN = 0.02
 def compare(
     model: Model,
     recordings: Recordings,
+    before: Before = None,
+    paired: Paired = "auto",
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
@@ -38,12 +42,13 @@ def compare(
 
     check_model(model)
     measured = read_recordings(recordings)
+    earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.compare import compare as compare_model
     from surgisoft.surrogate.checkpoint import load_model
 
     arm = load_model(model)
-    result, rest = compare_model(arm, measured)
+    result, rest = compare_model(arm, measured, before=earlier, paired=paired)
     warn_all(result.notes)
     title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
     written = []
@@ -66,13 +71,16 @@ def compare(
         write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
         written.append(replay)
     print(result.sentence)
+    if result.setup:
+        print(f"set-up: {result.setup}; `surgisoft diagnose` shows what mends it")
     print(arm.summary())
     _show(result)
     for path in written:
         print(f"wrote {path}")
     if result.explainable:
         names = " ".join(map(str, recordings))
-        following = with_effect_files(f"surgisoft diagnose {model} {names}")
+        since = f" --before {' '.join(map(str, before))}" if before else ""
+        following = with_effect_files(f"surgisoft diagnose {model} {names}{since}")
         print(f"next, which effect is missing: {following}")
 
 
@@ -100,6 +108,9 @@ def _show(result) -> None:
             low, high = (f"{100 * value:.0f}" for value in each.ci95)
             share = f"{100 * each.share:3.0f} % ({low} .. {high})"
             print(f"  {each.axis:16s} explains {share:16s} {counted}")
+    for each in result.change_axes[:AXES_SHOWN]:
+        if each.share >= LEAST_SHOWN:
+            print(f"  {each.axis:16s} explains {100 * each.share:3.0f} % of the change")
     for moment in result.worst:
         print(
             f"  worst: {moment.error_mm:.3f} mm at key point {moment.key_point}, "

@@ -1,18 +1,21 @@
 """`surgisoft diagnose`: find the physical effect that a model lacks."""
 
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free
-from surgisoft.cli.inputs import check_model, read_recordings, warn_all
+from surgisoft.cli.files import check_folder, check_free, check_new_folder
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
+    Before,
     EffectFiles,
     JsonFile,
     Model,
+    Paired,
     Recordings,
     Refit,
     Report,
@@ -28,15 +31,8 @@ def diagnose(
     recordings: Recordings,
     json_file: JsonFile = None,
     report: Report = None,
-    reference: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="REC...",
-            help="Recordings from before a change. The diagnosis then separates what has changed "
-            "since from errors of the model; default: the training residuals in the model's "
-            "folder.",
-        ),
-    ] = None,
+    before: Before = None,
+    paired: Paired = "auto",
     without: Annotated[
         list[str] | None,
         typer.Option(
@@ -45,19 +41,39 @@ def diagnose(
         ),
     ] = None,
     refit: Refit = "auto",
+    apply: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write the recordings with the fault of their set-up mended to this new folder.",
+        ),
+    ] = None,
+    setup_tests: Annotated[
+        bool,
+        typer.Option(
+            "--setup-tests/--no-setup-tests",
+            help="Whether frames, units, orders, chambers and clocks are tested before effects.",
+        ),
+    ] = True,
     effect_files: EffectFiles = None,
 ) -> None:
     """Diagnose a model: name the physical effect that it lacks, or report why none can be named.
+
+    The set-up of the recordings is tested first: a turned or mirrored frame, wrong units, swapped
+    chambers or key points, clocks that are apart, dead channels. Where one is found, the result is
+    'setup' with what mends it, and no effect is looked for.
 
     Uses the first three quarters of each recording; the last quarter is held out for `amend`.
     """
     check_free(json_file, "verdict")
     check_folder(report)
+    check_new_folder(apply)
     check_model(model)
     measured = read_recordings(recordings)
-    before = read_recordings(reference) if reference else None
+    earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
+    from surgisoft.measurement.recordings import save_recordings
     from surgisoft.surrogate.checkpoint import load_model
 
     arm = load_model(model)
@@ -66,9 +82,11 @@ def diagnose(
         found = diagnose_model(
             arm,
             measured,
-            lambda text: tell(next(stages), 5, text),
-            before,
-            without or (),
+            lambda text: tell(next(stages), 6, text),
+            without=without or (),
+            setup_tests=setup_tests,
+            before=earlier,
+            paired=paired,
             refit=refit,
             refit_progress=tell,
             processes=REFIT_PROCESSES,
@@ -83,26 +101,64 @@ def diagnose(
 
         title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
         written.append(write_report(found, report, title))
+    if apply and found.setup and found.setup.mendable:
+        save_recordings(found.setup.mended(measured), apply)
+        written.append(apply)
     _show(found)
     for path in written:
         print(f"wrote {path}")
     data = " ".join(map(str, recordings))
+    if found.setup:
+        _next_after_setup(found.setup, model, data, apply)
+    elif apply:
+        print(f"nothing to mend: {apply} was not written")
     if found.verdict.kind == "ambiguous":
         between = " ".join(found.verdict.effects)
         command = f"surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv"
         print(f"next: {with_effect_files(command)}")
     elif found.verdict.kind in ("identified", "several"):
         effects = " ".join(found.verdict.effects)
-        command = f"surgisoft amend {model} --effect {effects} --data {data} -o NEW"
+        command = f"surgisoft amend {model} --effect {effects} --data {data}"
+        if before:
+            command += f" --before {' '.join(map(str, before))}"
+        command += " -o NEW"
         if found.refit is not None and found.refit.winner is not None:
             command += " --refit always"
         print(f"next: {with_effect_files(command)}")
+
+
+def _next_after_setup(setup, model: Path, data: str, apply: Path | None) -> None:
+    """Print what to do about a fault of the set-up."""
+    if not setup.mendable:
+        if apply:
+            print(f"{apply} was not written: that cannot be mended in the recordings")
+        print(f"next: {setup.mending.splitlines()[0]}")
+    elif apply:
+        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {apply}')}")
+    else:
+        print(f"next: {with_effect_files(f'surgisoft diagnose {model} {data} --apply MENDED')}")
+
+
+def _show_setup(setup) -> None:
+    """Print what mends the faults of a set-up."""
+    print(f"in: {', '.join(setup.recordings)}")
+    print("to mend it, in the map of `surgisoft import`:" if setup.mendable else "to mend it:")
+    print(textwrap.indent(setup.mending, "  "))
+    for other in setup.alternative_mendings:
+        print("or, for the other explanation:")
+        print(textwrap.indent(other, "  "))
+    if setup.how_to_tell:
+        print(setup.how_to_tell)
 
 
 def _show(found) -> None:
     """Print the verdict, the ranking and the proposed experiment."""
     verdict, error = found.verdict, found.error_mm
     print(f"{verdict.kind}: {verdict.sentence}")
+    if found.setup:
+        _show_setup(found.setup)
+        print(f"{found.seconds:.1f} s")
+        return
     print(
         f"error {error.before:.4f} mm, floor {error.floor:.4f} mm, "
         f"best achievable {error.ceiling:.4f} mm (on held-out blocks)"

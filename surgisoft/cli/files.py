@@ -35,6 +35,15 @@ def check_folder(path: Path | None) -> None:
         raise InputError(f"{path}: cannot be written, {above} is not a writable folder")
 
 
+def check_new_folder(path: Path | None) -> None:
+    """Raise InputError unless a folder can be made there: nothing is replaced."""
+    if path is None:
+        return
+    check_folder(path)
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path}: is not empty, expected a new folder; choose another one")
+
+
 def check_replay(path: Path | None) -> None:
     """Raise InputError unless a replay may be written there; an older one is replaced."""
     if path is None:

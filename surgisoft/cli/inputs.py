@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 
 
 def warn(text: str) -> None:
@@ -27,6 +27,17 @@ def read_recordings(paths: Iterable[Path]) -> list:
     from surgisoft.measurement.recordings import load_recordings
 
     return load_recordings(paths, on_warning=warn)
+
+
+def read_before(paths: list[Path] | None, paired: str) -> list | None:
+    """The recordings of `--before`; None without them. paired: value of `--paired`."""
+    from surgisoft.diagnosis.pairs import PAIRED
+
+    if paired not in PAIRED:
+        raise unknown_name("value of --paired", paired, PAIRED)
+    if not paths and paired != "auto":
+        raise InputError(f"--paired {paired}: nothing to pair with; add --before REC")
+    return read_recordings(paths) if paths else None
 
 
 def counted(number: int, thing: str) -> str:

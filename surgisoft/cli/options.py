@@ -18,6 +18,24 @@ Model = Annotated[
 Recordings = Annotated[
     list[Path], Argument(metavar="REC", help="Recordings (.csv, .parquet) or folders of them.")
 ]
+Before = Annotated[
+    list[Path] | None,
+    Option(
+        "--before",
+        metavar="REC...",
+        help="Recordings from before a change. Where they were made with the same actuation, the "
+        "difference between the measurements is explained, in which the model's error cancels; "
+        "otherwise the model's residuals before and after are compared.",
+    ),
+]
+Paired = Annotated[
+    str,
+    Option(
+        metavar="auto|always|never",
+        help="Whether rows of the same actuation before and after are paired; 'always' makes it an "
+        "error if too few can be.",
+    ),
+]
 NewModel = Annotated[Path, Option("-o", "--output", metavar="NEW", help="Folder of the new model.")]
 NewRecording = Annotated[
     Path, Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv.")

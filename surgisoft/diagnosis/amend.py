@@ -16,11 +16,13 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effect
@@ -114,6 +116,12 @@ class Amendment:
     """Time that it took, s."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    change: Change | None = None
+    """How far the recordings differ from those before the change; where rows are paired, errors are
+    those of the paired difference, and None where no recordings from before were given."""
+    model_error: Fall | None = None
+    """The error of the model itself on the held-out rows, where the others are paired
+    differences."""
     refit: Refit | None = None
     """The comparison that fitted network and effects together; None where they were not."""
 
@@ -128,6 +136,11 @@ class Amendment:
         if self.refit is not None:
             return f"{' + '.join(self.effects)}: {self._together}"
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
+        if self.model_error is not None:
+            whole = self.model_error
+            text = text.replace("error ", f"change since {' + '.join(self.change.before)}: ", 1)
+            text += f"; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
+            return f"{text}, its network's last layer re-tuned" if self.retuned else text
         if not self.retuned:
             return text
         return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned behind"
@@ -159,6 +172,9 @@ class Amendment:
             "refit": None if self.refit is None else self.refit.to_json(),
             "notes": list(self.notes),
             "seconds": self.seconds,
+            "change": self.change and self.change.to_json(),
+            "error_model_mm": self.model_error
+            and asdict(self.model_error) | {"ci95": list(self.model_error.ci95)},
         }
 
 
@@ -169,6 +185,8 @@ def amend(
     effects: str | Iterable[str],
     retune_network: bool = True,
     progress: Progress | None = None,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
@@ -179,7 +197,10 @@ def amend(
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
-    effects alone make the error fall. refit: `always` fits the whole network together with the
+    effects alone make the error fall. before: recordings from before a change. Where they were made
+    with the same actuation, effects are fitted to the paired difference (`pairs`), so that the
+    network's error does not enter; paired: as for `diagnose`.
+    refit: `always` fits the whole network together with the
     effects, `auto` does where a network may have imitated them (`surgisoft.diagnosis.refit`) and
     held-out runs reward it, `never` does not; refit_progress and processes as for `diagnose`.
     """
@@ -188,14 +209,21 @@ def amend(
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
-    table = residual_table(model, recordings)
+    plain = table = residual_table(model, recordings)
+    both = None
+    if before is not None:
+        both = before_and_after(plain, load_recordings(before), paired).with_held_out_pairs()
+        notes, table = (*notes, *both.notes), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))
     judged = None
-    reason = refit_reason(problem, refit)
-    if refit == "always" and not retune_network:
-        raise InputError("--refit always changes the network: expected it without --keep-network")
-    if refit == "always" or (reason and retune_network and all(map(can_hide, names))):
+    reason = refit_reason(problem, refit) if both is None else ""
+    if refit == "always" and (both is not None or not retune_network):
+        raise InputError(
+            "a refit changes the network, and a change since BEFORE is not one of the network: "
+            "expected --refit always without --before and without --keep-network"
+        )
+    if reason and (refit == "always" or (retune_network and all(map(can_hide, names)))):
         judged = refit_effects(
             problem, reason, together=names, progress=refit_progress, processes=processes
         )
@@ -203,7 +231,7 @@ def amend(
         joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
         better, retuned, parameters = joint.model, False, joint.parameters
         refitted = tuple(name for name in names if name in model.effects)
-        held_out = table.final_check()
+        held_out = whole = table.final_check()
         alone = fall_of(held_out.with_model(joint.alone), held_out.with_model(better))
     else:
         judged = None
@@ -213,29 +241,34 @@ def amend(
         better, retuned = fitted.model, False
         if retune_network:
             tell("re-tuning the network")
-            tried = retune(better, problem)
+            # Tuned to what was measured: the network's own error is not in a paired difference.
+            tried = retune(better, plain.training())
             better, retuned = tried.model, tried.kept
         tell("evaluating on the held-out part")
-        held_out = table.final_check()
+        held_out, whole = table.final_check(), plain.final_check()
         alone = fall_of(held_out, held_out.with_model(fitted.model))
-        whole = fall_of(held_out, held_out.with_model(better))
-        if retuned and not (alone.claimed and whole.claimed):
+        if retuned and not (alone.claimed and fall_of(whole, whole.with_model(better)).claimed):
             better, retuned = fitted.model, False
         # The residuals of the fit say nothing of a network that was re-tuned since.
         better.training_residuals = None if retuned else model.training_residuals
-    pairs = [(part, part.with_model(better)) for part in (problem, held_out)]
+    is_paired = both is not None and both.used
+    # The paired difference holds for the network that predicted BEFORE.
+    shown = fitted.model if is_paired else better
+    falls = [(part, part.with_model(shown)) for part in (problem, held_out)]
     return Amendment(
         model=better,
         effects=tuple(names),
         refitted=refitted,
         parameters=parameters,
-        held_out=fall_of(*pairs[1]),
+        held_out=fall_of(*falls[1]),
         alone=alone,
-        training=fall_of(*pairs[0]),
+        training=fall_of(*falls[0]),
         retuned=retuned,
-        tracks=(track_of(*pairs[0]), track_of(*pairs[1])),
+        tracks=(track_of(*falls[0]), track_of(*falls[1])),
         seconds=time.perf_counter() - begin,
         notes=notes,
+        change=None if both is None else both.change,
+        model_error=fall_of(whole, whole.with_model(better)) if is_paired else None,
         refit=judged,
     )
 

@@ -15,6 +15,7 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
     Floor,
@@ -25,10 +26,12 @@ from surgisoft.diagnosis.residuals import (
     residual_table,
 )
 from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
+from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
-from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.histories import check_fits
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -102,6 +105,12 @@ class Comparison:
     """The worst moments, each from another stretch of time."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    setup: str | None = None
+    """What is wrong with the set-up of the recordings, in words; None where no fault is proved."""
+    change: Change | None = None
+    """How far the recordings differ from those before a change; None where none were given."""
+    change_axes: tuple[AxisShare, ...] = ()
+    """How much of the paired difference each axis explains, most first."""
 
     @property
     def explainable(self) -> float | None:
@@ -128,6 +137,8 @@ class Comparison:
         """Error, noise floor, best achievable error, and what the error depends on."""
         noise = self.floor.rmse_mm
         text = f"error {_mm(self.rmse_mm)}, floor {'unknown' if noise is None else _mm(noise)}"
+        if self.change is not None:
+            text = f"{self.change.sentence}; {text}"
         if noise is not None and self.rmse_mm <= AT_FLOOR * noise:
             return f"{text}: the error is at the floor"
         if self.ceiling is None:
@@ -148,7 +159,7 @@ class Comparison:
 
     def to_json(self) -> dict:
         """Plain values: `rmse_mm`, `per_key_point_mm`, `tip_rmse_mm`, `floor_mm` and the table."""
-        values = asdict(self)
+        values = asdict(self) | {"change": self.change and self.change.to_json()}
         floor, top = values.pop("floor"), values.pop("ceiling")
         values |= {
             "sentence": self.sentence,
@@ -168,16 +179,30 @@ def compare(
     recordings: Recordings,
     part: Part = "all",
     reference: Sequence[Recording] | TrainingResiduals | None = None,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
 ) -> tuple[Comparison, ResidualTable]:
     """Evaluate a model on recordings; both may be given by their paths.
 
     part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
-    for `diagnose`, which takes it into account for the best achievable error.
+    for `diagnose`, which takes it into account for the best achievable error. before: recordings
+    from before a change; the comparison then also says how far the two sets differ (`pairs`), by
+    the paired difference where both have the same actuation; paired: as for `diagnose`.
     """
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, sized=False)
+    wrong = find_setup_faults(model, recordings) if part == "all" else None
+    if wrong is None:
+        check_fits(model.spec, recordings)
     whole = residual_table(model, recordings)
     if np.isnan(whole.only(part).measured_mm).all():
         raise InputError("no key point was measured in any row of the recordings")
+    both, changed = None, ()
+    if before is not None:
+        earlier = load_recordings(before)
+        both = before_and_after(whole, earlier, paired)
+        notes, reference = (*notes, *both.notes), earlier
+        if both.used:
+            changed = tuple(shares(both.table.view(part)))
     problem = with_known_residuals(whole.view(part, least_blocks=1), reference)
     table, block = problem.table, problem.block_of_row
     square = np.square(table.error_mm)
@@ -208,6 +233,9 @@ def compare(
             bands=tuple(bands(problem)),
             worst=tuple(_worst(table)),
             notes=notes,
+            setup=wrong and wrong.sentence,
+            change=None if both is None else both.change,
+            change_axes=changed,
         ),
         table,
     )

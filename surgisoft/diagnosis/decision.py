@@ -23,6 +23,7 @@ Kind = Literal[
     "nothing_missing",
     "unknown_effect",
     "surrogate_undertrained",
+    "setup",
 ]
 
 MOST_RUNNER_UP = 1.2

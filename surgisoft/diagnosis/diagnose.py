@@ -1,6 +1,7 @@
 """`diagnose`: which physical effect is the model missing?
 
-System identification of a grey-box model in six steps:
+What is wrong with the set-up of the recordings is tested first (`setup`): where a fault is proved,
+the diagnosis ends there. Else it is a system identification of a grey-box model in six steps:
 
 1. Residual table: the model's residuals on the training rows, thinned, in blocks (`residuals`).
 2. Sensitivities: what each effect, with each choice of its nonlinear parameters, would change in
@@ -27,12 +28,13 @@ from surgisoft.diagnosis.error_axes import shares
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
-    identification_problem,
     open_inputs,
+    with_known_residuals,
 )
+from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
-from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -40,8 +42,10 @@ from surgisoft.diagnosis.selection import (
     find,
     rmse_interval,
 )
-from surgisoft.errors import unknown_name
-from surgisoft.measurement.recordings import Recording
+from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.histories import check_fits
+from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import known_effects
@@ -60,7 +64,7 @@ class Verdict:
     """The result of a diagnosis in short."""
 
     kind: Kind
-    """One of the six kinds of result."""
+    """One of the seven kinds of result."""
     effects: tuple[str, ...]
     """The missing effects, the surest first; all competing ones where they cannot be told apart."""
     sentence: str
@@ -126,13 +130,18 @@ class Diagnosis:
     """Time that it took, s."""
     statistics: Evidence | None = None
     """The numbers that the decision was made from."""
+    setup: SetupResult | None = None
+    """What is wrong with the set-up of the recordings; None where no fault is proved."""
+    change: Change | None = None
+    """How far the recordings differ from those before the change; None where none were given."""
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        together = None if self.refit is None else self.refit.to_json()
-        return asdict(replace(self, refit=None)) | {"refit": together}
+        plain = asdict(replace(self, setup=None, refit=None))
+        plain["setup"] = self.setup.to_json() if self.setup else None
+        return plain | {"refit": self.refit.to_json() if self.refit else None}
 
 
 @torch_threads(1)
@@ -142,28 +151,71 @@ def diagnose(
     progress: Progress | None = None,
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     without: Collection[str] = (),
+    setup_tests: bool = True,
+    before: Recordings | None = None,
+    paired: Paired = "auto",
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths. Where `setup_tests` prove a fault of the
+    set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
+    recordings.
 
     Only the training rows are looked at: the view of the residual table that is worked on holds no
-    other key points. reference: recordings from before a change in question; without them the
-    residuals that the model keeps of its fit. without: effects that cannot act, such as a contact
-    on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates together
-    with the network (`surgisoft.diagnosis.refit`); refit_progress: called while that goes on;
-    processes: how many trainings then run at once, with the same result. More than one starts new
-    Python processes, so a script has to guard its start by `if __name__ == "__main__"`.
+    other key points. before: recordings from before a change in question. Where they were made with
+    the same actuation, the paired difference is explained (`pairs`), else the residuals of the
+    model, with those of `before` as what was known; paired: `auto`, `always` (too few common
+    motions are an error) or `never`. reference: recordings, as before; or residuals of the model
+    from before, default those that it keeps of its fit. without: effects that cannot act, such as a
+    contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
+    together with the network (`surgisoft.diagnosis.refit`), not where recordings from before are
+    given; refit_progress: called while that goes on; processes: how many trainings then run at
+    once, with the same result. More than one starts new Python processes, so a script has to guard
+    its start by `if __name__ == "__main__"`.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
-    model, recordings, notes = open_inputs(model, recordings)
+    model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    if setup_tests:
+        report("set-up")
+        wrong = find_setup_faults(model, recordings)
+        if wrong is not None:
+            return replace(with_setup(wrong), notes=notes, seconds=time.perf_counter() - begin)
+        check_fits(model.spec, recordings)
     report("predicting")
-    problem = identification_problem(model, recordings, reference)
+    table = residual_table(model, recordings)
+    if before is None and not isinstance(reference, TrainingResiduals | None):
+        before = reference
+    both = None
+    if before is not None:
+        both = before_and_after(table, load_recordings(before), paired)
+        problem, notes = both.training(), (*notes, *both.notes)
+    else:
+        problem = with_known_residuals(table.training(), reference)
     reason = refit_reason(problem, refit)
+    if both is not None and refit == "always":
+        raise InputError(
+            "a change since recordings from before is not one that a network was fitted to: "
+            "expected --refit always without --before"
+        )
+    result = diagnosis_of(problem, report, without)
+    if both is not None:
+        result = since(result, both.change)
+    elif reason:
+        joint = fit_candidates_together(
+            problem, reason, without, progress=refit_progress, processes=processes
+        )
+        result = with_refit(result, joint, problem)
+    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+
+
+def diagnosis_of(
+    problem: Problem, report: Progress = lambda text: None, without: Collection[str] = ()
+) -> Diagnosis:
+    """The diagnosis of an identification problem."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
@@ -171,17 +223,23 @@ def diagnose(
             raise unknown_name("effect", name, names)
     tried = candidates(problem, [name for name in names if name not in without])
     result = result_of(find(problem, tried, report))
-    if reason:
-        result = with_refit(
-            result,
-            fit_candidates_together(
-                problem, reason, without, progress=refit_progress, processes=processes
-            ),
-            problem,
-        )
-    if result.verdict.kind == "unknown_effect":
-        result = with_axis(result, problem)
-    return replace(result, notes=notes, seconds=time.perf_counter() - begin)
+    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
+
+
+def since(result: Diagnosis, change: Change) -> Diagnosis:
+    """The diagnosis of a change: its sentence says since when, and how large the change is."""
+    text = f"since {' + '.join(change.before)}: {result.verdict.sentence}; {change.sentence}"
+    return replace(result, change=change, verdict=replace(result.verdict, sentence=text))
+
+
+def with_setup(wrong: SetupResult) -> Diagnosis:
+    """The diagnosis of recordings whose set-up is at fault."""
+    return Diagnosis(
+        verdict=Verdict("setup", (), wrong.sentence),
+        error_mm=ErrorLevels(wrong.before_mm, wrong.floor_mm, wrong.after_mm),
+        ranking=(),
+        setup=wrong,
+    )
 
 
 def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:

@@ -154,6 +154,7 @@ def improve(
             refit=refit,
             refit_progress=refit_progress,
             processes=processes,
+            setup_tests=not added,
         )
         error = fall_of(problem, problem.with_model(models[-1])).after
         current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)

@@ -18,17 +18,17 @@ Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 
 
 def open_inputs(
-    model: Model, recordings: Recordings
+    model: Model, recordings: Recordings, sized: bool = True
 ) -> tuple[ArmModel, list[Recording], tuple[str, ...]]:
     """The model and the recordings as a diagnosis takes them, with notes for its reader.
 
     A model whose recordings were made with another direction of gravity is given loads of any
     direction (`under_weight`); the notes say so, and say where the recordings leave the range of
-    actuation that the model was fitted to.
+    actuation that the model was fitted to. sized: whether the size of the arm has to fit, too.
     """
     arm = load_model(model)
     measured = load_recordings(recordings)
-    check_fits(arm.spec, measured)
+    check_fits(arm.spec, measured, sized)
     turned, notes = under_weight(arm, measured)
     return turned, measured, (*notes, *outside_range(arm.spec, measured))
 

@@ -68,7 +68,8 @@ class Floor:
     rmse_mm: float | None
     """RMS distance of a measured key point from its true place, mm; None if it is not known."""
     source: str
-    """`sidecar`, `holds`, `second differences`, `repeats` or `unknown`."""
+    """`sidecar`, `holds`, `second differences`, `repeats`, `pairs` (of a paired difference) or
+    `unknown`."""
 
 
 UNKNOWN = Floor(None, "unknown")
@@ -142,6 +143,8 @@ class ResidualTable:
     """(N, n, 3) measured key points, base frame, mm; NaN where missing, or not to be seen."""
     pressure: np.ndarray
     """(N, m) actuation, in the arm's unit."""
+    commanded: np.ndarray
+    """(N, m) commanded actuation, in the arm's unit; NaN where not known."""
     direction: np.ndarray
     """(N, m) direction of change of the chambers' pressure, as the network sees it: -1, 0, 1."""
     t_s: np.ndarray
@@ -166,6 +169,11 @@ class ResidualTable:
     """The noise over all key points, and where it is known from."""
     holds: Floor
     """The noise floor from the scatter in holds alone."""
+    paired_discrepancy_mm: np.ndarray | None = None
+    """(n,) where the residuals are paired differences (`pairs`): what takes the place of the model
+    discrepancy, mm; None: the residuals are those of the model."""
+    paired_tolerance_mm: np.ndarray | None = None
+    """(n,) where they are paired differences: `Problem.tolerance_mm`."""
 
     @property
     def spec(self) -> ArmSpec:
@@ -258,6 +266,10 @@ class ResidualTable:
         names = np.unique(block[index])
         places = np.where(np.isin(block, names), np.searchsorted(names, block), -1)
         motion = motions(table.history, half_range(self.spec), places)
+        discrepancy = self.paired_discrepancy_mm
+        if discrepancy is None:
+            discrepancy = model_discrepancy(self.model, table.noise_mm)
+        tolerance = self.paired_tolerance_mm
         return Problem(
             model=self.model,
             table=table,
@@ -271,7 +283,8 @@ class ResidualTable:
             block_of_row=places,
             motion=motion,
             fold=folds(motion),
-            discrepancy_mm=model_discrepancy(self.model, table.noise_mm),
+            discrepancy_mm=discrepancy,
+            tolerance_mm=discrepancy if tolerance is None else tolerance,
         )
 
     def training(self, rows: int = ROWS) -> "Problem":
@@ -284,8 +297,8 @@ class ResidualTable:
 
 
 def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTable:
-    """Evaluate a model on whole recordings."""
-    check_fits(model.spec, recordings)
+    """Evaluate a model on whole recordings, whatever their unit of length."""
+    check_fits(model.spec, recordings, sized=False)
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
         predicted = history.rows(model.predict(history))
@@ -311,6 +324,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         # Not through float32: the measured values are compared as they were recorded.
         measured_mm=np.concatenate([recording.key_points_mm for recording in recordings]),
         pressure=np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings]),
+        commanded=each(lambda r: r.commanded, (model.spec.chambers,)),
         direction=direction.double().numpy(),
         t_s=history.rows(history.t_s).numpy(),
         run=history.run_of_row.numpy(),
@@ -399,6 +413,9 @@ class Problem:
     """(B,) fold that each block is left out with; one for all blocks of a motion."""
     discrepancy_mm: np.ndarray
     """(n,) model discrepancy: validated RMS error of each key point without its noise, mm."""
+    tolerance_mm: np.ndarray
+    """(n,) RMS error, mm, that the right effect may leave: the model discrepancy, and in a paired
+    difference what errors of the model's slope do to the sensitivities of the effects."""
     reference: Reference | None = None
     """Residuals from before the change in question; None: the discrepancy is known by its size
     alone."""

@@ -158,9 +158,10 @@ class ModelSelection:
         return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
     def size(self, losses: np.ndarray) -> float:
-        """Error that is left above the noise floor, in units of the model discrepancy."""
+        """Error that is left above the noise floor, in units of the model discrepancy (of what the
+        right effect may leave, `Problem.tolerance_mm`)."""
         seen = np.isfinite(self.problem.residual).all(2).sum(0)
-        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.discrepancy_mm))))
+        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.tolerance_mm))))
 
     @property
     def whole_size(self) -> float:

@@ -166,8 +166,11 @@ def _with_room(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarra
     )
 
 
-def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
-    """Raise unless every recording has the model's chambers, key points, unit and size."""
+def check_fits(spec: ArmSpec, recordings: list[Recording], sized: bool = True) -> None:
+    """Raise unless every recording has the model's chambers, key points, unit and size.
+
+    sized: whether the size counts; a wrong unit of length is a fault that `diagnose` names.
+    """
     for recording in recordings:
         for what, came, expected in (
             ("chambers", recording.chambers, spec.chambers),
@@ -179,7 +182,7 @@ def check_fits(spec: ArmSpec, recordings: list[Recording]) -> None:
                     f"{recording.label}: {what}: {came}, but the model has {expected}; "
                     "use recordings of the arm that the model was fitted to"
                 )
-        extent = _extent_mm(recording.key_points_mm)
+        extent = _extent_mm(recording.key_points_mm) if sized else float("nan")
         if spec.length_mm and (extent > SIZES * spec.length_mm or extent < spec.length_mm / SIZES):
             raise InputError(
                 f"{recording.label}: its key points span {extent:.3g} mm, the model's arm is "

@@ -83,10 +83,10 @@ def test_a_wrong_unit_of_length_is_told(tmp_path, capsys):
 
     short = recorded(points=300)
     save_recording(replace(short, key_points_mm=1e3 * short.key_points_mm), tmp_path / "x.parquet")
-    assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 2
-    error = capsys.readouterr().err
-    assert "unit of length" in error
-    assert len(error.strip().splitlines()) == 1
+    assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 0
+    printed = capsys.readouterr().out
+    assert "setup: the positions are 1000 times too large" in printed
+    assert "scale = 0.001" in printed
 
 
 def test_a_key_point_that_was_never_measured_is_left_out():

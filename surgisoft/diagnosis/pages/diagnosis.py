@@ -4,6 +4,7 @@ from pathlib import Path
 
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.refit import Refit
+from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
 HOW = (
@@ -23,6 +24,12 @@ HOW = (
     "The diagnosis did not see the last quarter of each recording: `surgisoft amend` validates its "
     "model on it."
 )
+HOW_SETUP = (
+    "Frames, units, orders, chambers, clocks and dead channels are tested before any effect. A "
+    "fault is named where the model, with the fault corrected, predicts held-out blocks of time "
+    "about as well as a right set-up would. No effect was looked for: mend the recordings first, "
+    "with the lines in the map of `surgisoft import` or with `surgisoft diagnose ... --apply DIR`."
+)
 TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
 """Tone of a verdict; the others are warnings."""
 
@@ -39,7 +46,10 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     parts = [Facts(facts)]
     if found.checks:
         parts.append(Section("Checks of the data", [Text("\n\n".join(found.checks))]))
-    parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+    if found.setup:
+        parts.append(_setup(found.setup))
+    else:
+        parts.append(Section("Effects", [_chart(found), _ranking(found)]))
     if found.refit is not None:
         parts.append(_refit(found.refit))
     if found.next_experiment:
@@ -58,7 +68,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         )
     if verdict.effects:
         parts.append(_parameters(found))
-    parts.append(Section("How to read this", [Text(HOW)]))
+    parts.append(Section("How to read this", [Text(HOW_SETUP if found.setup else HOW)]))
     return Page(
         title=f"Diagnosis of {title}",
         verdict=verdict.sentence[:1].upper() + verdict.sentence[1:] + ".",
@@ -66,6 +76,39 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         tone=TONES.get(verdict.kind, "warn"),
         parts=parts,
     )
+
+
+def _setup(setup: SetupResult) -> Section:
+    """What is wrong with the set-up, and what mends it."""
+    rows = [
+        (fault.kind.replace("_", " "), fault.sentence, _numbers(fault)) for fault in setup.faults
+    ]
+    parts = [
+        Table(["fault", "what was found", "numbers"], rows),
+        Text(f"Recordings: {', '.join(setup.recordings)}."),
+        _lines("What mends it:", setup.mending),
+    ]
+    for other, mending in zip(setup.alternatives, setup.alternative_mendings, strict=True):
+        what = "; ".join(fault.sentence for fault in other)
+        parts.append(_lines(f"As likely: {what}. What mends that:", mending))
+    if setup.how_to_tell:
+        parts.append(Text(setup.how_to_tell[:1].upper() + setup.how_to_tell[1:] + "."))
+    return Section("Set-up of the recordings", parts)
+
+
+def _lines(title: str, lines: str) -> Text:
+    """A title and lines, each a paragraph."""
+    return Text("\n\n".join([title, *lines.splitlines()]))
+
+
+def _numbers(fault: SetupFault) -> str:
+    """Numbers of a fault with their standard errors."""
+    texts = []
+    for name, value in fault.numbers.items():
+        error = fault.errors.get(name)
+        known = error is not None
+        texts.append(f"{name} {_number(value)}" + (f" +- {_number(error)}" if known else ""))
+    return ", ".join(texts)
 
 
 def _ranking(found: Diagnosis) -> Table:

@@ -204,13 +204,14 @@ def read_points(
     joined: Joined, spec: KeyPointsMap, maps: tuple[KeyPoint, ...], frame: FrameMap, unit: str
 ) -> Points:
     """Key points in the arm's base frame; `unit` is the unit of the raw positions."""
-    scale = MM_PER[unit]
+    scale = MM_PER[unit] * spec.scale
     notes: list[str] = []
     raw = np.stack(
         [_raw_point(joined, spec, point, j, scale, notes) for j, point in enumerate(maps)], axis=1
     )
     if spec.repeated == "missing":
         notes += _stale_notes(joined, spec, maps)
+    raw = _in_order(joined, spec, raw)
     turned, to_base = _relative_to_base(joined, spec, frame.base, raw, scale, frame.rest_rows)
     rest = _rest(turned, frame.rest_rows)
     origin = rest[0] if isinstance(frame.origin, str) else np.array(frame.origin) * scale
@@ -226,6 +227,20 @@ def read_points(
         gravity /= np.linalg.norm(gravity)
     _note_tilt(key_points, frame, notes)
     return Points(key_points, gravity, notes)
+
+
+def _in_order(joined: Joined, spec: KeyPointsMap, raw: np.ndarray) -> np.ndarray:
+    """The positions (T, n, 3) base to tip, dead key points missing."""
+    count = raw.shape[1]
+    for name, given in (("order", spec.order), ("lost", spec.lost)):
+        short = name == "order" and len(given) not in (0, count)
+        if short or max(given, default=-1) >= count:
+            raise InputError(
+                f"{joined.main.path}: [key_points] {name} = {[*given]} in the map, expected "
+                f"numbers of its {count} key points, from 0 to {count - 1}"
+            )
+    raw[:, list(spec.lost)] = np.nan
+    return raw[:, list(spec.order)] if spec.order else raw
 
 
 def _raw_point(

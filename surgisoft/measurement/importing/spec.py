@@ -71,6 +71,10 @@ PerChannel = Annotated[
     float | tuple[float, ...],
     Rule("a number or a number a channel", lambda value: value != ()),
 ]
+PERMUTATION = Rule(
+    "each of the numbers 0, 1, ... once", lambda order: sorted(order) == [*range(len(order))]
+)
+NUMBERS = Rule("numbers >= 0", lambda some: min(some, default=0) >= 0)
 UNIT_VECTOR = Rule(
     "three numbers, a unit vector", lambda vector: abs(np.linalg.norm(vector) - 1) <= 0.01
 )
@@ -185,6 +189,12 @@ class KeyPointsMap:
     """Key points that jump away and back within a few rows: "keep" or "missing"."""
     max_residual_mm: Annotated[float, POSITIVE] = math.inf
     """A circle that misses its markers by more (rms) is a missing key point [mm]."""
+    scale: Annotated[float, POSITIVE] = 1.0
+    """Factor of all positions, for files whose unit has no name here."""
+    order: Annotated[tuple[int, ...], PERMUTATION] = ()
+    """Base to tip, the number from 0 of each key point among those given; none: as given."""
+    lost: Annotated[tuple[int, ...], NUMBERS] = ()
+    """Numbers from 0, among those given, of key points whose tracker is dead: they are missing."""
 
     def checked(self, where: Where) -> "KeyPointsMap":
         """The table itself; raises InputError unless the key points have exactly one source."""

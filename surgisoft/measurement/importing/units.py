@@ -20,7 +20,7 @@ _KPA_PER = {
 _DEGREES_PER = {"deg": 1.0, "rad": 57.29577951308232, "rev": 360.0}
 _VOLTS_PER = {"V": 1.0, "mV": 1e-3}
 _NEWTONS_PER = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
-_QUANTITIES = (_KPA_PER, _DEGREES_PER, MM_PER | {"in": 25.4}, _VOLTS_PER, _NEWTONS_PER)
+_QUANTITIES = (_KPA_PER, _DEGREES_PER, MM_PER, _VOLTS_PER, _NEWTONS_PER)
 
 
 def factor(unit: str, to: str) -> float | None:
@@ -43,3 +43,19 @@ def check_conversion(unit: str, to: str, where: Where) -> None:
             else f"'{unit}' itself, a unit that nothing converts to; use scale and offset"
         )
         raise where.error(f"got '{to}'", expected)
+
+
+_SELDOM = ("hPa", "atm", "mmHg", "rev")
+"""Units that no wrong unit is taken for: another one is as large, or nobody logs in them."""
+
+
+def other_units(unit: str) -> dict[str, float]:
+    """The usual other units of the quantity that a unit measures, and how many of `unit` one is."""
+    for quantity in _QUANTITIES:
+        if unit in quantity:
+            return {
+                name: size / quantity[unit]
+                for name, size in quantity.items()
+                if name != unit and name not in _SELDOM
+            }
+    return {}

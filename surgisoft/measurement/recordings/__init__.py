@@ -8,6 +8,7 @@ from surgisoft.measurement.recordings.file import (
     load_recording,
     load_recordings,
     save_recording,
+    save_recordings,
 )
 from surgisoft.measurement.recordings.quality import QualityWarning, find_warnings, summary
 from surgisoft.measurement.recordings.recording import (
@@ -30,5 +31,6 @@ __all__ = [
     "load_recording",
     "load_recordings",
     "save_recording",
+    "save_recordings",
     "summary",
 ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from surgisoft.errors import InputError
 
-MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Millimetres in each unit that key points may come in."""
 
 _UNIT = r"([A-Za-z%][A-Za-z0-9%]*)"

@@ -12,7 +12,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from surgisoft.errors import InputError
-from surgisoft.files import new_file
+from surgisoft.files import new_file, new_folder
 from surgisoft.measurement.recordings.columns import Layout, parse_header
 from surgisoft.measurement.recordings.quality import find_warnings
 from surgisoft.measurement.recordings.recording import (
@@ -262,6 +262,24 @@ def save_recording(recording: Recording, path: str | Path, force: bool = False) 
             sidecar.write_text(sidecar_text(recording), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def save_recordings(recordings: Iterable[Recording], folder: str | Path) -> list[Path]:
+    """Write recordings as .parquet with their sidecars to a new folder, all of them or none."""
+    folder, recordings = Path(folder), list(recordings)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists already, expected a new folder; choose another one")
+    names = [recording.name for recording in recordings]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"two recordings are called '{twice}', expected names that differ")
+    try:
+        with new_folder(folder) as fresh:
+            for recording in recordings:
+                save_recording(recording, fresh / f"{recording.name}.parquet")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    return [folder / f"{name}.parquet" for name in names]
 
 
 def _write_table(content: pa.Table, part: Path, suffix: str) -> None:

@@ -176,7 +176,8 @@ def _actuation_moves(recording: Recording, rows: slice, share: float) -> bool:
     return False
 
 
-def _frozen_key_points(recording: Recording) -> list[QualityWarning]:
+def frozen_key_points(recording: Recording) -> list[tuple[list[int], slice]]:
+    """Key points (from 0) that froze together, and the samples that repeat one position."""
     changes = _key_point_changes(recording)
     frozen: list[tuple[int, slice]] = []
     for j, changed in enumerate(changes):
@@ -187,13 +188,17 @@ def _frozen_key_points(recording: Recording) -> list[QualityWarning]:
             others = any(_lives(c, stretch) for c in (*changes[:j], *changes[j + 1 :]))
             if known and (others or _actuation_moves(recording, stretch, 0.05)):
                 frozen.append((j, stretch))
+    return _merged(frozen)
+
+
+def _frozen_key_points(recording: Recording) -> list[QualityWarning]:
     return [
         QualityWarning(
             stretch.start,
             f"key point {', '.join(f'k{j}' for j in members)} repeats bit-equal for "
             f"{_duration(recording, stretch)} while other signals move; frozen?",
         )
-        for members, stretch in _merged(frozen)
+        for members, stretch in frozen_key_points(recording)
     ]
 
 

@@ -1,0 +1,299 @@
+"""Cases for a diagnosis on the PyElastica rig: robots with recordings before and after a change.
+
+    python -m benchmarks.elastica_cases FOLDER [--robots 101,102,...] [--count 100] [--seed 1]
+        [--processes 1]
+
+FOLDER (such as runs/elastica, outside git) gets
+
+    robots/ROBOT/before/*.parquet   recordings of the unchanged robot, for the fit
+    robots/ROBOT/robot.json         seed, chambers, key points, noise
+    cases/CASE/after/*.parquet      recording of the same robot with what is hidden
+    cases/CASE/truth.json           robot, hidden effects with their strengths, the names that a
+                                    diagnosis should give, RMS change of the key points in mm,
+                                    noise in mm, whether a recording before has the same actuation
+
+Everything follows from the seeds, and what exists already is kept: a second call continues. The
+cases come in rounds that hold every known effect, unknown ones, pairs and clean robots, so that any
+first part of them is balanced. Strengths are chosen so that the RMS change is about the one drawn.
+Nothing here knows a model or a diagnosis.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surgisoft.files import write_atomically
+from surgisoft.measurement.protocols import Protocol
+from surgisoft.measurement.protocols.continuous import schedule
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
+from surgisoft.rig.elastica import ElasticaRig
+from surgisoft.workers import workers
+
+KNOWN = {
+    "payload": "payload",
+    "hysteresis": "hysteresis",
+    "gain_mismatch": "gain_mismatch",
+    "line_lag": "line_lag",
+    "creep": "creep",
+    "misalignment": "misalignment",
+    "rate_dependence": "rate_dependence",
+    "contact": "contact",
+    "softening": "softening",
+    "coupling": "coupling",
+    "dead_zone": "dead_zone",
+    "drift": "drift",
+    "stiffening": "stiffening",
+    "twist": "twist",
+    "thermal_drift": "drift",
+}
+"""Hidden effect of the rig -> the name that a diagnosis should give."""
+UNKNOWN = ("breathing", "stick_slip", "leak", "knock")
+"""Hidden effects for which a diagnosis has no name."""
+PAIRS = (
+    ("creep", "payload"),
+    ("line_lag", "misalignment"),
+    ("hysteresis", "creep"),
+    ("softening", "gain_mismatch"),
+    ("drift", "dead_zone"),
+    ("rate_dependence", "payload"),
+    ("line_lag", "creep"),
+    ("misalignment", "gain_mismatch"),
+)
+"""Pairs that are hidden at once."""
+CLEAN_A_ROUND, PAIRS_A_ROUND = 4, 2
+"""Cases without any change, and with two effects, in a round."""
+CHANGE_MM = (0.4, 3.0)
+"""Range of the RMS change of the key points that is drawn, log-uniformly [mm]."""
+ROBOTS = "101,102,103,104,105,106"
+"""Seeds of the default robots."""
+
+BEFORE = {
+    "mixed": ("ramps", "holds", "reversals", "ladder", "wander"),
+    "other": ("steps", "sets", "two_speeds", "wander"),
+}
+"""Recordings before the change: name -> excitation signals, one run each."""
+BEFORE_S = {"mixed": 250.0, "other": 180.0}
+"""Their durations [s]."""
+AFTER = {
+    "same": ("ramps", "holds", "reversals", "ladder", "wander"),
+    "mixed": ("ramps", "holds", "reversals", "ladder", "wander"),
+    "brisk": ("steps", "ramps", "wander"),
+}
+"""Recordings after it. `same` has the actuation of `mixed` before; the others are drawn anew for
+each robot."""
+AFTER_S = {"same": 250.0, "mixed": 160.0, "brisk": 150.0}
+"""Their durations [s]."""
+TRIED = ("ramps", "holds", "wander")
+"""Excitation signals on which a strength is tried."""
+TRIED_S = 36.0
+"""Duration of a try [s]."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case."""
+
+    number: int
+    """Position in the list."""
+    robot: int
+    """Seed of the robot."""
+    names: tuple[str, ...]
+    """Hidden effects."""
+    change_mm: float
+    """RMS change of the key points that each of them should make [mm]."""
+    after: str
+    """A name of AFTER."""
+
+    @property
+    def truth(self) -> list[str]:
+        """The names that a diagnosis should give; `unknown` for effects that it does not have."""
+        return [KNOWN.get(name, "unknown") for name in self.names]
+
+
+def cases(robots: list[int], count: int, seed: int) -> list[Case]:
+    """The first `count` cases of rounds in which each robot gets other effects every time."""
+    rng = np.random.default_rng(seed)
+    found: list[Case] = []
+    turn = 0
+    while len(found) < count:
+        pairs = [PAIRS[(PAIRS_A_ROUND * turn + k) % len(PAIRS)] for k in range(PAIRS_A_ROUND)]
+        plan = [*((name,) for name in (*KNOWN, *UNKNOWN)), *pairs, *[()] * CLEAN_A_ROUND]
+        for k in rng.permutation(len(plan)):
+            change = np.exp(rng.uniform(*np.log(CHANGE_MM)))
+            robot = robots[(int(k) + turn) % len(robots)]
+            after = str(rng.choice(list(AFTER)))
+            found.append(Case(len(found), robot, plan[k], float(change), after))
+        turn += 1
+    return found[:count]
+
+
+def excitation(
+    rig: ElasticaRig, name: str, signals: tuple[str, ...], seconds: float, seed: int
+) -> Protocol:
+    """A continuous protocol of excitation signals, one run each."""
+    rng = np.random.default_rng([seed, len(name), *name.encode()])
+    count = round(seconds / rig.period_s)
+    return Protocol(
+        name, "continuous", *_ordered(schedule(signals, count, rig.period_s, rig.limits, rng))
+    )
+
+
+def _ordered(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple:
+    """Commands, runs and times in the order of `Protocol`."""
+    times, rows, runs = parts
+    return rows, runs, times
+
+
+def after_protocol(rig: ElasticaRig, robot: int, after: str) -> Protocol:
+    """The protocol of a recording after the change."""
+    name = "mixed" if after == "same" else f"after_{after}"
+    return excitation(rig, name, AFTER[after], AFTER_S[after], robot)
+
+
+def record(rig: ElasticaRig, protocol: Protocol) -> tuple[Recording, np.ndarray]:
+    """A recording, and the key points (T, n, 3) [mm] of its samples without noise."""
+    recording, truth = rig.record(protocol)
+    return recording, truth.noise_free_mm
+
+
+def make_robot(folder: Path, robot: int) -> None:
+    """Record a robot before any change, and what it would do in the protocols after it."""
+    place = folder / "robots" / str(robot)
+    if (place / "robot.json").is_file():
+        return
+    (place / "before").mkdir(parents=True, exist_ok=True)
+    plain = {}
+    noise: list[float | None] = []
+    for take, (name, signals) in enumerate(BEFORE.items()):
+        rig = ElasticaRig(robot, take=take)
+        protocol = excitation(rig, name, signals, BEFORE_S[name], robot)
+        recording, points = record(rig, protocol)
+        save_recording(recording, place / "before" / f"{name}.parquet", force=True)
+        noise.append(recording.noise_mm)
+        if name == "mixed":
+            plain["same"] = points
+    for after in AFTER:
+        if after != "same":
+            rig = ElasticaRig(robot, noise=0.0)
+            plain[after] = record(rig, after_protocol(rig, robot, after))[1]
+    rig = ElasticaRig(robot, noise=0.0)
+    plain["tried"] = record(rig, excitation(rig, "tried", TRIED, TRIED_S, robot))[1]
+    np.savez_compressed(place / "unchanged.npz", **plain)
+    about = {
+        "seed": robot,
+        "chambers": rig.chambers,
+        "key_points": rig.key_planes,
+        "length_mm": rig.arm.length_mm,
+        "high_kPa": float(rig.limits[0, 1]),
+        "period_s": rig.period_s,
+        "noise_mm": noise,
+    }
+    _write(place / "robot.json", about)
+
+
+def change_mm(points: np.ndarray, plain: np.ndarray) -> float:
+    """RMS distance [mm] between key points (T, n, 3) with and without the hidden effects."""
+    return float(np.sqrt(np.nanmean(np.square(points - plain).sum(axis=2))))
+
+
+def strength_for(robot: int, name: str, wanted_mm: float, plain: np.ndarray) -> float:
+    """Strength at which an effect changes the key points by about so much, from two tries."""
+    strength = 1.0
+    for _ in range(2):
+        rig = ElasticaRig(robot, noise=0.0, hidden=[(name, strength)])
+        points = record(rig, excitation(rig, "tried", TRIED, TRIED_S, robot))[1]
+        factor = wanted_mm / max(change_mm(points, plain), 1e-3)
+        strength = float(np.clip(strength * np.clip(factor, 0.05, 8.0), 0.02, 10.0))
+        if 0.8 < factor < 1.25:
+            break
+    return round(strength, 4)
+
+
+def make_case(folder: Path, case: Case) -> None:
+    """Record one case."""
+    place = folder / "cases" / f"{case.number:03d}"
+    if (place / "truth.json").is_file():
+        return
+    robot = folder / "robots" / str(case.robot)
+    plain = np.load(robot / "unchanged.npz")
+    hidden = [
+        (name, strength_for(case.robot, name, case.change_mm, plain["tried"]))
+        for name in case.names
+    ]
+    rig = ElasticaRig(case.robot, take=1000 + case.number, hidden=hidden)
+    recording, points = record(rig, after_protocol(rig, case.robot, case.after))
+    (place / "after").mkdir(parents=True, exist_ok=True)
+    save_recording(recording, place / "after" / f"{case.after}.parquet", force=True)
+    about = {
+        "robot": str(case.robot),
+        "hidden": [{"effect": name, "strength": strength} for name, strength in hidden],
+        "truth": case.truth,
+        "change_rms_mm": change_mm(points, plain[case.after]),
+        "noise_mm": recording.noise_mm,
+        "after": case.after,
+        "same_actuation": case.after == "same",
+    }
+    _write(place / "truth.json", about)
+
+
+def run(
+    folder: Path,
+    robots: list[int],
+    count: int,
+    seed: int,
+    processes: int,
+    report: Callable[[str], None],
+) -> None:
+    """Make the robots that the cases need, each before its first case, and the cases in order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = cases(robots, count, seed)
+    if processes == 1:
+        for case in drawn:
+            make_robot(folder, case.robot)
+            make_case(folder, case)
+            report(f"{case.number + 1} of {count}")
+        return
+    with workers(processes) as pool:
+        for robot in pool.map(make_robot, [folder] * len(robots), robots):
+            report(f"robots {robot or ''}")
+        for number, _ in enumerate(pool.map(make_case, [folder] * count, drawn)):
+            report(f"{number + 1} of {count}")
+
+
+def _write(path: Path, about: dict) -> None:
+    write_atomically(path, (json.dumps(about, indent=1) + "\n").encode())
+
+
+def load_case(folder: Path, number: int) -> tuple[dict, list[Recording], list[Recording]]:
+    """A case's truth, and its recordings before and after."""
+    place = folder / "cases" / f"{number:03d}"
+    truth = json.loads((place / "truth.json").read_text())
+    before = folder / "robots" / truth["robot"] / "before"
+    both = [
+        [load_recording(path) for path in sorted(where.glob("*.parquet"))]
+        for where in (before, place / "after")
+    ]
+    return truth, both[0], both[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--robots", default=ROBOTS, help="seeds, with commas")
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
+    given = parser.parse_args()
+    robots = [int(word) for word in given.robots.split(",")]
+    run(given.folder, robots, given.count, given.seed, given.processes,
+        lambda text: print(text, flush=True))  # fmt: skip
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    main()

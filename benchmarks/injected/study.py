@@ -1,0 +1,176 @@
+"""Diagnoses of case folders: one model for each robot, one answer for each case.
+
+A case folder holds `truth.json` and `after/` with recordings; the folder of its robot holds
+`before/`, and `model/` where it was fitted already. The robot's folder is the next one above the
+case, or the one of its name below the folder of all cases.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from concurrent.futures import as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from benchmarks.cache import Cache
+from benchmarks.injected.laws import UNKNOWN
+from benchmarks.real.entries import FitOptions
+from benchmarks.real.study import CLAIMED, NAMING, Answer, answer_of, ask, fitted, misleads, right
+from surgisoft.errors import InputError
+from surgisoft.files import json_safe
+from surgisoft.measurement.recordings import load_recordings
+from surgisoft.progress import Progress, silent
+from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.workers import workers
+
+SURE = 0.95
+"""Confidence from which a statement counts as sure (goal: 97 % of these are right)."""
+
+
+@dataclass(frozen=True)
+class CaseFolder:
+    """One case on the disk."""
+
+    place: Path
+    """Its folder."""
+    robot: Path
+    """Folder of its robot."""
+    truth: tuple[str, ...]
+    """Effects that are missing; `unknown`, or none: nothing changed."""
+    hidden: tuple[str, ...]
+    """Names of the injected effects."""
+    size: float
+    """RMS change over the validated error that the change was scaled by."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One case and the diagnosis of it."""
+
+    case: CaseFolder
+    """The case."""
+    answer: Answer
+    """What the diagnosis said."""
+
+
+def find_cases(folder: Path) -> list[CaseFolder]:
+    """All cases below a folder, in order of their names."""
+    found = []
+    for file in sorted(folder.rglob("truth.json")):
+        try:
+            about = json.loads(file.read_text())
+            truth, name = tuple(about["truth"]), str(about["robot"])
+            hidden = tuple(str(each["effect"]) for each in about["hidden"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{file}: not the truth of a case ({error!r})") from None
+        above = [parent for parent in file.parents[1:] if parent.is_relative_to(folder)]
+        homes = [*above, folder / name, folder / "robots" / name]
+        robot = next((home for home in homes if (home / "before").is_dir()), None)
+        if robot is None:
+            raise InputError(f"{file}: no folder 'before' of the robot '{name}' below {folder}")
+        size = float(about.get("size", 0.0))
+        found.append(CaseFolder(file.parent, robot, truth, hidden, size))
+    if not found:
+        raise InputError(f"{folder}: no truth.json below this folder, expected folders of cases")
+    return found
+
+
+def model_of(robot: Path) -> Path:
+    """Folder of the robot's model, which is fitted to the recordings before where it is absent."""
+    place = robot / "model"
+    if not (place / "config.json").is_file():
+        before = load_recordings(robot / "before", lambda text: None)
+        cache = Cache(robot / "fits")
+        fitted(before, FitOptions(), "measured", cache, silent)
+        (made,) = cache.folder.glob("model-*")
+        made.rename(place)
+    return place
+
+
+def judge(case: CaseFolder) -> Judged:
+    """The diagnosis of one case, with its robot's recordings from before."""
+    model = load_model(case.robot / "model")
+    before = load_recordings(case.robot / "before", lambda text: None)
+    after = load_recordings(case.place / "after", lambda text: None)
+    begin = time.process_time()
+    found = ask(model, after, before)
+    return Judged(case, answer_of(model, found, time.process_time() - begin))
+
+
+def run(cases: Sequence[CaseFolder], processes: int, report: Progress) -> list[Judged]:
+    """The diagnoses of all cases, models first, in order."""
+    robots = sorted({case.robot for case in cases})
+    total, done = len(robots) + len(cases), 0
+    judged: dict[Path, Judged] = {}
+    with workers(processes) as pool:
+        for future in as_completed([pool.submit(model_of, robot) for robot in robots]):
+            future.result()
+            done += 1
+            report(done, total, "models")
+        for future in as_completed([pool.submit(judge, case) for case in cases]):
+            one = future.result()
+            judged[one.case.place] = one
+            done += 1
+            report(done, total, one.case.place.name)
+    return [judged[case.place] for case in cases]
+
+
+def markdown(judged: Sequence[Judged]) -> str:
+    """Tables of all cases, and counts beside the goals."""
+    known = [j for j in judged if j.case.truth and UNKNOWN not in j.case.truth]
+    single = [j for j in known if len(j.case.truth) == 1]
+    pairs = [j for j in known if len(j.case.truth) > 1]
+    strange = [j for j in judged if UNKNOWN in j.case.truth]
+    clean = [j for j in judged if not j.case.truth]
+    sure = [j for j in judged if j.answer.kind in NAMING and j.answer.confidence >= SURE]
+    first = [j for j in single if j.answer.ranking[:1] == j.case.truth]
+    rows = [
+        ("right effect first in the ranking", len(first), len(single), ".95"),
+        ("named alone or in a set of two", _right(single), len(single), ".90"),
+        ("two effects, both named", _right(pairs), len(pairs), ".85"),
+        ("unknown called unknown", _right(strange), len(strange), ".80"),
+        ("named where nothing changed", _naming(clean), len(clean), ".02"),
+        (f"confidence >= {SURE} and right", _right(sure), len(sure), ".97"),
+        (
+            f"wrong name with confidence >= {CLAIMED}",
+            sum(misleads(j.answer, j.case.truth) for j in judged),
+            len(judged),
+            "0",
+        ),
+    ]
+    lines = ["| | found | goal |", "|---|---|---|"]
+    lines += [f"| {what} | {count} of {of} | {goal} |" for what, count, of, goal in rows]
+    lines += ["", "| robot | case | size | verdict | names | conf. | right |"]
+    lines += ["|---|---|---|---|---|---|---|"]
+    for j in judged:
+        names = ", ".join(j.answer.names) if j.answer.kind in NAMING else ""
+        good = "yes" if right(j.answer, j.case.truth) else "no"
+        lines.append(
+            f"| {j.case.robot.name} | {j.case.place.name} | {j.case.size:g} | {j.answer.kind} "
+            f"| {names} | {j.answer.confidence:.2f} | {good} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _right(some: Sequence[Judged]) -> int:
+    return sum(right(j.answer, j.case.truth) for j in some)
+
+
+def _naming(some: Sequence[Judged]) -> int:
+    return sum(j.answer.kind in NAMING for j in some)
+
+
+def to_json(judged: Sequence[Judged]) -> dict:
+    """Plain values of all cases."""
+    rows = [
+        {
+            "robot": j.case.robot.name,
+            "case": j.case.place.name,
+            "truth": list(j.case.truth),
+            "hidden": list(j.case.hidden),
+            "size": j.case.size,
+            **asdict(j.answer),
+        }
+        for j in judged
+    ]
+    return json_safe({"cases": rows})

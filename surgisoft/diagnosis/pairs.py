@@ -1,0 +1,819 @@
+"""Before and after: rows of two sets of recordings that were made with the same actuation.
+
+A model's residual holds what the model cannot describe. Where the same actuation was recorded
+before and after a change, that part is the same in both and cancels in the *paired difference*
+
+    d(t) = [y_after(t) - f(u_after)(t)] - [y_before(t') - f(u_before)(t')],    t' = t + delay,
+
+with y the measured key points and f the model's prediction, memory included. With equal actuation
+the two predictions are equal and d is measured minus measured; where the actuation differs a
+little, f(u_after) - f(u_before) is the first-order (and higher) correction for it. So the residual
+does not depend on how good the model is; only the sensitivities of the candidate effects do.
+
+An effect that acts before and after alike cancels as far as it is additive: what hysteresis or
+creep does to the *change* (a load moves the arm along another loop) is of second order and stays.
+
+Partners are found in three steps: windows of AFTER are searched in BEFORE by the mean squared
+difference of the actuation over all delays (computed by FFT); each delay that explains windows is
+refined to a fraction of a sample; a row is paired where the actuation agreed over the seconds
+before it. Delay estimation by matching: Knapp & Carter 1976, here with a squared difference in
+place of a correlation, because the level of an actuation counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.discrepancy import LENGTHS
+from surgisoft.diagnosis.residuals import (
+    BLOCK_ROWS,
+    LEAST_BLOCKS,
+    LEAST_DISCREPANCY,
+    ROWS,
+    Floor,
+    Problem,
+    ResidualTable,
+    model_discrepancy,
+    residual_table,
+)
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.measurement.recordings import Recording
+
+WINDOW_S = 20.0
+"""Length of the windows of AFTER that are searched in BEFORE, s: several blocks of time."""
+WINDOW_SHARE = 0.5
+"""Longest window as a share of the shorter of two runs, so that delays of up to the other half are
+found."""
+STRIDE_SHARE = 0.5
+"""Distance of two windows as a share of their length."""
+GRID_ROWS = 20_000
+"""Most samples of a run in the search; longer runs are searched on a coarser grid."""
+ALIKE = 0.03
+"""Largest difference of the actuation, as a share of its range, at which two rows count as the same
+(root mean square over the past, any chamber). The difference that remains is corrected by the
+model."""
+ALIKE_NOISES = 4.0
+"""Or: so many standard deviations of the actuation's noise in both recordings."""
+ALIKE_NOW = 2.0
+"""Largest difference at the row itself, in multiples of the one over the past."""
+PAST_S = 2.0
+"""Time before a row over which the actuation must agree, s: the longest of the memories by which
+motions are told apart (`residuals.MOTION_TIMES_S`)."""
+MOVES = 2.0
+"""A window counts where a chamber moves, RMS, by this multiple of what counts as the same: at rest
+every delay fits."""
+REFINEMENTS = 8
+"""Most Newton steps of a delay."""
+APART_S = 10.0
+"""Least delay at which a run repeats itself, s; a smaller one is the run itself."""
+LEAST_SHARE = 0.5
+"""Share of the training rows of AFTER that must have a partner for the paired difference to be
+used, or:"""
+LEAST_S = 60.0
+"""time with a partner from which fewer do, s."""
+SPECTRUM_S = 20.0
+"""Longest stretch of a power spectrum, s: four blocks of time."""
+FREE_POWER = 4.0
+"""Power of the measured motion over that of the predicted one from which motion is free."""
+LEAST_BINS = 8
+"""Lowest frequency at which motion can be free, in steps of the spectrum: below it the few bins say
+little, and creep and drift act there."""
+UNSEEN_NOISE = 1.0
+"""Repeatability beyond the noise floor, in noise floors, where BEFORE has no repeats that show it:
+slow noise is then taken to be as large as fast noise."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Rows of one run of AFTER that have their partners in one run of BEFORE at one delay."""
+
+    after: str
+    """Recording of AFTER."""
+    after_run: int
+    """Run, counted over all recordings of AFTER."""
+    before: str
+    """Recording of BEFORE."""
+    before_run: int
+    """Run, counted over all recordings of BEFORE."""
+    delay_s: float
+    """Time in BEFORE less time in AFTER, s; rows in place of s for steady-state samples."""
+    rows: int
+    """Rows of AFTER that are paired so."""
+    mismatch: float
+    """RMS difference of the actuation over these rows, as a share of its range."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """The partners of the N rows of AFTER in BEFORE, and how well BEFORE repeats itself."""
+
+    before: tuple[str, ...]
+    """Names of the recordings of BEFORE."""
+    stretches: tuple[Stretch, ...]
+    """What was paired with what, the longest first."""
+    partners: np.ndarray
+    """(N,) runs of BEFORE that a row has a partner in; partners are averaged."""
+    partner_t_s: np.ndarray
+    """(N,) time of the first partner in its recording, s; NaN where there is none."""
+    after_mm: np.ndarray
+    """(N, n, 3) measured key points of AFTER, base frame, mm; NaN where missing."""
+    before_mm: np.ndarray
+    """(N, n, 3) measured key points of the partner, corrected for the difference of the actuation,
+    base frame, mm; NaN where there is none."""
+    correction_mm: np.ndarray
+    """(N, n, 3) what the model says the difference of the actuation does, mm."""
+    repeatability_mm: np.ndarray
+    """(n,) RMS distance by which two recordings of the same motion differ at each key point where
+    nothing has changed, for one recording (their difference over root two), mm."""
+    source: str
+    """Where the repeatability is from: `repeats` of BEFORE, or `noise` where it has none."""
+    free_mm: np.ndarray
+    """(n,) RMS of the change at the frequencies of free motion, mm, see `free_motion`."""
+    noise_mm: np.ndarray
+    """(n,) RMS noise of the paired difference of each key point, free motion included, mm."""
+    discrepancy_mm: np.ndarray
+    """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
+    tolerance_mm: np.ndarray
+    """(n,) what the right effect may leave, mm: the discrepancy, and the share of the change that
+    the sensitivities of the effects are off by (`slope_error`)."""
+
+    @property
+    def paired(self) -> np.ndarray:
+        """(N,) bool: rows with a partner."""
+        return self.partners > 0
+
+    @property
+    def change_mm(self) -> np.ndarray:
+        """(N, n, 3) paired difference: AFTER less BEFORE, mm; NaN where a row has no partner."""
+        return self.after_mm - self.before_mm
+
+
+@dataclass(frozen=True)
+class Change:
+    """How far AFTER differs from BEFORE."""
+
+    before: tuple[str, ...]
+    """Names of the recordings of BEFORE."""
+    paired_share: float
+    """Share of the rows of AFTER with a partner in BEFORE, 0 to 1."""
+    change_mm: float | None
+    """RMS paired difference over all key points and training rows, mm; None without pairs."""
+    per_key_point_mm: tuple[float, ...]
+    """RMS paired difference of each key point, mm."""
+    repeatability_mm: float | None
+    """RMS distance by which a recording of the same motion differs where nothing changed, mm."""
+    repeatability_source: str
+    """`repeats`, `noise`, or `none` without pairs."""
+    free_mm: float
+    """RMS of the change at frequencies at which the arm moves freely (swings, vibration,
+    noise), mm; no effect explains it."""
+    mismatch: float
+    """RMS difference of the actuation between partners, as a share of its range."""
+    stretches: tuple[Stretch, ...]
+    """What was paired with what."""
+
+    @property
+    def sentence(self) -> str:
+        """The change in words."""
+        names = " + ".join(self.before)
+        if self.change_mm is None:
+            return f"no common actuation with {names}: compared through the model"
+        delays = sorted({f"{each.delay_s:.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
+        return (
+            f"{100 * self.paired_share:.0f} % of the rows have a partner in {names} (delay "
+            f"{', '.join(delays)}); change {self.change_mm:.3g} mm, repeatability "
+            f"{self.repeatability_mm:.3g} mm (from {self.repeatability_source})"
+        )
+
+    def to_json(self) -> dict:
+        """Plain values."""
+        return asdict(self) | {"sentence": self.sentence}
+
+
+DELAYS_SHOWN = 3
+"""Delays that a sentence lists."""
+
+
+# Runs as signals -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RunSignal:
+    """The actuation of one run."""
+
+    number: int
+    """Number of the run in its table."""
+    recording: str
+    """Name of its recording."""
+    rows: np.ndarray
+    """(T,) rows of the table."""
+    t_s: np.ndarray
+    """(T,) time, s; the number of the row for steady-state samples."""
+    values: np.ndarray
+    """(T, m) actuation as a share of its range."""
+    timed: bool = True
+    """Whether it is a continuous run, not one of steady-state samples."""
+
+    @property
+    def step_s(self) -> float:
+        """Usual distance of two samples, s."""
+        return float(np.median(np.diff(self.t_s))) if len(self.t_s) > 1 else 1.0
+
+    def at(self, t_s: np.ndarray) -> np.ndarray:
+        """(S, m) actuation at times (S,), between the samples linear; NaN outside."""
+        columns = [
+            np.interp(t_s, self.t_s, column, left=np.nan, right=np.nan) for column in self.values.T
+        ]
+        return np.stack(columns, axis=1)
+
+
+def run_signals(table: ResidualTable, commanded: bool) -> list[RunSignal]:
+    """The actuation of every run of a table, as commanded or as the model takes it."""
+    span, answer = np.array(table.spec.span), []
+    actuation = table.commanded if commanded else table.pressure
+    for number in np.unique(table.run):
+        rows = np.flatnonzero(table.run == number)
+        timed = bool(table.timed[rows[0]])
+        time = table.t_s[rows] if timed else np.arange(len(rows), dtype=float)
+        name = table.names[table.recording[rows[0]]]
+        answer.append(RunSignal(int(number), name, rows, time, actuation[rows] / span, timed))
+    return answer
+
+
+# Delays --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Rows of a run of AFTER that agree with a run of BEFORE at one delay."""
+
+    after: RunSignal
+    before: RunSignal
+    delay_s: float
+    """Time in BEFORE less time in AFTER, s."""
+    inside: np.ndarray
+    """(T,) bool: rows of the run of AFTER that are paired."""
+    mismatch: float
+    """RMS difference of the actuation over them, as a share of its range."""
+
+
+def matches(
+    after: RunSignal, before: RunSignal, alike: np.ndarray, apart_s: float = 0.0
+) -> list[Match]:
+    """Delays at which a run of AFTER repeats a run of BEFORE, the one with most rows first.
+
+    alike: (m,) difference of each chamber, as a share of its range, that counts as the same;
+    apart_s: least size of a delay, s. A row belongs to one match only.
+    """
+    step = max(after.step_s, before.step_s, _length(after) / GRID_ROWS, _length(before) / GRID_ROWS)
+    a, b = _on_grid(after, step), _on_grid(before, step)
+    longest = WINDOW_S / step if after.timed else BLOCK_ROWS * LEAST_BLOCKS
+    width = int(min(longest, WINDOW_SHARE * min(len(a), len(b))))
+    if width < BLOCK_ROWS:
+        return []
+    begins = np.arange(0, len(a) - width + 1, max(1, int(STRIDE_SHARE * width)))
+    moving = [(a[i : i + width].std(0) >= MOVES * alike).any() for i in begins]
+    begins = begins[np.array(moving, bool)]
+    lags = np.arange(-len(a) + 1, len(b))
+    fits = np.zeros((len(begins), len(lags)), bool)
+    apart = np.zeros((len(begins), len(lags)))
+    for number, begin in enumerate(begins):
+        found = _window_misfit(a[begin : begin + width], b, alike)
+        first = len(a) - 1 - begin
+        fits[number, first : first + len(found)] = found <= 1.0
+        apart[number, first : first + len(found)] = found
+    offset = before.t_s[0] - after.t_s[0]
+    if apart_s:
+        fits[:, np.abs(lags * step + offset) < apart_s] = False
+    free, answer = np.full(len(after.rows), True), []
+    while fits.any():
+        count = fits.sum(0)
+        tied = np.flatnonzero(count == count.max())
+        best = tied[np.argmin((apart * fits)[:, tied].sum(0))]
+        delay = _refined(after, before, float(lags[best] * step + offset), alike, 2 * step)
+        inside, mismatch = _agree(after, before, delay, alike)
+        inside &= free
+        # Delays within a window's own uncertainty of this one are this one.
+        done = fits[:, best].copy()
+        fits[done] = False
+        if inside.sum() >= BLOCK_ROWS:
+            free &= ~inside
+            level = float(np.sqrt(np.mean(np.square(mismatch[inside]))))
+            answer.append(Match(after, before, delay, inside, level))
+    return sorted(answer, key=lambda match: -int(match.inside.sum()))
+
+
+def _length(signal: RunSignal) -> float:
+    return float(np.ptp(signal.t_s))
+
+
+def _on_grid(signal: RunSignal, step: float) -> np.ndarray:
+    """(G, m) the actuation at even times from the run's first on."""
+    count = int(_length(signal) / step + 1e-6) + 1
+    return signal.at(np.minimum(signal.t_s[0] + step * np.arange(count), signal.t_s[-1]))
+
+
+def _window_misfit(window: np.ndarray, b: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """(G - W + 1,) mean squared difference of a window (W, m) and b (G, m) from each place on.
+
+    In units of what counts as the same, of the chamber that differs most.
+    """
+    size = len(window) + len(b)
+    length = 1 << (size - 1).bit_length()
+    middle = window.mean(0)
+    x, y = window - middle, b - middle
+    cross = np.fft.irfft(
+        np.conj(np.fft.rfft(x, length, axis=0)) * np.fft.rfft(y, length, axis=0), length, axis=0
+    )[: len(b) - len(window) + 1]
+    sums = np.cumsum(np.vstack([np.zeros(y.shape[1]), np.square(y)]), axis=0)
+    moving = sums[len(window) :] - sums[: len(sums) - len(window)]
+    square = (np.square(x).sum(0) - 2 * cross + moving) / len(window)
+    return (np.maximum(square, 0.0) / np.square(alike)).max(1)
+
+
+def _refined(
+    after: RunSignal, before: RunSignal, delay: float, alike: np.ndarray, reach: float
+) -> float:
+    """The delay at which the slope of the misfit is zero, from one that is right to a sample.
+
+    Newton steps on sum a'(t) (b(t + delay) - a(t)) = 0 with the central difference a' of AFTER: its
+    noise is independent of that of a(t) and of b, so the noise of the actuation causes no bias (the
+    least squared difference itself prefers delays between samples, where interpolation averages
+    noise). reach: farthest that it may go, s.
+    """
+    if not after.timed or len(after.t_s) < 3:
+        return float(round(delay))
+    slope = np.zeros_like(after.values)
+    dt = after.t_s[2:] - after.t_s[:-2]
+    slope[1:-1] = (after.values[2:] - after.values[:-2]) / dt[:, None]
+    start = delay
+    for _ in range(REFINEMENTS):
+        difference = before.at(after.t_s + delay) - after.values
+        whole = np.isfinite(difference).all(1) & (np.abs(difference) <= MOVES * alike).all(1)
+        power = np.square(slope[whole] / alike).sum()
+        if power <= 0:
+            return start
+        change = -float((slope[whole] * difference[whole] / np.square(alike)).sum() / power)
+        delay = float(np.clip(delay + change, start - reach, start + reach))
+        if abs(change) < 1e-6:
+            break
+    return delay
+
+
+def _agree(
+    after: RunSignal, before: RunSignal, delay: float, alike: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """((T,) bool, (T,) share): rows that agree with BEFORE at a delay, and their RMS difference."""
+    difference = before.at(after.t_s + delay) - after.values
+    inside = np.isfinite(difference).all(1)
+    scaled = np.where(inside[:, None], np.square(difference / alike), 0.0)
+    past = PAST_S if after.timed else 1.0
+    sums = np.cumsum(np.vstack([np.zeros(scaled.shape[1]), scaled]), axis=0)
+    # Rows from the begin of the common stretch on, at most so far back.
+    begin = np.flatnonzero(inside)[0] if inside.any() else 0
+    first = np.maximum(np.searchsorted(after.t_s, after.t_s - past - 1e-9), begin)
+    rows = np.arange(len(after.t_s))
+    count = np.maximum(rows + 1 - first, 1)
+    mean = (sums[rows + 1] - sums[np.minimum(first, rows)]) / count[:, None]
+    alike_past = (mean <= 1.0).all(1)
+    alike_now = (scaled <= ALIKE_NOW**2).all(1)
+    # Memories of the two runs agree from their first rows on, or after some time.
+    both_begin = abs(after.t_s[0] + delay - before.t_s[0]) <= 1.5 * after.step_s
+    known = both_begin | (after.t_s - after.t_s[begin] >= past)
+    ok = inside & alike_past & alike_now & known
+    return ok, np.sqrt(np.nan_to_num(np.square(difference).mean(1)))
+
+
+# Tables --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What BEFORE says about the rows of AFTER."""
+
+    residual_mm: np.ndarray
+    """(N, n, 3) mean residual of the partners, mm; NaN where there is none."""
+    predicted_mm: np.ndarray
+    """(N, n, 3) mean prediction of the partners, mm."""
+    partners: np.ndarray
+    """(N,) number of them."""
+    partner_t_s: np.ndarray
+    """(N,) time of the first one, s."""
+    averaging: np.ndarray
+    """(N,) factor on the variance of BEFORE's noise, by interpolation and by averaging."""
+    stretches: tuple[Stretch, ...]
+
+
+def _alike(after: ResidualTable, before: ResidualTable, commanded: bool) -> np.ndarray:
+    """(m,) difference of each chamber, as a share of its range, that counts as the same."""
+    span = np.array(after.spec.span)
+    noise = [
+        np.zeros(len(span)) if table.history.noise is None else np.array(table.history.noise)
+        for table in (after, before)
+    ]
+    noise_share = 0.0 if commanded else ALIKE_NOISES * np.hypot(*noise) / span
+    return np.maximum(ALIKE, noise_share)
+
+
+def _partners(after: ResidualTable, before: ResidualTable, itself: bool = False) -> _Found:
+    """The partners of every row of AFTER; itself: BEFORE is the same table, rows are not their own
+    partners."""
+    shape = after.measured_mm.shape
+    # A command has no noise, and a change of the arm does not change it.
+    commanded = all(np.isfinite(table.commanded).all() for table in (after, before))
+    alike = _alike(after, before, commanded)
+    sums, predicted = np.zeros(shape), np.zeros(shape)
+    seen, averaging = np.zeros(shape[:2]), np.zeros(shape[0])
+    partners, time = np.zeros(shape[0], int), np.full(shape[0], np.nan)
+    stretches = []
+    others = run_signals(before, commanded)
+    for one in run_signals(after, commanded):
+        for other in others:
+            if one.timed != other.timed:
+                continue
+            same = itself and one.number == other.number
+            if itself and one.number > other.number:
+                continue
+            for match in matches(one, other, alike, APART_S if same else 0.0):
+                at = one.t_s[match.inside] + match.delay_s
+                rows = one.rows[match.inside]
+                lower = np.clip(np.searchsorted(other.t_s, at, "right") - 1, 0, len(other.t_s) - 2)
+                share = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
+                share = np.clip(share, 0.0, 1.0)
+                lower = other.rows[lower]
+                residual = _between(before.residual_mm, lower, share)
+                ok = np.isfinite(residual).all(2)
+                sums[rows] += np.where(ok[..., None], residual, 0.0)
+                predicted[rows] += _between(before.predicted_mm, lower, share)
+                seen[rows] += ok
+                partners[rows] += 1
+                averaging[rows] += share**2 + (1 - share) ** 2
+                time[rows] = np.where(np.isnan(time[rows]), at, time[rows])
+                stretches.append(
+                    Stretch(
+                        one.recording,
+                        one.number,
+                        other.recording,
+                        other.number,
+                        match.delay_s,
+                        len(rows),
+                        match.mismatch,
+                    )
+                )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        residual = sums / np.where(seen, seen, np.nan)[..., None]
+        predicted = predicted / np.where(partners, partners, np.nan)[:, None, None]
+        averaging = averaging / np.where(partners, partners, np.nan) ** 2
+    stretches.sort(key=lambda stretch: -stretch.rows)
+    return _Found(residual, predicted, partners, time, averaging, tuple(stretches))
+
+
+def _between(values: np.ndarray, lower: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(S, n, 3) values between the rows `lower` and those behind them; exact at share 0 or 1."""
+    upper = np.minimum(lower + 1, len(values) - 1)
+    w = share[:, None, None]
+    first = np.where(w < 1, values[lower], 0.0) * (1 - w)
+    return first + np.where(w > 0, values[upper], 0.0) * w
+
+
+def paired_table(after: ResidualTable, before: ResidualTable) -> tuple[ResidualTable | None, Pairs]:
+    """AFTER's table with the paired difference in place of the residual, and the pairs.
+
+    The measured key points become those that would have been measured if the model made no other
+    errors after than before: measured less the partner's residual. Rows without a partner are NaN.
+    None where too few rows have one.
+    """
+    pairs = _pairs(after, before, _partners(after, before))
+    if not _enough(after, pairs):
+        return None, pairs
+    change, noise = pairs.change_mm, pairs.noise_mm
+    measured = after.predicted_mm + change
+    points = after.history.key_points.clone()
+    points[after.history.valid] = torch.from_numpy(measured).to(points.dtype)
+    paired = replace(
+        after,
+        measured_mm=measured,
+        history=replace(after.history, key_points=points),
+        noise_mm=noise,
+        floor=Floor(float(np.sqrt(np.mean(noise**2))), "pairs"),
+        paired_discrepancy_mm=pairs.discrepancy_mm,
+        paired_tolerance_mm=pairs.tolerance_mm,
+    )
+    return paired, pairs
+
+
+def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
+    """The pairs that the partners amount to; what they say about errors is of training rows."""
+    paired, training = found.partners > 0, ~after.held_out
+    measured_before = found.residual_mm + found.predicted_mm
+    correction = after.predicted_mm - found.predicted_mm
+    correction = without_noise(after, after.measured_mm - measured_before, correction)
+    change = after.measured_mm - measured_before - correction
+    noise = np.sqrt(
+        np.square(after.noise_mm)
+        + np.square(before.noise_mm) * (np.nanmean(found.averaging) if paired.any() else 1.0)
+    )
+    free = free_motion(after, measured_before, found.predicted_mm, change)
+    noise = np.maximum(noise, free)
+    repeatability, source = _repeatability(before)
+    slope = slope_error(after)
+    discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
+    return Pairs(
+        before=before.names,
+        stretches=found.stretches,
+        partners=found.partners,
+        partner_t_s=found.partner_t_s,
+        after_mm=after.measured_mm,
+        before_mm=after.measured_mm - change,
+        correction_mm=correction,
+        repeatability_mm=repeatability,
+        source=source,
+        free_mm=free,
+        noise_mm=noise,
+        discrepancy_mm=discrepancy,
+        tolerance_mm=np.hypot(discrepancy, slope * rms_by_point(change[training])),
+    )
+
+
+def without_noise(
+    after: ResidualTable, difference_mm: np.ndarray, correction_mm: np.ndarray
+) -> np.ndarray:
+    """(N, n, 3) the correction for the actuation, its fast part only as far as the arm followed it.
+
+    Differences of a measured actuation are real, or noise of its sensors, which moves no arm. What
+    is slower than PAST_S is taken for real. Of the rest a share is, found by regression of the
+    steps of the measured difference on those of the correction (training rows, one number).
+    """
+    if not after.timed.any():
+        return correction_mm
+    slow = np.full_like(correction_mm, np.nan)
+    for signal in run_signals(after, False):
+        width = max(1, round(PAST_S / signal.step_s))
+        slow[signal.rows] = _moving_mean(correction_mm[signal.rows], width)
+    fast = correction_mm - slow
+    same = (after.run[1:] == after.run[:-1]) & ~after.held_out[1:] & ~after.held_out[:-1]
+    left, right = np.diff(difference_mm, axis=0)[same], np.diff(fast, axis=0)[same]
+    seen = np.isfinite(left) & np.isfinite(right)
+    power = float(np.square(right[seen]).sum())
+    share = float((left[seen] * right[seen]).sum()) / power if power > 0 else 0.0
+    return slow + float(np.clip(share, 0.0, 1.0)) * fast
+
+
+def _moving_mean(field: np.ndarray, width: int) -> np.ndarray:
+    """(T, ...) mean over `width` rows around each row, of what is not NaN; NaN where nothing is."""
+    seen = np.isfinite(field)
+    empty = np.zeros((1, *field.shape[1:]))
+    sums = np.concatenate([empty, np.cumsum(np.where(seen, field, 0.0), axis=0)])
+    counts = np.concatenate([empty, np.cumsum(seen, axis=0)])
+    rows = np.arange(len(field))
+    low, high = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(field))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (sums[high] - sums[low]) / (counts[high] - counts[low])
+
+
+def free_motion(
+    after: ResidualTable,
+    measured_before_mm: np.ndarray,
+    predicted_before_mm: np.ndarray,
+    change_mm: np.ndarray,
+) -> np.ndarray:
+    """(n,) RMS of the change of each key point at the frequencies of free motion, mm.
+
+    An arm that swings, vibrates or is measured with noise moves at frequencies that the actuation
+    hardly contains: there BEFORE or AFTER shows FREE_POWER times the power that the model predicts,
+    or more.
+    No change of gain below 1 and no delay of a predicted motion has so much (|1 - exp(i phi)|^2 is
+    at most 4), so no effect of the catalogue explains what changes there, and it counts as noise of
+    the pair. Power by the method of Welch (1967), in bands of a third of an octave.
+    """
+    points = change_mm.shape[1]
+    fields = np.concatenate(
+        [measured_before_mm, after.measured_mm, predicted_before_mm, after.predicted_mm, change_mm],
+        axis=1,
+    )
+    count, power = 0, None
+    signals = [signal for signal in run_signals(after, False) if signal.timed]
+    if not signals:
+        return np.zeros(points)
+    step = float(np.median(np.concatenate([np.diff(signal.t_s) for signal in signals])))
+    length = int(2 ** np.floor(np.log2(max(2.0, SPECTRUM_S / step))))
+    for signal in signals:
+        rows = signal.rows[~after.held_out[signal.rows]]
+        seen = np.isfinite(fields[rows]).all((1, 2))
+        if seen.sum() < length:
+            continue
+        time = after.t_s[rows][seen]
+        even = np.arange(time[0], time[-1], step)
+        flat = fields[rows][seen].reshape(seen.sum(), -1)
+        values = np.stack([np.interp(even, time, column) for column in flat.T], axis=1)
+        for begin in range(0, len(even) - length + 1, length // 2):
+            found = _power(values[begin : begin + length]).reshape(-1, 5, points, 3).sum(3)
+            power, count = found if power is None else power + found, count + 1
+    if power is None:
+        return np.zeros(points)
+    total = power / count
+    frequency = np.fft.rfftfreq(length, step)
+    band = np.floor(3.0 * np.log2(np.maximum(frequency, frequency[1]) / frequency[1])).astype(int)
+    free = np.zeros(points)
+    for number in range(band[LEAST_BINS] + 1, band.max() + 1):
+        level = total[band == number].sum(0)
+        before, later, predicted_before, predicted_later = level[:4].sum(1)
+        if before >= FREE_POWER * predicted_before or later >= FREE_POWER * predicted_later:
+            free += level[4]
+    return np.sqrt(free)
+
+
+def _power(values: np.ndarray) -> np.ndarray:
+    """(F, C) power of signals (T, C) at each frequency; their sum is the variance."""
+    window = np.hanning(len(values))
+    spectrum = np.fft.rfft((values - values.mean(0)) * window[:, None], axis=0)
+    power = np.square(np.abs(spectrum)) / np.square(window).sum() / len(values)
+    power[1:-1] *= 2.0
+    return power
+
+
+def _enough(after: ResidualTable, pairs: Pairs) -> bool:
+    """Whether enough of the training rows have a partner to diagnose the paired difference."""
+    shown = np.isfinite(after.measured_mm).all(2).any(1) & ~after.held_out
+    both = shown & np.isfinite(pairs.change_mm).all(2).any(1)
+    if both.sum() < 2 * LEAST_BLOCKS * BLOCK_ROWS:
+        return False
+    step = np.median(np.concatenate([np.diff(s.t_s) for s in run_signals(after, False)]))
+    enough_time = after.timed.any() and both.sum() * step >= LEAST_S
+    return bool(both.sum() >= LEAST_SHARE * shown.sum() or enough_time)
+
+
+def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
+    """(n,) RMS distance by which a recording of the same motion differs, mm, and its source.
+
+    Two recordings of BEFORE differ by twice the variance of one.
+    """
+    found = _partners(before, before, itself=True)
+    difference = before.residual_mm - found.residual_mm
+    square = np.square(difference).sum(2)
+    # A mean of several partners has less of a variance.
+    square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
+    seen = np.isfinite(square)
+    if (seen.sum(0) < 2 * LEAST_BLOCKS * BLOCK_ROWS).any():
+        return np.hypot(1.0, UNSEEN_NOISE) * before.noise_mm, "noise"
+    return np.sqrt(np.nanmean(square, axis=0)), "repeats"
+
+
+def paired_discrepancy(
+    repeatability_mm: np.ndarray, correction_mm: np.ndarray, noise_mm: np.ndarray, slope: float
+) -> np.ndarray:
+    """(n,) RMS systematic error of the paired difference of each key point, mm, without noise.
+
+    What BEFORE does not repeat, without the noise of the pair (`noise_mm`), and the error of the
+    correction for the actuation, of which the model's slope is off by a share (`slope`):
+
+        discrepancy^2 = max(2 repeatability^2 - noise^2, (least noise)^2) + (slope correction)^2.
+
+    It takes the place of the model discrepancy, in its size and its form: a smooth function of the
+    actuation that is the same in every repeat.
+    """
+    slow = np.maximum(2 * repeatability_mm**2 - noise_mm**2, (LEAST_DISCREPANCY * noise_mm) ** 2)
+    return np.sqrt(slow + (slope * rms_by_point(correction_mm)) ** 2)
+
+
+def rms_by_point(field_mm: np.ndarray) -> np.ndarray:
+    """(n,) RMS distance of a field (N, n, 3), mm; NaN counts as missing, nothing at all as 0."""
+    square = np.square(field_mm).sum(2)
+    count = np.isfinite(square).sum(0)
+    return np.sqrt(np.nansum(square, axis=0) / np.maximum(count, 1))
+
+
+def slope_error(table: ResidualTable) -> float:
+    """Error of a model's slopes as a share of them, at most 1.
+
+    Values off by e (validated error over the RMS motion that the model predicts) have slopes that
+    are off by more, the shorter the scales of the error are: a Matern-5/2 function of unit variance
+    and length l has slopes of variance 5 / (3 l^2) (Rasmussen & Williams 2006, sec. 4.2), here the
+    mixture of lengths of the model discrepancy. A motion of m chambers, each spread evenly over its
+    range of -1 to 1 with a slope s, is m s^2 / 3 in the mean square.
+    """
+    motion = table.predicted_mm - table.predicted_mm.mean(0)
+    moved = float(np.sqrt(np.mean(np.square(motion).sum(2))))
+    error = float(np.sqrt(np.mean(model_discrepancy(table.model, table.noise_mm) ** 2)))
+    steepness = sum(share * 5.0 / (3.0 * length**2) for length, share in LENGTHS)
+    return min(1.0, np.sqrt(steepness * table.spec.chambers / 3.0) * error / max(moved, 1e-9))
+
+
+# Before and after ----------------------------------------------------------------------------
+
+Paired = Literal["auto", "always", "never"]
+"""Whether rows are paired: where enough have a partner, or it is an error if too few have, or not
+at all."""
+PAIRED: tuple[Paired, ...] = get_args(Paired)
+
+
+@dataclass(frozen=True, eq=False)
+class BeforeAfter:
+    """Recordings of an arm before and after a change, under one model."""
+
+    table: ResidualTable
+    """Residuals of AFTER: paired differences where `used`, else those of the model."""
+    plain: ResidualTable
+    """Residuals of the model on AFTER."""
+    before: tuple[Recording, ...]
+    """The recordings of BEFORE."""
+    pairs: Pairs
+    """The partners of the rows of AFTER."""
+    used: bool
+    """Whether the paired difference is what is explained."""
+
+    @property
+    def names(self) -> str:
+        """The recordings of BEFORE, for a sentence."""
+        return " + ".join(self.pairs.before)
+
+    def training(self, rows: int = ROWS) -> Problem:
+        """The training rows of AFTER; without pairs the residuals of BEFORE are their reference."""
+        problem = self.table.training(rows)
+        return problem if self.used else problem.with_reference(self.before)
+
+    def with_held_out_pairs(self) -> "BeforeAfter":
+        """These recordings; through the model where too few held-out rows have a partner."""
+        shown = np.isfinite(self.plain.measured_mm).all(2).any(1) & self.plain.held_out
+        both = shown & self.pairs.paired
+        if not self.used or both.sum() >= LEAST_SHARE * shown.sum():
+            return self
+        return replace(self, table=self.plain, used=False)
+
+    @property
+    def change(self) -> Change:
+        """How far AFTER differs from BEFORE."""
+        pairs, training = self.pairs, ~self.table.held_out
+        share = float(pairs.paired[training].mean())
+        if not self.used:
+            return Change(pairs.before, share, None, (), None, "none", 0.0, 0.0, pairs.stretches)
+        square = np.square(pairs.change_mm[training]).sum(2)
+        counts = np.array([each.rows for each in pairs.stretches])
+        mismatch = np.array([each.mismatch for each in pairs.stretches])
+        return Change(
+            before=pairs.before,
+            paired_share=share,
+            change_mm=float(np.sqrt(np.nanmean(square))),
+            per_key_point_mm=tuple(float(x) for x in np.sqrt(np.nanmean(square, axis=0))),
+            repeatability_mm=float(np.sqrt(np.mean(pairs.repeatability_mm**2))),
+            repeatability_source=pairs.source,
+            free_mm=float(np.sqrt(np.mean(pairs.free_mm**2))),
+            mismatch=float(np.sqrt(np.average(mismatch**2, weights=counts))),
+            stretches=pairs.stretches,
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the reader of a result must know."""
+        if self.used:
+            return ()
+        share = float(self.pairs.paired[~self.table.held_out].mean())
+        return (
+            f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
+            f"{self.names}: compared through the model, whose error counts; record the same "
+            "protocol before and after",
+        )
+
+
+def before_and_after(
+    table: ResidualTable, before: Sequence[Recording], paired: Paired = "auto"
+) -> BeforeAfter:
+    """Pair AFTER's residual table with recordings from before a change."""
+    if paired not in PAIRED:
+        raise unknown_name("choice of pairing", paired, PAIRED)
+    before = tuple(before)
+    if not before:
+        raise InputError("no recording from before the change; expected at least one")
+    other = residual_table(table.model, list(before))
+    _check_common_range(table, other)
+    if paired == "never":
+        empty = replace(other, run=np.full(len(other.run), -1))
+        return BeforeAfter(
+            table, table, before, _pairs(table, other, _partners(table, empty)), False
+        )
+    found, pairs = paired_table(table, other)
+    if found is None and paired == "always":
+        raise InputError(
+            f"{' + '.join(table.names)}: only {100 * pairs.paired.mean():.0f} % of the rows were "
+            f"recorded with the same actuation as {' + '.join(pairs.before)}; record the same "
+            "protocol before and after, or leave out --paired always"
+        )
+    return BeforeAfter(found or table, table, before, pairs, found is not None)
+
+
+def _check_common_range(after: ResidualTable, before: ResidualTable) -> None:
+    """Raise where the actuation of BEFORE and AFTER has no range in common."""
+    for chamber in range(after.spec.chambers):
+        (a, b), (c, d) = (
+            (table.pressure[:, chamber].min(), table.pressure[:, chamber].max())
+            for table in (after, before)
+        )
+        if min(b, d) < max(a, c):
+            raise InputError(
+                f"{' + '.join(before.names)}: chamber {chamber + 1} goes from {c:.4g} to {d:.4g} "
+                f"{after.spec.unit}, and after the change from {a:.4g} to {b:.4g}: no common "
+                "actuation; use a recording from before the change that moves over the same range"
+            )

@@ -1,0 +1,344 @@
+"""The set-up tests of a diagnosis: what is wrong before any physics, and what mends it."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from surgisoft.diagnosis.residuals import EVERY_ROW, model_discrepancy, noise_of
+from surgisoft.diagnosis.setup.alignment import HANDED, Frame, angle, shifted
+from surgisoft.diagnosis.setup.arrangements import units
+from surgisoft.diagnosis.setup.blind import Blind, blind_channel
+from surgisoft.diagnosis.setup.channels import Dead, dead_channels
+from surgisoft.diagnosis.setup.correction import Correction
+from surgisoft.diagnosis.setup.sample import Arrangement, sample_of
+from surgisoft.diagnosis.setup.search import (
+    PROOF,
+    SETTINGS,
+    Fitted,
+    Found,
+    Hypothesis,
+    Levels,
+    Search,
+)
+from surgisoft.diagnosis.setup.words import SetupFault, faults_of, joined, signed_axes
+from surgisoft.measurement.histories import actuation_of
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.model import ArmModel
+
+EXACT_RAD = 0.09
+"""A frame is one whose axes were swapped or mirrored, and nothing else, up to this turn beside it:
+5 degrees."""
+LEAST_MOTION = 0.05
+"""A key point that stands still is dead if it should move by this share of the one that moves
+most."""
+WHOLE = 0.95
+"""A key point is dead, not frozen for a while, from this share of the rows on."""
+MOST_APART = 8
+"""Most recordings that are tested one by one where they share no fault."""
+
+
+@dataclass(frozen=True)
+class SetupResult:
+    """What is wrong with the set-up of some recordings."""
+
+    faults: tuple[SetupFault, ...]
+    """The faults; all of them hold together."""
+    alternatives: tuple[tuple[SetupFault, ...], ...]
+    """Other explanations that do as well, each with the faults that it consists of."""
+    sentence: str
+    """What is wrong, and what the correction does to the error."""
+    mending: str
+    """Lines of the import's map that mend it, or what else to do."""
+    alternative_mendings: tuple[str, ...]
+    """The same for each alternative."""
+    how_to_tell: str
+    """How to find out which explanation is right; empty where there is one."""
+    before_mm: float
+    """RMS error of the model as recorded, on the training rows, mm."""
+    after_mm: float
+    """Held-out RMS error with the correction, mm."""
+    floor_mm: float
+    """Noise floor, mm."""
+    recordings: tuple[str, ...]
+    """Names of the recordings that it holds for."""
+    mendable: bool
+    """Whether the recordings can be mended without recording again."""
+    correction: Correction
+    """What mends a recording."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of the faults."""
+        return tuple(fault.kind for fault in self.faults)
+
+    def mended(self, recordings: Sequence[Recording]) -> list[Recording]:
+        """The recordings, those that the faults hold for mended."""
+        return [
+            self.correction.applied(recording) if recording.name in self.recordings else recording
+            for recording in recordings
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, for `diagnose --json`."""
+        return {
+            "faults": [asdict(fault) for fault in self.faults],
+            "alternatives": [[asdict(fault) for fault in some] for some in self.alternatives],
+            "sentence": self.sentence,
+            "mending": self.mending,
+            "alternative_mendings": list(self.alternative_mendings),
+            "how_to_tell": self.how_to_tell,
+            "before_mm": self.before_mm,
+            "after_mm": self.after_mm,
+            "floor_mm": self.floor_mm,
+            "recordings": list(self.recordings),
+            "mendable": self.mendable,
+        }
+
+
+def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> SetupResult | None:
+    """The faults of the set-up that recordings of a model's arm show; None where none is proved.
+
+    All recordings are tested together first. Where they share no fault, each is tested alone: one
+    of several may have been recorded after a camera was moved.
+    """
+    measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
+    if not measured:
+        return None
+    found = _of_one_setup(model, measured)
+    if found is not None or len(measured) == 1:
+        return found
+    alone = {}
+    for recording in measured[:MOST_APART]:
+        result = _of_one_setup(model, [recording])
+        if result is not None:
+            alone[recording.name] = result
+    if not alone:
+        return None
+    first = next(iter(alone.values()))
+    same = [name for name, result in alone.items() if result.kinds == first.kinds]
+    together = _of_one_setup(model, [each for each in measured if each.name in same])
+    return together or first
+
+
+def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult | None:
+    """The faults of recordings that share them."""
+    noise, _ = noise_of(recordings)
+    discrepancy = model_discrepancy(model, noise)
+    levels = Levels(float(np.sqrt(np.mean(noise**2))), float(np.sqrt(np.mean(discrepancy**2))))
+    dead, masked, commanded = dead_channels(model.spec, recordings)
+    search = _search(model, masked, levels)
+    found = search.run()
+    taken: tuple[int, ...] = ()
+    blind: Blind | None = None
+    if dead.chambers and search.noticed:
+        if commanded is not masked:
+            driven = _search(model, commanded, levels)
+            better = driven.run()
+            after = better.best.rmse_mm if better else driven.start.rmse_mm
+            if driven.explains(search.raw.rmse_mm, after):
+                search, found, taken = driven, better, dead.chambers
+        if not taken and found is None and len(dead.chambers) == 1:
+            blind = blind_channel(search, dead.chambers[0])
+    return _Report(model, recordings, search, found, dead, taken, blind).result()
+
+
+def _search(model: ArmModel, recordings: list[Recording], levels: Levels) -> Search:
+    coarse = sample_of(model, recordings, SETTINGS.coarse_rows)
+    fine = sample_of(model, recordings, SETTINGS.fine_rows)
+    full = sample_of(model, recordings, EVERY_ROW)
+    actuation = np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings])
+    return Search(coarse, fine, full, levels, units(model.spec, actuation))
+
+
+@dataclass(frozen=True, eq=False)
+class _Report:
+    """What the tests of some recordings found, before it is put into words."""
+
+    model: ArmModel
+    recordings: list[Recording]
+    search: Search
+    found: Found | None
+    dead: Dead
+    taken: tuple[int, ...]
+    """Dead channels in whose place the command explains the motion."""
+    blind: Blind | None
+
+    def result(self) -> SetupResult | None:
+        """The result in words; None where nothing is wrong."""
+        best = self.found.best if self.found else self.search.start
+        given = self.blind.hypothesis if self.blind else best.hypothesis
+        frame = self.blind.frame if self.blind else self._exact(best)
+        before = self._raw_error()
+        after = self.blind.rmse_mm if self.blind else best.rmse_mm
+        lost = self._lost(given)
+        silent = (self.blind.channel,) if self.blind else self.taken
+        proved = self.found or self.blind or self.search.explains(before, after)
+        frozen = self.dead.frozen if proved else {}
+        faults = [_dead_key_point(k, self.dead.key_points[k]) for k in lost]
+        faults += [_dead_chamber(k, self.blind) for k in silent]
+        faults += [_frozen_chamber(k, share) for k, share in frozen.items()]
+        if self.found:
+            faults += self._faults(best, frame)
+        elif self.blind:
+            faults += self.blind.further(self._unit, self._recorded(given))
+        if not faults:
+            return None
+        whole = self.dead.key_points
+        correction = replace(
+            self._correction(given, frame),
+            from_command=self.taken,
+            lost=tuple(k for k in lost if whole[k] > WHOLE),
+            stale=tuple(k for k in lost if whole[k] <= WHOLE),
+            frozen=bool(frozen),
+        )
+        others = [(o, self._exact(o)) for o in (self.found.as_good if self.found else ())]
+        alternatives = tuple(tuple(self._faults(o, f)) for o, f in others)
+        mending, mendable = self._mending(correction)
+        text = "; or ".join(joined(some) for some in (faults, *alternatives))
+        if mendable:
+            text += f": mended, the error falls from {before:.3g} to {after:.3g} mm"
+        return SetupResult(
+            faults=tuple(faults),
+            alternatives=alternatives,
+            sentence=text,
+            mending=mending,
+            alternative_mendings=tuple(
+                self._correction(o.hypothesis, f).lines(self._commands) for o, f in others
+            ),
+            how_to_tell=_how_to_tell(faults, alternatives),
+            before_mm=before,
+            after_mm=after,
+            floor_mm=self.search.levels.noise,
+            recordings=tuple(recording.name for recording in self.recordings),
+            mendable=mendable,
+            correction=correction,
+        )
+
+    @property
+    def _unit(self) -> str:
+        """The model's unit of actuation."""
+        return self.model.spec.unit
+
+    @property
+    def _commands(self) -> bool:
+        """Whether every recording has a command."""
+        return all(recording.commanded is not None for recording in self.recordings)
+
+    def _recorded(self, given: Hypothesis) -> str:
+        """The unit that the actuation is truly in."""
+        names = {factor: unit for unit, factor in self.search.units.items()}
+        return names.get(given.arrangement.factor, self._unit)
+
+    def _faults(self, given: Fitted, frame: Frame) -> list[SetupFault]:
+        return faults_of(given, frame, self._unit, self._recorded(given.hypothesis))
+
+    def _exact(self, given: Fitted) -> Frame:
+        """The frame of an explanation: axes or a shift only, where these do as well."""
+        if given.hypothesis.frame not in HANDED:
+            return given.frame
+        axes = signed_axes()
+        axes = axes[np.linalg.det(axes) * np.linalg.det(given.frame.rotation) > 0]
+        apart = angle(np.einsum("aij,kj->aik", axes, given.frame.rotation))
+        nearest = axes[int(apart.argmin())]
+        if apart.min() > EXACT_RAD:
+            return given.frame
+        scale, sums = given.frame.scale, given.blocks.summed()
+        limit = PROOF.as_good * max(given.rmse_mm, self.search.levels.reference)
+        for plain in (Frame(nearest, np.zeros(3), scale), shifted(nearest, sums, scale)):
+            if np.sqrt(sums.mean_square(plain)) <= limit:
+                return plain
+        return given.frame
+
+    def _correction(self, given: Hypothesis, frame: Frame) -> Correction:
+        turned = given.frame in HANDED
+        rotation = np.asarray(frame.rotation).T
+        exact = np.abs(rotation - np.round(rotation)).max() < 1e-9
+        rotation = np.round(rotation) + 0.0 if exact else rotation
+        identity = np.array_equal(rotation, np.eye(3))
+        shift = np.asarray(frame.shift) * given.mm_per_unit
+        return Correction(
+            arrangement=given.arrangement,
+            points=given.points,
+            unit=self._unit,
+            recorded_unit=self._recorded(given),
+            mm_per_unit=given.mm_per_unit,
+            rotation=rotation if turned and not identity else None,
+            origin_mm=shift if turned and shift.any() else None,
+            delay_s=-given.later_s,
+        )
+
+    def _mending(self, correction: Correction) -> tuple[str, bool]:
+        """What mends the set-up, and whether that is possible without recording again."""
+        lines = correction.lines(self._commands)
+        still = [k for k, sign in enumerate(correction.arrangement.sign) if sign == 0.0]
+        again = ""
+        if self.blind:
+            again = f"record again with a sensor that reads channel {self.blind.channel + 1}"
+        elif still:
+            again = f"look after chamber {still[0] + 1} (valve, line, leak) and record again"
+        if not again:
+            return lines, True
+        other = [table for table in correction.tables(False) if table != "measured"]
+        beside = f"{again}; beside that\n{lines}"
+        return beside if other or (self.blind and lines) else again, False
+
+    def _lost(self, given: Hypothesis) -> list[int]:
+        """Recorded key points that stand still and, by the model, should not."""
+        if not self.dead.key_points:
+            return []
+        moved = self.search.motion(given.arrangement)
+        least = max(LEAST_MOTION * moved.max(), 5 * self.search.levels.noise)
+        return [k for k in sorted(self.dead.key_points) if moved[given.points.index(k)] > least]
+
+    def _raw_error(self) -> float:
+        """RMS error on the training rows as recorded, mm."""
+        sample = sample_of(self.model, self.recordings, SETTINGS.fine_rows)
+        plain = Arrangement.as_recorded(sample.history.chambers)
+        apart = np.square(sample.measured()[0] - sample.predicted([plain])[0]).sum(2)
+        return float(np.sqrt(np.nanmean(apart)))
+
+
+def _dead_key_point(k: int, share: float) -> SetupFault:
+    how = "is dead: it keeps one position"
+    if share <= WHOLE:
+        how = f"is frozen in {share:.0%} of the rows"
+    numbers: dict[str, float | list] = {"key_point": float(k), "share_of_rows": share}
+    return SetupFault("dead_key_point", f"key point k{k} {how}, while the arm moves", numbers)
+
+
+def _dead_chamber(k: int, blind: Blind | None) -> SetupFault:
+    text = f"channel {k + 1} is dead: it keeps one value, while the body moves"
+    numbers: dict[str, float | list] = {"channel": float(k + 1)}
+    if blind is None:
+        text += " as the command says"
+    else:
+        low, high = blind.range
+        text += f" as if it were driven between {low:.3g} and {high:.3g} {blind.unit}"
+        numbers["range"] = [low, high]
+    return SetupFault("dead_chamber", text, numbers)
+
+
+def _frozen_chamber(k: int, share: float) -> SetupFault:
+    text = f"channel {k + 1} is frozen in {share:.0%} of the rows"
+    return SetupFault("dead_chamber", text, {"channel": float(k + 1), "share_of_rows": share})
+
+
+TESTS = {
+    "chambers": "pressurise one chamber alone and look which one fills",
+    "frame": "move a marker along one axis of the cameras and look which column changes",
+    "key_points": "cover the tip's marker and look which key point is lost",
+    "length_unit": "compare a distance with a ruler",
+    "actuation_unit": "compare a reading with a gauge",
+    "time": "tap the arm and compare the clocks",
+}
+"""What to do on the bench to find out whether a fault of each kind is there."""
+
+
+def _how_to_tell(faults: Sequence[SetupFault], alternatives) -> str:
+    """What to do on the bench to tell explanations apart."""
+    if not alternatives:
+        return ""
+    kinds = {fault.kind for some in (faults, *alternatives) for fault in some}
+    return "to tell: " + "; or ".join(TESTS[kind] for kind in TESTS if kind in kinds)

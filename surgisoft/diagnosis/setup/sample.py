@@ -1,0 +1,195 @@
+"""The training rows of some recordings, and what a model predicts for other set-ups of them.
+
+A set-up fault changes what enters the model (chambers, unit), when (the clocks) or what is compared
+with its output (frame, order, unit of length). A prediction for another actuation needs the model;
+all else is a change of what was measured.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.residuals import blocks, folds, held_out_rows
+from surgisoft.measurement.histories import actuation_of, history_of
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.model import ArmModel
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Which recorded channel drives each chamber of the model, and by which factor."""
+
+    order: tuple[int, ...]
+    """(m,) recorded channel of each chamber, from 0."""
+    sign: tuple[float, ...]
+    """(m,) 1 or -1; 0 where the chamber does not act."""
+    factor: float = 1.0
+    """Model units in one recorded unit."""
+
+    @classmethod
+    def as_recorded(cls, chambers: int) -> "Arrangement":
+        """Every channel drives its own chamber."""
+        return cls(tuple(range(chambers)), (1.0,) * chambers)
+
+    @property
+    def gain(self) -> np.ndarray:
+        """(m,) factor of each chamber's channel."""
+        return self.factor * np.array(self.sign)
+
+    @property
+    def rearranged(self) -> bool:
+        """Whether channels are permuted, flipped or left out."""
+        return self.order != tuple(range(len(self.order))) or any(s != 1.0 for s in self.sign)
+
+    def of(self, actuation: np.ndarray) -> np.ndarray:
+        """(..., m) actuation of the chambers from the recorded channels (..., m)."""
+        return actuation[..., list(self.order)] * self.gain
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Runs of some recordings, thinned to S rows, of which the training rows are compared."""
+
+    model: ArmModel
+    """The model."""
+    history: History
+    """(R, T) thinned runs with the recorded actuation."""
+    times: tuple[np.ndarray, ...]
+    """(T_r,) times of every row of each run, s."""
+    points: tuple[np.ndarray, ...]
+    """(T_r, n, 3) key points of every row of each run, as recorded; NaN outside the training rows
+    and where missing."""
+    at: tuple[np.ndarray, ...]
+    """(S_r,) times of the thinned rows of each run, s."""
+    block: np.ndarray
+    """(S,) block of time of each row; -1 where it is no training row."""
+    timed: bool
+    """Whether rows follow one another in time, and are no steady-state samples."""
+
+    @property
+    def fold(self) -> np.ndarray:
+        """(B,) fold of each block."""
+        return folds(np.arange(self.blocks))
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks B."""
+        return int(self.block.max(initial=-1)) + 1
+
+    @property
+    def rows(self) -> int:
+        """Number of rows S."""
+        return len(self.block)
+
+    def measured(self, later_s: Sequence[float] = (0.0,)) -> np.ndarray:
+        """(D, S, n, 3) key points as recorded, each time `later_s` after the row; NaN beyond."""
+        return np.stack(
+            [
+                np.concatenate(
+                    [
+                        interpolated(at + later, times, points)
+                        for at, times, points in zip(self.at, self.times, self.points, strict=True)
+                    ]
+                )
+                for later in later_s
+            ]
+        )
+
+    def predicted(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
+        """(A, S, n, 3) predicted key points, mm, if the channels drove the chambers so."""
+        history, cases = self.history, len(arrangements)
+
+        def each(tensor: torch.Tensor) -> torch.Tensor:
+            """(A R, ...) a tensor (R, ...) for every arrangement."""
+            return tensor.repeat(cases, *[1] * (tensor.ndim - 1))
+
+        def arranged(tensor: torch.Tensor) -> torch.Tensor:
+            """(A R, ..., m) actuation (R, ..., m) of the chambers in every arrangement."""
+            gains = torch.from_numpy(np.stack([a.gain for a in arrangements])).to(tensor)
+            parts = [
+                tensor[..., list(a.order)] * g for a, g in zip(arrangements, gains, strict=True)
+            ]
+            return torch.cat(parts)
+
+        wide = History(
+            t_s=each(history.t_s),
+            pressure=arranged(history.pressure),
+            key_points=each(history.key_points),
+            valid=each(history.valid),
+            noise=history.noise,
+            temperature_C=None if history.temperature_C is None else each(history.temperature_C),
+            stood=None if history.stood is None else arranged(history.stood),
+        )
+        with torch.no_grad():
+            points = wide.rows(self.model.predict(wide)).double().numpy()
+        points = np.where(np.isfinite(points), points, 0.0)
+        return points.reshape(cases, -1, *points.shape[1:])
+
+    def without(self, lost: np.ndarray) -> "Sample":
+        """The sample without key points where a mask (n,) holds."""
+        return replace(
+            self, points=tuple(np.where(lost[:, None], np.nan, part) for part in self.points)
+        )
+
+
+def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample:
+    """About `rows` rows of the recordings, evenly thinned; a recurrent network sees every row."""
+    whole = history_of(recordings, model.spec.actuation)
+    count = int(whole.valid.sum())
+    step = 1 if model.remembers else max(1, round(count / rows))
+    training = ~held_out_rows(recordings)
+    measured = np.concatenate([recording.key_points_mm for recording in recordings])
+    measured = np.where(training[:, None, None], measured, np.nan)
+    seen = np.isfinite(measured).all(2).any(1)
+    block = blocks(whole, seen, step, least_blocks=1)
+    times, points, at, kept = [], [], [], []
+    begin = 0
+    for run in range(whole.runs):
+        length = int(whole.valid[run].sum())
+        inside = slice(begin, begin + length)
+        t_s = whole.t_s[run, :length].numpy()
+        times.append(t_s)
+        points.append(measured[inside])
+        at.append(t_s[::step])
+        kept.append(block[inside][::step])
+        begin += length
+    return Sample(
+        model=model,
+        history=History(
+            t_s=whole.t_s[:, ::step],
+            pressure=whole.pressure[:, ::step],
+            key_points=whole.key_points[:, ::step],
+            valid=whole.valid[:, ::step],
+            noise=whole.noise,
+            temperature_C=None if whole.temperature_C is None else whole.temperature_C[:, ::step],
+            stood=whole.stood,
+        ),
+        times=tuple(times),
+        points=tuple(points),
+        at=tuple(at),
+        block=np.concatenate(kept),
+        timed=all(recording.kind == "continuous" for recording in recordings),
+    )
+
+
+def recorded_actuation(recordings: list[Recording], model: ArmModel) -> np.ndarray:
+    """(N, m) actuation of all rows as the model takes it, in the recordings' unit."""
+    return np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings])
+
+
+def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(S, n, 3) of points (T, n, 3) at times at (S,), on lines between rows; NaN beyond them."""
+    if len(times) < 2:
+        inside = np.abs(at - times[0]) < 1e-9
+        return np.where(inside[:, None, None], points[np.zeros(len(at), int)], np.nan)
+    after = np.clip(np.searchsorted(times, at - 1e-9), 1, len(times) - 1)
+    share = (at - times[after - 1]) / (times[after] - times[after - 1])
+    share = np.where(np.abs(share - np.round(share)) < 1e-6, np.round(share), share)
+    first, second = points[after - 1], points[after]
+    part = share[:, None, None]
+    # A row that is met exactly does not need its neighbour, which may be missing.
+    found = np.where(part == 0, first, np.where(part == 1, second, first + part * (second - first)))
+    return np.where(((share < 0) | (share > 1))[:, None, None], np.nan, found)

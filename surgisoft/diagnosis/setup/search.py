@@ -1,0 +1,654 @@
+"""The search for set-up faults: every kind alone and together, judged on held-out blocks of time.
+
+First a coarse search on few rows: every arrangement of the actuation, a grid of times, orders of
+the key points and units of length, each with the best frame in closed form. Then the best of each
+combination of kinds is fitted again on more rows, with the time refined, and its error is measured
+on blocks of time that took no part in the fit. The combination with the fewest kinds that does as
+well as any is taken, and then has to prove itself (`Proof`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.signal import lfilter
+
+from surgisoft.diagnosis.setup.alignment import (
+    HANDED,
+    Frame,
+    Moments,
+    angle,
+    block_moments,
+    fitted,
+    moments,
+    shifted,
+    unturned,
+)
+from surgisoft.diagnosis.setup.arrangements import EXHAUSTIVE, improved, proposed
+from surgisoft.diagnosis.setup.sample import Arrangement, Sample, interpolated
+from surgisoft.surrogate.effects.misalignment import Misalignment
+from surgisoft.surrogate.model import ArmModel
+
+Kind = Literal["chambers", "actuation_unit", "key_points", "length_unit", "frame", "time"]
+"""Kinds of faults that one search combines, in the order in which they are told."""
+KINDS: tuple[Kind, ...] = (
+    "chambers",
+    "actuation_unit",
+    "key_points",
+    "length_unit",
+    "frame",
+    "time",
+)
+
+LENGTHS = (1.0, 10.0, 1000.0, 25.4, 0.1, 0.001, 1 / 25.4, 100.0, 0.01)
+"""Millimetres in a recorded unit that are tried: cm, m, inch for mm, each the other way round, and
+m for cm."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Sizes of the search: they decide about its time, not about its result."""
+
+    coarse_rows: int = 400
+    """Rows of the coarse search."""
+    fine_rows: int = 2500
+    """Rows of the fits."""
+    times_s: tuple[float, ...] = (0.15, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+    """Offsets of the clocks that are tried first, either way, s."""
+    fits: int = 10
+    """Combinations that are fitted."""
+    starts: int = 4
+    """Arrangements that are improved by swaps and flips, where not all can be tried."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What a correction must show before it is called a fault of the set-up.
+
+    Set by reasoning on what each number stands for, before any case was counted.
+    """
+
+    explained: float = 0.9
+    """Least share of the squared error above the model's validated error that the correction
+    removes on held-out blocks: what a correct set-up would."""
+    left_of_motion: float = 0.35
+    """Most error that may be left, as a share of the motion of the key points: with a correct
+    set-up a model of the same arm predicts most of its motion, whatever physics is missing."""
+    near_validated: float = 2.0
+    """... or as a multiple of the validated error and the noise together."""
+    noticed: float = 1.5
+    """Least error before the correction, as a multiple of the validated error and the noise."""
+    as_good: float = 1.25
+    """Corrections whose errors differ by less than this factor do equally well: the simplest of
+    them is named, and those of its number of kinds are named together."""
+    blocks: float = 0.9
+    """Least share of the blocks of time whose error falls."""
+    lag_share: float = 0.85
+    """Least share of a delay that must be pure: a lag moves the rest."""
+    lag_gain: float = 0.5
+    """Most squared error above the validated one that a pure delay may leave, as a share of what
+    the best first-order lag leaves."""
+    earliest_s: float = 0.03
+    """Least offset of the clocks that is called a fault, s; or one and a half rows."""
+    most_kinds: int = 3
+    """Most kinds of faults that are named at once."""
+
+
+SETTINGS, PROOF = SearchSettings(), Proof()
+
+
+@dataclass(frozen=True)
+class Border:
+    """Beyond what a frame is set up wrongly: the plausible range of the effect `misalignment`."""
+
+    turn_rad: float
+    """Largest turn that is a misalignment, rad."""
+    shift_mm: float
+    """Largest shift along an axis that is a misalignment, mm."""
+
+    @classmethod
+    def of(cls, model: ArmModel) -> "Border":
+        """The border that the effect states."""
+        stated = {q.name: q.high for q in Misalignment(model.facts).quantities()}
+        return cls(stated["turn_rad"], stated["shift_mm"])
+
+    def holds(self, frame: Frame) -> np.ndarray:
+        """(...) whether proper frames stay within it."""
+        scale = np.asarray(frame.scale)
+        shift = np.abs(frame.shift).max(-1) / scale
+        return (angle(frame.rotation) <= self.turn_rad) & (shift <= self.shift_mm)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One combination of set-up faults; the frame's numbers are fitted."""
+
+    arrangement: Arrangement
+    """Which channels drive the chambers, and in which unit."""
+    points: tuple[int, ...]
+    """(n,) recorded key point of each true one."""
+    mm_per_unit: float = 1.0
+    """Millimetres in a recorded unit."""
+    frame: Literal["none", "small", "proper", "improper"] = "small"
+    """Frame as it is; within the border of a misalignment; turned and shifted; mirrored too."""
+    later_s: float = 0.0
+    """By how much the key points are recorded late relative to the actuation, s."""
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of faults that it consists of."""
+        wrong = {
+            "chambers": self.arrangement.rearranged,
+            "actuation_unit": self.arrangement.factor != 1.0,
+            "key_points": self.points != tuple(range(len(self.points))),
+            "length_unit": self.mm_per_unit != 1.0,
+            "frame": self.frame in HANDED,
+            "time": self.later_s != 0.0,
+        }
+        return tuple(kind for kind in KINDS if wrong[kind])
+
+    @property
+    def what(self) -> tuple:
+        """All but the time and the size of the frame: what tells two explanations apart."""
+        mirrored = self.frame if self.frame in HANDED else ""
+        late = self.later_s != 0.0
+        return self.arrangement, self.points, self.mm_per_unit, mirrored, late
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A hypothesis with its numbers, and its error on held-out blocks."""
+
+    hypothesis: Hypothesis
+    """What is wrong."""
+    frame: Frame
+    """The frame, from all training rows."""
+    blocks: Moments
+    """(B,) sums over each block of time."""
+    losses: np.ndarray
+    """(B,) sum of squared distances on each block with the numbers of the other folds, mm^2."""
+    rmse_mm: float
+    """Held-out RMS error, mm."""
+    later_sd_s: float = 0.0
+    """Standard error of the offset in time, s."""
+
+    @property
+    def complexity(self) -> int:
+        """Number of kinds of faults."""
+        return len(self.hypothesis.kinds)
+
+    def turn_and_shift_errors(self) -> tuple[float, np.ndarray]:
+        """Standard errors of the frame's turn, rad, and shift (3,), mm: jackknife over blocks.
+
+        Quenouille 1956 and Tukey 1958, with blocks of time for rows (Kunsch 1989).
+        """
+        used = np.flatnonzero(self.blocks.count > 0)
+        total, count = self.blocks.summed(), len(used)
+        if count < 2:
+            return float("nan"), np.full(3, np.nan)
+        sign = float(np.sign(np.linalg.det(self.frame.rotation)))
+        without = fitted(
+            Moments(*(t - p for t, p in zip(total._parts, self.blocks[used]._parts, strict=True))),
+            sign,
+            np.full(count, self.frame.scale),
+        )
+        apart = angle(np.einsum("bij,kj->bik", without.rotation, self.frame.rotation))
+        shift = (without.shift - without.shift.mean(0)) / self.frame.scale
+        by = (count - 1) / count
+        return float(np.sqrt(by * np.sum(apart**2))), np.sqrt(by * np.sum(shift**2, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The faults that a search found, with what proves them."""
+
+    best: Fitted
+    """The explanation that is named."""
+    as_good: tuple[Fitted, ...]
+    """Other explanations with as many kinds that do as well."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """What errors are compared with, RMS distances of a key point, mm."""
+
+    noise: float
+    """Noise of the measurement."""
+    discrepancy: float
+    """Validated error of the model, without its noise."""
+
+    @property
+    def reference(self) -> float:
+        """The error that a correct set-up shows where no physics is missing."""
+        return float(np.hypot(self.noise, self.discrepancy))
+
+
+class Search:
+    """One search over a model and recordings of one set-up."""
+
+    def __init__(
+        self,
+        coarse: Sample,
+        fine: Sample,
+        full: Sample,
+        levels: Levels,
+        units: dict[str, float],
+        settings: SearchSettings = SETTINGS,
+        proof: Proof = PROOF,
+    ):
+        """units: unit -> model units in it, for the units of actuation that are tried."""
+        self.coarse, self.fine, self.full, self.levels = coarse, fine, full, levels
+        self.units, self.settings, self.proof = units, settings, proof
+        self.factors = tuple(units.values())
+        self.border = Border.of(coarse.model)
+        self.chambers = coarse.history.chambers
+        self._measured = fine.measured()[0]
+        self._predicted: dict[Arrangement, np.ndarray] = {}
+        self._whole: dict[Arrangement, np.ndarray] = {}
+
+    @cached_property
+    def raw(self) -> Fitted:
+        """The recordings as they are."""
+        return self.fit(replace(self._nothing(), frame="none"))
+
+    @cached_property
+    def start(self) -> Fitted:
+        """The recordings as they are, but for a small misalignment where that helps."""
+        before = self.fit(self._nothing())
+        return before if before.rmse_mm < self.raw.rmse_mm else self.raw
+
+    @property
+    def limit_mm(self) -> float:
+        """Error up to which no fault is looked for, mm."""
+        return self.proof.noticed * self.levels.reference
+
+    @property
+    def noticed(self) -> bool:
+        """Whether the error is large enough for a fault."""
+        return self.raw.rmse_mm > self.limit_mm
+
+    def explains(self, before_mm: float, after_mm: float) -> bool:
+        """Whether an error before is noticed, and explained by what leaves the error after."""
+        noticed = before_mm > self.limit_mm
+        return noticed and self._share(before_mm, after_mm) >= self.proof.explained
+
+    def _share(self, before_mm: float, after_mm: float) -> float:
+        """Share of the squared error above the reference that falls."""
+        least = min(self.levels.reference, after_mm)
+        return (before_mm**2 - after_mm**2) / max(before_mm**2 - least**2, 1e-12)
+
+    def motion(self, arrangement: Arrangement) -> np.ndarray:
+        """(n,) RMS motion of the predicted key points, mm."""
+        return _motion(self._fine(arrangement))
+
+    def run(self) -> Found | None:
+        """The faults, where some are proved."""
+        if not self.noticed:
+            return None
+        start = self.start
+        tried = [start, *(self.fit(each) for each in self._shortlist(start.hypothesis))]
+        best = self._simplest(tried)
+        while "time" in best.hypothesis.kinds and not self._pure_delay(best):
+            tried = [each for each in tried if "time" not in each.hypothesis.kinds]
+            best = self._simplest(tried)
+        if not best.hypothesis.kinds:
+            return None
+        if not self._proved(start, best):
+            return None
+        return Found(best, self._equals(best, tried))
+
+    # Coarse search ----------------------------------------------------------------------------
+
+    def _nothing(self) -> Hypothesis:
+        points = tuple(range(self.coarse.points[0].shape[1]))
+        return Hypothesis(Arrangement.as_recorded(self.chambers), points)
+
+    def _orders(self) -> list[tuple[int, ...]]:
+        """Orders of the key points to begin with: as recorded, reversed, and by their motion."""
+        count = self.coarse.points[0].shape[1]
+        same = tuple(range(count))
+        orders = [same, same[::-1]]
+        if count > 2:
+            measured = _motion(self.coarse.measured()[0])
+            predicted = _motion(self._predictions([Arrangement.as_recorded(self.chambers)])[0])
+            by_motion = np.empty(count, int)
+            by_motion[np.argsort(predicted)] = np.argsort(np.where(measured > 0, measured, np.inf))
+            orders.append(tuple(by_motion.tolist()))
+        return list(dict.fromkeys(orders))
+
+    def _shortlist(self, start: Hypothesis) -> list[Hypothesis]:
+        """The best hypothesis of each combination of kinds, the most promising first."""
+        orders = self._orders()
+        given = proposed(self.coarse, orders, self.factors)
+        table = self._table(given, orders)
+        if self.chambers > EXHAUSTIVE:
+            for arrangement in self._improved(table, orders):
+                if arrangement not in given:
+                    given.append(arrangement)
+                    table += self._table([arrangement], orders)
+        most = self.proof.most_kinds
+        best: dict[tuple, list[tuple[float, Hypothesis]]] = {}
+        for square, hypothesis in sorted(table, key=lambda row: row[0]):
+            kinds = hypothesis.kinds
+            if len(kinds) <= most:
+                some = best.setdefault(kinds, [])
+                if len(some) < 3:
+                    some.append((square, hypothesis))
+        rows = [row for some in best.values() for row in some if row[1].kinds]
+        rows.sort(key=lambda row: row[0] * 1.5 ** len(row[1].kinds))
+        picked = [hypothesis for _, hypothesis in rows[: self.settings.fits]]
+        simple = [row for row in rows if len(row[1].kinds) == 1]
+        return list(dict.fromkeys([*picked, *(row[1] for row in simple[:3])]))
+
+    def _predictions(self, given: Sequence[Arrangement]) -> np.ndarray:
+        return self.coarse.predicted(given)
+
+    def _table(
+        self, given: Sequence[Arrangement], orders: Sequence[tuple[int, ...]]
+    ) -> list[tuple[float, Hypothesis]]:
+        """Mean squared error, mm^2, of the best hypotheses of each combination."""
+        predicted = self._predictions(given)
+        later = [0.0]
+        if self.coarse.timed:
+            later += [sign * t for t in self.settings.times_s for sign in (1, -1)]
+        measured = self.coarse.measured(later)
+        rows: list[tuple[float, Hypothesis]] = []
+        for order in orders:
+            sums = moments(measured[:, :, list(order)], predicted)
+            for frame, mm_per_unit, square in self._frames(sums):
+                for a, d in _least(square):
+                    rows.append(
+                        (
+                            float(square[a, d]),
+                            Hypothesis(given[a], order, float(mm_per_unit[a, d]), frame, later[d]),
+                        )
+                    )
+        return rows
+
+    def _frames(self, sums: Moments):
+        """Kind of frame, unit of length (A, D) and mean squared error (A, D), mm^2."""
+        enough = sums.count >= 0.5 * sums.count.max()
+        for name, determinant in HANDED.items():
+            free = fitted(sums, determinant)
+            snapped = _snapped(free.scale)
+            for mm_per_unit in (np.ones_like(snapped), snapped):
+                frame = _rescaled(free, sums, 1.0 / mm_per_unit)
+                square = np.where(enough, sums.mean_square(frame), np.inf)
+                if name == "proper":
+                    within = self.border.holds(frame)
+                    yield "small", mm_per_unit, np.where(within, square, np.inf)
+                    square = np.where(within, np.inf, square)
+                    plain = sums.mean_square(unturned(sums, 1.0 / mm_per_unit))
+                    yield "none", mm_per_unit, np.where(enough, plain, np.inf)
+                yield name, mm_per_unit, square
+
+    def _improved(self, table, orders) -> list[Arrangement]:
+        """Arrangements that swaps and flips lead to from the best ones."""
+        found: list[Arrangement] = []
+        starts: dict[Arrangement, Hypothesis] = {}
+        for _, hypothesis in sorted(table, key=lambda row: row[0]):
+            starts.setdefault(hypothesis.arrangement, hypothesis)
+            if len(starts) >= self.settings.starts:
+                break
+        for arrangement, hypothesis in starts.items():
+            measured = self.coarse.measured([hypothesis.later_s])[:, :, list(hypothesis.points)]
+
+            def error(given, measured=measured, hypothesis=hypothesis):
+                sums = moments(measured, self._predictions(given))
+                free = fitted(sums, HANDED.get(hypothesis.frame, 1.0))
+                if hypothesis.frame not in HANDED:
+                    free = unturned(sums)
+                scale = np.full(sums.count.shape, 1.0 / hypothesis.mm_per_unit)
+                return sums.mean_square(_rescaled(free, sums, scale))[:, 0]
+
+            found += improved(arrangement, error)
+        return list(dict.fromkeys(found))
+
+    # Fits -------------------------------------------------------------------------------------
+
+    def fit(self, hypothesis: Hypothesis) -> Fitted:
+        """The hypothesis fitted to the rows of the fine sample, its offset in time refined."""
+        if not hypothesis.later_s:
+            return self._at(hypothesis, self._fine(hypothesis.arrangement))
+        later, spread = self._time(hypothesis)
+        hypothesis = replace(hypothesis, later_s=later)
+        return self._at(hypothesis, self._late(self._full(hypothesis.arrangement), later), spread)
+
+    def _fine(self, arrangement: Arrangement) -> np.ndarray:
+        """(S, n, 3) prediction for the rows of the fine sample, mm."""
+        if arrangement not in self._predicted:
+            self._predicted[arrangement] = self.fine.predicted([arrangement])[0]
+        return self._predicted[arrangement]
+
+    def _full(self, arrangement: Arrangement) -> np.ndarray:
+        """(N, n, 3) prediction for every row, mm."""
+        if arrangement not in self._whole:
+            self._whole[arrangement] = self.full.predicted([arrangement])[0]
+        return self._whole[arrangement]
+
+    def _late(self, predicted: np.ndarray, later_s: float) -> np.ndarray:
+        """(S, n, 3) prediction of every row (N, n, 3), as it was `later_s` before the fine rows.
+
+        The prediction is what is interpolated: it has no noise that interpolation would lessen.
+        """
+        parts, begin = [], 0
+        for at, times in zip(self.fine.at, self.full.at, strict=True):
+            part = predicted[begin : begin + len(times)]
+            begin += len(times)
+            parts.append(interpolated(at - later_s, times, part))
+        return np.concatenate(parts)
+
+    def _at(self, hypothesis: Hypothesis, predicted: np.ndarray, spread: float = 0.0) -> Fitted:
+        """The hypothesis with its frame fitted, for a prediction (S, n, 3) at its time."""
+        measured = self._measured[:, list(hypothesis.points)]
+        blocks = block_moments(measured, predicted, self.fine.block, self.fine.blocks)
+        return self._fit_blocks(hypothesis, blocks, spread)
+
+    def _fit_blocks(self, hypothesis: Hypothesis, blocks: Moments, spread: float) -> Fitted:
+        fold = self.fine.fold
+        losses = np.zeros(len(fold))
+        for one in np.unique(fold):
+            out = fold == one
+            frame = self._frame(hypothesis, blocks.summed(~out))
+            part = blocks[out]
+            losses[out] = part.mean_square(frame) * part.count
+        count = max(float(blocks.count.sum()), 1.0)
+        return Fitted(
+            hypothesis=hypothesis,
+            frame=self._frame(hypothesis, blocks.summed()),
+            blocks=blocks,
+            losses=losses,
+            rmse_mm=float(np.sqrt(losses.sum() / count)),
+            later_sd_s=spread,
+        )
+
+    def _frame(self, hypothesis: Hypothesis, sums: Moments) -> Frame:
+        scale = 1.0 / hypothesis.mm_per_unit
+        plain = unturned(sums, scale)
+        if hypothesis.frame == "none":
+            return plain
+        frame = fitted(sums, HANDED.get(hypothesis.frame, 1.0), np.asarray(scale))
+        if hypothesis.frame == "small" and not self.border.holds(frame):
+            return plain
+        return frame
+
+    def _time(self, hypothesis: Hypothesis) -> tuple[float, float]:
+        """The offset in time with the least error, s, and its standard error."""
+        full = self._full(hypothesis.arrangement)
+        measured = self._measured[:, list(hypothesis.points)]
+
+        def errors(grid: np.ndarray) -> np.ndarray:
+            late = np.stack([self._late(full, later) for later in grid])
+            seen = np.isfinite(late).all((0, 2, 3))
+            sums = moments(measured[None, seen], late[:, seen])
+            scale = np.full(sums.count.shape, 1.0 / hypothesis.mm_per_unit)
+            frame = unturned(sums, scale)
+            if hypothesis.frame != "none":
+                frame = fitted(sums, HANDED.get(hypothesis.frame, 1.0), scale)
+            return sums.mean_square(frame)[:, 0]
+
+        tried = np.array([0.0, *self.settings.times_s])
+        near = np.sort(np.abs(tried - abs(hypothesis.later_s)))[:2]
+        width = max(float(near.sum()), self.row_s)
+        best = hypothesis.later_s
+        while True:
+            grid = best + width * np.linspace(-1.0, 1.0, 7)
+            square = errors(grid)
+            best = float(grid[int(square.argmin())])
+            if width <= 1.5 * self.row_s:
+                break
+            width /= 3
+        best = _lowest(grid, square)
+        grid = best + max(self.row_s, 0.01) * np.array([-1.0, 0.0, 1.0])
+        losses = [self._at(hypothesis, self._late(full, later)).losses for later in grid]
+        return best, _jackknife(grid, np.stack(losses))
+
+    @property
+    def row_s(self) -> float:
+        """Usual time between rows of the recordings, s."""
+        steps = [np.diff(t) for t in self.fine.times if len(t) > 1]
+        return float(np.median(np.concatenate(steps))) if steps else 0.0
+
+    # Decision ---------------------------------------------------------------------------------
+
+    def _simplest(self, tried: Sequence[Fitted]) -> Fitted:
+        """The explanation with the fewest kinds among those that do as well as any."""
+        least = min(each.rmse_mm for each in tried)
+        near = [
+            each
+            for each in tried
+            if each.rmse_mm <= self.proof.as_good * max(least, self.levels.noise)
+        ]
+        return min(near, key=lambda each: (each.complexity, each.rmse_mm))
+
+    def _equals(self, best: Fitted, tried: Sequence[Fitted]) -> tuple[Fitted, ...]:
+        """Other explanations with as many kinds, each once, that do as well."""
+        found = {best.hypothesis.what: best}
+        limit = self.proof.as_good * max(best.rmse_mm, self.levels.noise)
+        for each in sorted(tried, key=lambda one: one.rmse_mm):
+            same = each.complexity == best.complexity and each.rmse_mm <= limit
+            if same and each.hypothesis.what not in found:
+                found[each.hypothesis.what] = each
+        return tuple(found.values())[1:]
+
+    def _proved(self, before: Fitted, after: Fitted) -> bool:
+        """Whether a correction shows what `Proof` asks for."""
+        asked = self.proof
+        # In a wrong unit of length the error before is in that unit, too.
+        start = before.rmse_mm * max(1.0, after.hypothesis.mm_per_unit)
+        explained = self._share(start, after.rmse_mm)
+        motion = float(np.sqrt(np.mean(self.motion(after.hypothesis.arrangement) ** 2)))
+        most = max(asked.near_validated * self.levels.reference, asked.left_of_motion * motion)
+        counted = after.blocks.count > 0
+        falls = float(np.mean(after.losses[counted] < before.losses[counted]))
+        if after.hypothesis.mm_per_unit != 1.0:
+            falls = 1.0
+        return explained >= asked.explained and after.rmse_mm <= most and falls >= asked.blocks
+
+    def _pure_delay(self, given: Fitted) -> bool:
+        """Whether an offset in time is one of the clocks and no lag of the arm or its line.
+
+        A body that moves before its actuation is no physics. One that moves late may lag: the
+        prediction is passed through first-order lags of the same total delay, of which a part is
+        pure. The offset counts where the pure delay does best, and clearly better than a lag alone.
+        """
+        late = given.hypothesis.later_s
+        if abs(late) < max(self.proof.earliest_s, 1.5 * self.row_s):
+            return False
+        if late < 0:
+            return True
+        pure = given.rmse_mm**2
+        losses = {1.0: given.losses}
+        for share in (0.0, 0.25, 0.5, 0.75):
+            stretches = (0.7, 1.0, 1.4) if share == 0.0 else (1.0, 1.3)
+            each = [
+                self._lagging(given.hypothesis, share * late, (1 - share) * late * stretch)
+                for stretch in stretches
+            ]
+            losses[share] = min(each, key=np.sum)
+        least = min(losses, key=lambda share: losses[share].sum())
+        count = max(float(given.blocks.count.sum()), 1.0)
+        alone = losses[0.0].sum() / count
+        floor = min(self.levels.reference**2, pure)
+        clear = pure - floor <= self.proof.lag_gain * (alone - floor)
+        return least >= self.proof.lag_share and clear
+
+    def _lagging(self, hypothesis: Hypothesis, later_s: float, tau_s: float) -> np.ndarray:
+        """(B,) losses of a body behind a pure delay and a first-order lag, mm^2."""
+        full, parts, begin = self._full(hypothesis.arrangement), [], 0
+        for times in self.full.at:
+            part = full[begin : begin + len(times)]
+            begin += len(times)
+            step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+            lagged = _first_order(part.reshape(len(part), -1), step, tau_s)
+            parts.append(lagged.reshape(part.shape))
+        late = self._late(np.concatenate(parts), later_s)
+        return self._at(replace(hypothesis, later_s=later_s), late).losses
+
+
+def _first_order(values: np.ndarray, step_s: float, tau_s: float) -> np.ndarray:
+    """(T, c) of values (T, c), linear between rows, behind y' = (u - y) / tau from steady state.
+
+    Exact for a signal that is linear between rows (ramp-invariant discretisation).
+    """
+    ratio = step_s / max(tau_s, 1e-6)
+    keep = np.exp(-ratio)
+    new = 1.0 - (1.0 - keep) / ratio
+    old = 1.0 - keep - new
+    start = values[:1] * (1.0 - new)
+    return lfilter([new, old], [1.0, -keep], values, axis=0, zi=start)[0]
+
+
+def _motion(points: np.ndarray) -> np.ndarray:
+    """(n,) RMS distance of each key point (S, n, 3) from its mean; 0 where it is not seen."""
+    seen = np.isfinite(points).all(-1)
+    count = np.maximum(seen.sum(0), 1)[:, None]
+    known = np.where(seen[..., None], points, 0.0)
+    away = np.where(seen[..., None], points - known.sum(0) / count, 0.0)
+    return np.sqrt(np.square(away).sum((0, 2)) / count[:, 0])
+
+
+def _snapped(scale: np.ndarray) -> np.ndarray:
+    """(...) the tried millimetres in a unit that are nearest to 1 / scale, by ratio."""
+    known = np.log(np.array(LENGTHS))
+    apart = np.abs(-np.log(np.asarray(scale))[..., None] - known)
+    return np.array(LENGTHS)[apart.argmin(-1)]
+
+
+def _rescaled(frame: Frame, sums: Moments, scale: np.ndarray) -> Frame:
+    """The frame with another scale and the shift that goes with it."""
+    if not np.any(frame.shift) and np.allclose(frame.rotation, np.eye(3)):
+        return Frame(frame.rotation, frame.shift, scale)
+    return shifted(frame.rotation, sums, scale)
+
+
+def _least(square: np.ndarray, many: int = 2) -> list[tuple[int, int]]:
+    """Places (a, d) of the smallest finite values: some over all, and some at d = 0."""
+    found = []
+    for part in (square[:, :1], square):
+        order = np.argsort(part, axis=None)[: 3 * many]
+        found += [tuple(int(v) for v in np.unravel_index(at, part.shape)) for at in order]
+    # The arrangement and the unit as recorded have a row of their own at every time.
+    found += [(0, int(d)) for d in np.argsort(square[0])[:many]]
+    return [at for at in dict.fromkeys(found) if np.isfinite(square[at])]
+
+
+def _lowest(grid: np.ndarray, values: np.ndarray) -> float:
+    """Where the parabola through the least value and its neighbours is lowest."""
+    at = int(values.argmin())
+    if at in (0, len(values) - 1):
+        return float(grid[at])
+    a, b, _ = np.polyfit(grid[at - 1 : at + 2] - grid[at], values[at - 1 : at + 2], 2)
+    return float(grid[at] - b / (2 * a)) if a > 0 else float(grid[at])
+
+
+def _jackknife(grid: np.ndarray, losses: np.ndarray) -> float:
+    """Standard error of the lowest place of losses (K, B), by leaving out each block."""
+    count = losses.shape[1]
+    if count < 2:
+        return float("nan")
+    total = losses.sum(1)
+    without = np.array([_lowest(grid, total - losses[:, b]) for b in range(count)])
+    return float(np.sqrt((count - 1) / count * np.square(without - without.mean()).sum()))

@@ -1,0 +1,203 @@
+"""Set-up faults in words, with their numbers."""
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from surgisoft.diagnosis.setup.alignment import Frame, angle
+from surgisoft.diagnosis.setup.sample import Arrangement
+from surgisoft.diagnosis.setup.search import Fitted, Kind
+
+NEAR_AXIS_RAD = 0.1
+"""An axis of rotation is named x, y or z up to this angle, rad."""
+LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
+"""A shift of the frame is told beside a turn from so many standard errors on, and from so many mm
+on: less is no part of the fault."""
+UNIT_NAMES = {10.0: "cm", 1000.0: "m", 25.4: "inches"}
+"""Names of units of length by their millimetres."""
+
+
+@dataclass(frozen=True)
+class SetupFault:
+    """One thing that is wrong with the set-up of a recording."""
+
+    kind: str
+    """`chambers`, `actuation_unit`, `key_points`, `length_unit`, `frame`, `time`, `dead_chamber`
+    or `dead_key_point`."""
+    sentence: str
+    """What is wrong, in words."""
+    numbers: dict[str, float | list] = field(default_factory=dict)
+    """Its numbers; the name of each ends with its unit."""
+    errors: dict[str, float | list] = field(default_factory=dict)
+    """Standard errors of those of the numbers that are estimated, by the same names."""
+
+
+def signed_axes() -> np.ndarray:
+    """(48, 3, 3) every permutation of the axes with every choice of signs."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            found.append(matrix)
+    return np.array(found)
+
+
+def faults_of(given: Fitted, frame: Frame, unit: str, recorded_unit: str) -> list[SetupFault]:
+    """The faults of one explanation; frame: as it will be corrected."""
+    words = {
+        "chambers": lambda: _chambers(given.hypothesis.arrangement),
+        "actuation_unit": lambda: SetupFault(
+            "actuation_unit",
+            f"the actuation is in {recorded_unit} where {unit} is stated",
+            {"factor": given.hypothesis.arrangement.factor},
+        ),
+        "key_points": lambda: _key_points(given.hypothesis.points),
+        "length_unit": lambda: _length(given.hypothesis.mm_per_unit),
+        "frame": lambda: _frame(given, frame),
+        "time": lambda: _time(given),
+    }
+    kinds: tuple[Kind, ...] = given.hypothesis.kinds
+    return [words[kind]() for kind in kinds]
+
+
+def joined(faults: list[SetupFault] | tuple[SetupFault, ...]) -> str:
+    """The sentences of faults that hold together."""
+    return "; ".join(fault.sentence for fault in faults)
+
+
+def _chambers(arrangement: Arrangement) -> SetupFault:
+    order, sign = arrangement.order, arrangement.sign
+    parts = []
+    if order != tuple(range(len(order))):
+        listed = ", ".join(str(k + 1) for k in order)
+        parts.append(
+            f"the chambers are permuted: chambers {_numbers(range(len(order)))} are driven by "
+            f"channels {listed}"
+        )
+    flipped = [k for k, s in enumerate(sign) if s < 0]
+    if flipped:
+        many = len(flipped) > 1
+        parts.append(
+            f"the sign of chamber{'s' * many} {_numbers(flipped)} {'are' if many else 'is'} flipped"
+        )
+    idle = [k for k, s in enumerate(sign) if s == 0]
+    if idle:
+        parts.append(
+            f"chamber {_numbers(idle)} does not act: the body moves as if it stayed at rest"
+        )
+    return SetupFault(
+        "chambers",
+        "; ".join(parts),
+        {"channel_of_chamber": [k + 1 for k in order], "sign": list(sign)},
+    )
+
+
+def _numbers(some) -> str:
+    return ", ".join(str(k + 1) for k in some)
+
+
+def _key_points(points: tuple[int, ...]) -> SetupFault:
+    if points == tuple(range(len(points)))[::-1]:
+        text = "the key points are in reverse order, tip to base"
+    else:
+        text = "the key points are permuted: base to tip they are " + ", ".join(
+            f"k{k}" for k in points
+        )
+    return SetupFault("key_points", text, {"order": list(points)})
+
+
+def _length(mm: float) -> SetupFault:
+    if mm in UNIT_NAMES:
+        text = f"the positions are in {UNIT_NAMES[mm]} where mm are stated"
+    elif 1.0 / mm in UNIT_NAMES:
+        text = f"the positions are {1 / mm:g} times too large: mm were read as {UNIT_NAMES[1 / mm]}"
+    elif mm < 1.0:
+        text = f"the positions are {1 / mm:g} times too large"
+    else:
+        text = f"the positions are {mm:g} times too small"
+    return SetupFault("length_unit", text, {"mm_per_recorded_mm": mm})
+
+
+def _frame(given: Fitted, frame: Frame) -> SetupFault:
+    turn_sd, shift_sd = given.turn_and_shift_errors()
+    rotation, scale = frame.rotation, float(frame.scale)
+    shift = frame.shift / scale
+    exact = _signed(rotation)
+    numbers: dict[str, float | list] = {"rotation": rotation.tolist()}
+    mirrored = np.linalg.det(rotation) < 0
+    if mirrored:
+        text = _mirrored(rotation) if exact else _mirrored_and_turned(rotation)
+    else:
+        turn = float(angle(rotation))
+        numbers["turn_deg"] = float(np.degrees(turn))
+        axis = _axis(rotation)
+        numbers["axis"] = axis.tolist()
+        text = f"turned by {np.degrees(turn):.1f} deg about {_axis_name(axis)}"
+        if exact:
+            text += f" (axes {_axes(rotation)})"
+    turned = mirrored or numbers.get("turn_deg", 0.0) > max(1.0, 3 * np.degrees(turn_sd))
+    far = np.abs(shift) > np.maximum(LEAST_SHIFT_SD * shift_sd, LEAST_SHIFT_MM)
+    where = "(" + ", ".join(f"{v:.1f}" for v in shift) + ") mm"
+    if not turned:
+        text = f"shifted by {where}"
+    elif far.any():
+        text += f" and shifted by {where}"
+    numbers["shift_mm"] = shift.tolist()
+    errors = {"turn_deg": float(np.degrees(turn_sd)), "shift_mm": shift_sd.tolist()}
+    return SetupFault("frame", f"the frame of the key points is {text}", numbers, errors)
+
+
+def _signed(rotation: np.ndarray) -> bool:
+    return bool(np.abs(rotation - np.round(rotation)).max() < 1e-9)
+
+
+def _axis(rotation: np.ndarray) -> np.ndarray:
+    vector = Rotation.from_matrix(rotation).as_rotvec()
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _axis_name(axis: np.ndarray) -> str:
+    at = int(np.abs(axis).argmax())
+    if np.arccos(min(abs(axis[at]), 1.0)) <= NEAR_AXIS_RAD:
+        return ("-" if axis[at] < 0 else "") + "xyz"[at]
+    return "(" + ", ".join(f"{v:.2f}" for v in axis) + ")"
+
+
+def _axes(rotation: np.ndarray) -> str:
+    """What the recorded x, y and z truly are, of a signed permutation."""
+    rows = [(int(np.abs(row).argmax()), row.sum() < 0) for row in np.round(rotation)]
+    return "x y z are " + " ".join(("-" if minus else "") + "xyz"[axis] for axis, minus in rows)
+
+
+def _mirrored(rotation: np.ndarray) -> str:
+    whole = np.round(rotation)
+    if np.abs(whole - np.diag(np.diag(whole))).max() < 0.5:
+        axes = ["xyz"[k] for k in range(3) if whole[k, k] < 0]
+        return f"mirrored: the sign of {' and '.join(axes)} is wrong"
+    if (whole >= 0).all():
+        moved = ["xyz"[k] for k in range(3) if whole[k, k] < 0.5]
+        return f"mirrored: the axes {' and '.join(moved)} are swapped"
+    return f"mirrored: the axes {_axes(whole)}"
+
+
+def _mirrored_and_turned(rotation: np.ndarray) -> str:
+    """A mirrored frame as a mirrored x axis and a turn."""
+    turn = rotation @ np.diag([-1.0, 1.0, 1.0])
+    axis = _axis(turn)
+    return (
+        f"mirrored (the sign of one axis is wrong), beside x turned by "
+        f"{np.degrees(float(angle(turn))):.1f} deg about {_axis_name(axis)}"
+    )
+
+
+def _time(given: Fitted) -> SetupFault:
+    late, spread = given.hypothesis.later_s, given.later_sd_s
+    how = "late" if late > 0 else "early"
+    text = (
+        f"the key points are {abs(late):.3f} +- {spread:.3f} s {how} relative to the actuation: "
+        "their clocks are apart"
+    )
+    return SetupFault("time", text, {"late_s": late}, {"late_s": spread})

@@ -24,7 +24,7 @@ from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.model import ArmModel, Validation
 
 PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
-SHORT = RefitConfig(rows=1200, seeds=2, first_epochs=3, epochs=8, finalists=2)
+SHORT = RefitConfig(rows=800, seeds=2, first_epochs=2, epochs=5, finalists=2)
 """A budget of seconds."""
 
 
@@ -43,7 +43,7 @@ def command(rows: int, seed: int = 0) -> np.ndarray:
     return np.array(columns).T
 
 
-def arm_by_hand(lag_s: float = LAG_S, rows: int = 1600) -> Recording:
+def arm_by_hand(lag_s: float = LAG_S, rows: int = 1200) -> Recording:
     """An arm of constant curvature behind a first-order lag, from formulas written here."""
     asked = command(rows)
     chamber, now = np.empty_like(asked), np.zeros(2)
@@ -94,7 +94,8 @@ def found(problem):
 
 @pytest.fixture
 def short(monkeypatch):
-    """The commands with a budget of seconds, in this process."""
+    """The commands with a budget of seconds and two candidates, in this process."""
+    monkeypatch.setattr(refitting, "hideable", lambda *given: (["creep", "line_lag"], {}))
     together = partial(refit, config=SHORT)
     monkeypatch.setattr(diagnosing, "fit_candidates_together", together)
     monkeypatch.setattr(amending, "refit_effects", together)

@@ -106,6 +106,38 @@ def diagnosis(
     _show("Diagnosis results", command, markdown(outcomes), output)
 
 
+@app.command("setup-faults")
+def setup_faults(
+    robots: Annotated[str, typer.Option(help="Seeds of the robots, with commas.")] = "142,143",
+    folders: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--source",
+            metavar="DIR",
+            help="Folder with model/, clean/*.parquet and hidden/*.parquet of another arm.",
+        ),
+    ] = None,
+    count: Annotated[
+        int, typer.Option(min=1, help="Number of single faults, and of pairs, of each source.")
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the faults.")] = 1,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of base models and recordings.")
+    ] = Path("runs/benchmark-setup-faults"),
+    output: Output = None,
+) -> None:
+    """Faults of the set-up in recordings: frames, units, orders, chambers, clocks."""
+    from benchmarks.setup_faults import markdown, run
+
+    numbers = _numbers("--robots", robots)
+    with progress("setup-faults") as report:
+        outcomes = run(numbers, folders or [], count, seed, work, processes, report)
+    command = f"surgisoft benchmark setup-faults --robots {robots} --count {count} --seed {seed}"
+    command += "".join(f" --source {folder.name}" for folder in folders or [])
+    _show("Set-up faults", command, markdown(outcomes), output)
+
+
 @app.command("hidden-effect")
 def hidden_effect(
     effects: Annotated[

@@ -129,9 +129,9 @@ def _reversed(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def _late(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Key points 0.2 to 1.5 s late or early, by whole rows."""
+    """Key points 0.25 to 1.5 s late or early, by whole rows."""
     step = float(np.median(np.diff(recording.t_s)))
-    rows = max(1, round(rng.uniform(0.2, 1.5) / step))
+    rows = max(1, round(rng.uniform(0.25, 1.5) / step))
     late = bool(rng.integers(2))
     parts = {"measured": [], "commanded": [], "key_points_mm": [], "t_s": [], "run": []}
     for run in recording.runs:

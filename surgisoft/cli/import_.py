@@ -1,12 +1,13 @@
 """`surgisoft import`: convert other files to recordings; `surgisoft recording`: summarise them."""
 
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.inputs import read_recordings, warn
+from surgisoft.cli.inputs import check_model, read_recordings, warn
 from surgisoft.cli.options import Force, Recordings
 from surgisoft.errors import InputError
 
@@ -32,8 +33,19 @@ def import_(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
     ] = False,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL",
+            help="Model of the arm: the set-up is tested against it, as `diagnose` does.",
+        ),
+    ] = None,
 ) -> None:
-    """Import a laboratory's files as recordings; a map states columns, units and frames."""
+    """Import a laboratory's files as recordings; a map states columns, units and frames.
+
+    Notes tell what cannot be right: lengths, reversed key points, clocks that are apart. With a
+    model of the arm, frames, units, orders, chambers and dead channels are tested, too.
+    """
     from surgisoft.measurement.importing import import_files, load_map
     from surgisoft.measurement.recordings import (
         check_writable,
@@ -42,6 +54,8 @@ def import_(
         summary,
     )
 
+    if model:
+        check_model(model)
     to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
     if to_file and output.suffix not in (".csv", ".parquet"):
         raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
@@ -60,6 +74,25 @@ def import_(
         first, *rest = summary(part.recording)
         about = first.partition(": ")[2]
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
+    if model:
+        _test_setup(model, [part.recording for part in parts])
+
+
+def _test_setup(model: Path, recordings: list) -> None:
+    """Print what a model shows to be wrong with the set-up of recordings."""
+    from surgisoft.diagnosis.setup import find_setup_faults
+    from surgisoft.measurement.histories import check_fits
+    from surgisoft.surrogate.checkpoint import load_model
+
+    arm = load_model(model)
+    check_fits(arm.spec, recordings, sized=False)
+    found = find_setup_faults(arm, recordings)
+    if found is None:
+        print(f"set-up: no fault that {model} shows")
+        return
+    warn(f"set-up: {found.sentence}")
+    print("to mend it, in a map that reads the recording (docs/diagnosis.md, set-up faults):")
+    print(textwrap.indent(found.mending, "  "))
 
 
 @app.command("recording")

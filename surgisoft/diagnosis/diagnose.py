@@ -31,7 +31,7 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
-from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, residual_table
@@ -134,14 +134,21 @@ class Diagnosis:
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
     """How far the recordings differ from those before the change; None where none were given."""
+    track: ChangeTrack | None = None
+    """Key points before and after and what the named effects explain, for pictures; None without
+    pairs."""
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        plain = asdict(replace(self, setup=None, refit=None))
-        plain["setup"] = self.setup.to_json() if self.setup else None
-        return plain | {"refit": self.refit.to_json() if self.refit else None}
+        plain = asdict(replace(self, setup=None, track=None, change=None, refit=None))
+        del plain["track"]
+        return plain | {
+            "setup": self.setup.to_json() if self.setup else None,
+            "change": self.change.to_json() if self.change else None,
+            "refit": self.refit.to_json() if self.refit else None,
+        }
 
 
 @torch_threads(1)
@@ -201,35 +208,45 @@ def diagnose(
             "a change since recordings from before is not one that a network was fitted to: "
             "expected --refit always without --before"
         )
-    result = diagnosis_of(problem, report, without)
+    found = findings_of(problem, report, without)
+    result = result_of(found)
     if both is not None:
-        result = since(result, both.change)
+        result = since(result, both, found)
     elif reason:
         joint = fit_candidates_together(
             problem, reason, without, progress=refit_progress, processes=processes
         )
         result = with_refit(result, joint, problem)
+    if result.verdict.kind == "unknown_effect":
+        result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
 
 
-def diagnosis_of(
-    problem: Problem, report: Progress = lambda text: None, without: Collection[str] = ()
-) -> Diagnosis:
-    """The diagnosis of an identification problem."""
+def findings_of(problem: Problem, report: Progress, without: Collection[str]) -> Findings:
+    """What model selection finds on an identification problem."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
         if name not in names:
             raise unknown_name("effect", name, names)
     tried = candidates(problem, [name for name in names if name not in without])
-    result = result_of(find(problem, tried, report))
-    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
+    return find(problem, tried, report)
 
 
-def since(result: Diagnosis, change: Change) -> Diagnosis:
-    """The diagnosis of a change: its sentence says since when, and how large the change is."""
-    text = f"since {' + '.join(change.before)}: {result.verdict.sentence}; {change.sentence}"
-    return replace(result, change=change, verdict=replace(result.verdict, sentence=text))
+def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
+    """The diagnosis of a change: since when, how large it is, and what of it is explained.
+
+    The network's own error is not in a paired difference: what no effect explains there is no
+    network that was fitted too little, but something that has changed.
+    """
+    verdict, change = result.verdict, both.change
+    words = verdict.sentence
+    if both.used and verdict.kind == "surrogate_undertrained":
+        words = sentence_of("unknown_effect", (), result.error_mm, 0.0, 0.0, None)
+        verdict = replace(verdict, kind="unknown_effect")
+    text = f"since {both.names}: {words}; {change.sentence}"
+    track = both.track(found.problem, found.explained_mm) if both.used else None
+    return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

@@ -605,6 +605,12 @@ class Selected:
         """Sensitivities of the named effects."""
         return chosen_by(self.named)
 
+    @property
+    def explained_mm(self) -> np.ndarray:
+        """(S, n, 3) what the named effects explain of the residual, mm; 0 where none is named."""
+        amplitudes = self.selection.validation.amplitudes(self.chosen)
+        return self.selection.sensitivities[..., list(self.chosen)] @ amplitudes
+
 
 @dataclass(frozen=True, eq=False)
 class Findings(Selected):

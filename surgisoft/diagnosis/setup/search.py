@@ -84,18 +84,25 @@ class Proof:
     """Corrections whose errors differ by less than this factor do equally well: the simplest of
     them is named, and those of its number of kinds are named together."""
     blocks: float = 0.9
-    """Least share of the blocks of time whose error falls."""
-    lag_share: float = 0.85
-    """Least share of a delay that must be pure: a lag moves the rest."""
+    """Least share of the blocks of time whose error falls, of those above the validated error."""
+    lag_t: float = 3.0
+    """By how many standard errors, over blocks of time, the logarithm of the error must be less
+    with a pure delay than with any lag, alone or behind a quarter of the delay."""
     lag_gain: float = 0.5
     """Most squared error above the validated one that a pure delay may leave, as a share of what
-    the best first-order lag leaves."""
+    the best lag without a delay leaves."""
     earliest_s: float = 0.03
     """Least offset of the clocks that is called a fault, s; or one and a half rows."""
     most_kinds: int = 3
     """Most kinds of faults that are named at once."""
 
 
+LAG_SHARES = (0.0, 0.25)
+"""Pure parts of the mixtures of a delay and a lag that a pure delay is compared with."""
+LAG_STRETCHES = (0.7, 1.0, 1.3)
+"""Time constants of their lags, in units of what is left of the delay."""
+LAG_MARGIN = 3.0
+"""Rows that take no part at the begin of each run, in units of the delay."""
 SETTINGS, PROOF = SearchSettings(), Proof()
 
 
@@ -541,51 +548,69 @@ class Search:
         explained = self._share(start, after.rmse_mm)
         motion = float(np.sqrt(np.mean(self.motion(after.hypothesis.arrangement) ** 2)))
         most = max(asked.near_validated * self.levels.reference, asked.left_of_motion * motion)
-        counted = after.blocks.count > 0
-        falls = float(np.mean(after.losses[counted] < before.losses[counted]))
-        if after.hypothesis.mm_per_unit != 1.0:
-            falls = 1.0
-        return explained >= asked.explained and after.rmse_mm <= most and falls >= asked.blocks
+        # A fault need not show in a block in which nothing moves.
+        counted = (after.blocks.count > 0) & (before.blocks.count > 0)
+        noticed = before.losses > self.levels.reference**2 * before.blocks.count
+        falls = after.losses < before.losses
+        known = after.hypothesis.mm_per_unit != 1.0 or not (counted & noticed).any()
+        share = 1.0 if known else float(np.mean(falls[counted & noticed]))
+        return explained >= asked.explained and after.rmse_mm <= most and share >= asked.blocks
 
     def _pure_delay(self, given: Fitted) -> bool:
         """Whether an offset in time is one of the clocks and no lag of the arm or its line.
 
         A body that moves before its actuation is no physics. One that moves late may lag: the
-        prediction is passed through first-order lags of the same total delay, of which a part is
-        pure. The offset counts where the pure delay does best, and clearly better than a lag alone.
+        prediction is passed through one or two first-order lags of the same total delay, of which a
+        quarter is pure or nothing. The offset counts where the pure delay does clearly better.
         """
         late = given.hypothesis.later_s
         if abs(late) < max(self.proof.earliest_s, 1.5 * self.row_s):
             return False
         if late < 0:
             return True
-        pure = given.rmse_mm**2
-        losses = {1.0: given.losses}
-        for share in (0.0, 0.25, 0.5, 0.75):
-            stretches = (0.7, 1.0, 1.4) if share == 0.0 else (1.0, 1.3)
-            each = [
-                self._lagging(given.hypothesis, share * late, (1 - share) * late * stretch)
-                for stretch in stretches
+        pure = self._lagging(given.hypothesis, late, late, 0.0, 1)
+        used = given.blocks.count > 0
+        count = given.blocks.count[used]
+        floor = min(self.levels.reference**2, float(pure.sum() / count.sum())) * count.sum()
+        for share in LAG_SHARES:
+            mixtures = [
+                self._lagging(given.hypothesis, late, share * late, (1 - share) * late * by, lags)
+                for by in LAG_STRETCHES
+                for lags in (1, 2)
             ]
-            losses[share] = min(each, key=np.sum)
-        least = min(losses, key=lambda share: losses[share].sum())
-        count = max(float(given.blocks.count.sum()), 1.0)
-        alone = losses[0.0].sum() / count
-        floor = min(self.levels.reference**2, pure)
-        clear = pure - floor <= self.proof.lag_gain * (alone - floor)
-        return least >= self.proof.lag_share and clear
+            lagged = min(mixtures, key=np.sum)
+            gain = np.log(np.maximum(lagged[used], 1e-12) / np.maximum(pure[used], 1e-12))
+            if gain.mean() < self.proof.lag_t * gain.std(ddof=1) / np.sqrt(len(gain)):
+                return False
+            small = pure.sum() - floor <= self.proof.lag_gain * (lagged.sum() - floor)
+            if share == 0.0 and not small:
+                return False
+        return True
 
-    def _lagging(self, hypothesis: Hypothesis, later_s: float, tau_s: float) -> np.ndarray:
-        """(B,) losses of a body behind a pure delay and a first-order lag, mm^2."""
+    def _lagging(
+        self, hypothesis: Hypothesis, late_s: float, pure_s: float, tau_s: float, lags: int
+    ) -> np.ndarray:
+        """(B,) losses of a body behind a pure delay and equal first-order lags, mm^2.
+
+        late_s: the whole delay; rows too near to the begin of a run to know what came before them
+        take no part, the same for every mixture. tau_s: time constant of the lags together.
+        """
         full, parts, begin = self._full(hypothesis.arrangement), [], 0
         for times in self.full.at:
-            part = full[begin : begin + len(times)]
+            part = full[begin : begin + len(times)].copy()
             begin += len(times)
             step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-            lagged = _first_order(part.reshape(len(part), -1), step, tau_s)
-            parts.append(lagged.reshape(part.shape))
-        late = self._late(np.concatenate(parts), later_s)
-        return self._at(replace(hypothesis, later_s=later_s), late).losses
+            for _ in range(lags if tau_s else 0):
+                lagged = _first_order(part.reshape(len(part), -1), step, tau_s / lags)
+                part = lagged.reshape(part.shape)
+            parts.append(part)
+        late = self._late(np.concatenate(parts), pure_s)
+        late[self._early(LAG_MARGIN * late_s)] = np.nan
+        return self._at(replace(hypothesis, later_s=pure_s), late).losses
+
+    def _early(self, margin_s: float) -> np.ndarray:
+        """(S,) bool: the rows of the fine sample in the first `margin_s` of a run."""
+        return np.concatenate([at - at[0] < margin_s for at in self.fine.at])
 
 
 def _first_order(values: np.ndarray, step_s: float, tau_s: float) -> np.ndarray:

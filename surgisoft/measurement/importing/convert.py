@@ -15,6 +15,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.align import Joined, join
+from surgisoft.measurement.importing.plausible import plausibility_notes
 from surgisoft.measurement.importing.points import (
     key_points_of,
     needed_columns,
@@ -377,4 +378,5 @@ def _finished(part: Imported, spec: ImportMap) -> Imported:
     if spec.key_points.spikes == "missing":
         recording, marked = without_spikes(recording)
         notes = [*notes, *marked]
+    notes = [*notes, *plausibility_notes(recording, spec.key_points.unit)]
     return Imported(recording, [*notes, *timing_notes(recording, spec.measured.delay_s)])

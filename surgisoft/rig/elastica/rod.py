@@ -32,7 +32,7 @@ from elastica.rod.data_structures import overload_operator_kinematic_numba
 from surgisoft.compiled import compiled
 
 _gravity_forces = elastica.GravityForces.compute_gravity_forces
-MARGIN = 0.7
+MARGIN = 0.8
 """Time step as a share of the largest stable one [-]; what is left covers contact and large
 deformation."""
 CONTACT_TOLERANCE_M = 1e-4

@@ -1,0 +1,64 @@
+"""Notes of an import about a set-up that cannot be right, as far as no model is needed for it."""
+
+import itertools
+
+import numpy as np
+
+from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.columns import MM_PER
+
+LARGEST_RATIO = 2.0
+"""Key points that span more than this multiple of the arm's length are in a wrong unit."""
+LEAST_RATIO = 0.2
+"""Key points that span less than this share of the arm's length are in a wrong unit: trackers may
+cover a part of the arm only."""
+UNIT_TOLERANCE = 0.5
+"""Largest difference, in the logarithm of the length, of a unit that is proposed."""
+BASE_MOTION = 3.0
+"""Key points are taken for reversed where the first moves so many times more than the last."""
+
+
+def plausibility_notes(recording: Recording, unit: str | None) -> list[str]:
+    """What contradicts the arm's stated length or the order base to tip; unit: of the positions."""
+    return [*_length(recording, unit), *_order(recording)]
+
+
+def _length(recording: Recording, unit: str | None) -> list[str]:
+    """A note where the key points span far more or less than the arm's length."""
+    stated, points = recording.arm.length_mm, recording.key_points_mm
+    if stated is None or recording.key_points < 2:
+        return []
+    links = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    known = ~np.isnan(links).any(axis=1)
+    if not known.any():
+        return []
+    span = float(np.median(links[known].sum(axis=1)))
+    if LEAST_RATIO * stated <= span <= LARGEST_RATIO * stated:
+        return []
+    text = f"the key points span {span:.3g} mm, the arm is {stated:.3g} mm long"
+    ratio = stated / max(span, 1e-12)
+    by = MM_PER.get(unit or "mm", 1.0)
+    known_units = {name: mm / by for name, mm in MM_PER.items() if name != unit}
+    best = min(known_units, key=lambda name: abs(np.log(known_units[name] / ratio)))
+    if abs(np.log(known_units[best] / ratio)) > UNIT_TOLERANCE:
+        return [f"{text}: check unit and scale in [key_points] and length_mm in [arm]"]
+    return [f'{text}: if the positions are in {best}, set unit = "{best}" in [key_points]']
+
+
+def _order(recording: Recording) -> list[str]:
+    """A note where the key points move less and less from the first to the last."""
+    motion = []
+    for k in range(recording.key_points):
+        point = recording.key_points_mm[:, k]
+        seen = point[~np.isnan(point).any(axis=1)]
+        if len(seen) < 2:
+            return []
+        motion.append(float(np.sqrt(np.square(seen - seen.mean(axis=0)).sum(axis=1).mean())))
+    falls = all(a > b for a, b in itertools.pairwise(motion))
+    if len(motion) < 3 or not falls or motion[0] < BASE_MOTION * motion[-1]:
+        return []
+    order = [*range(recording.key_points)][::-1]
+    return [
+        f"key point k0 moves by {motion[0]:.3g} mm and the last one by {motion[-1]:.3g} mm (rms), "
+        f"expected base to tip: if they are in reverse order, set order = {order} in [key_points]"
+    ]

@@ -1,5 +1,7 @@
 """Notes of an import about a set-up that cannot be right, as far as no model is needed for it."""
 
+import itertools
+
 import numpy as np
 
 from surgisoft.measurement.recordings import Recording
@@ -52,7 +54,7 @@ def _order(recording: Recording) -> list[str]:
         if len(seen) < 2:
             return []
         motion.append(float(np.sqrt(np.square(seen - seen.mean(axis=0)).sum(axis=1).mean())))
-    falls = all(a > b for a, b in zip(motion, motion[1:], strict=False))
+    falls = all(a > b for a, b in itertools.pairwise(motion))
     if len(motion) < 3 or not falls or motion[0] < BASE_MOTION * motion[-1]:
         return []
     order = [*range(recording.key_points)][::-1]

@@ -7,9 +7,9 @@ Minimised over the bends, stretches and base are
 
 with v the mean squared motion of a key point, by L-BFGS (Liu & Nocedal 1989) in double precision.
 Bends and stretches are those of half a chamber's range. A ridge is the prior of a Gaussian
-variable, s^2 / (N w^2): what the arcs leave is about s = 15 % of the motion, of which a short recording has
-about N = 20 independent samples, and the variable is of the size w. Without it, a chamber that
-hardly moved gets a large bend that fits the others' residuals.
+variable, s^2 / (N w^2): what the arcs leave is about s = 15 % of the motion, of which a short
+recording has about N = 20 independent samples, and the variable is of the size w. Without it, a
+chamber that hardly moved gets a large bend that fits the others' residuals.
 """
 
 import torch

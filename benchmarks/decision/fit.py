@@ -2,8 +2,9 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, however many cases
-it has. The penalty of each model is chosen by leaving out one robot after another within the cases
-that the model is fitted to, so nothing of a source that is left out enters.
+it has. The penalty of each model is chosen by leaving out one source after another within the cases
+that the model is fitted to (groups of robots where all are of one source), so that it suits robots
+of another kind; nothing of a source that is judged enters.
 """
 
 import datetime
@@ -24,7 +25,7 @@ from surgisoft.diagnosis.decision import (
     features_of,
 )
 
-PENALTIES = (0.1, 0.3, 1.0, 3.0)
+PENALTIES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Ridge penalties on the weights that are tried: inverse variances of a normal prior around 0, for
 features of order 1."""
 CONSTANT_PENALTY = 0.01
@@ -32,8 +33,10 @@ CONSTANT_PENALTY = 0.01
 WEAK = 0.5
 """Change by what is missing, over the validated error, below which "nothing" is right too: such
 cases take no part in the fit of `missing`."""
+WHOLE_TRUTH = ("missing", "known", "network")
+"""Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
-"""Groups of robots that are left out in turn for the choice of a penalty."""
+"""Groups of robots that are left out in turn for the choice of a penalty within one source."""
 
 
 def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
@@ -46,6 +49,8 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
         if case.label == "setup" or not case.evidence.effects:
             continue
         missing = case.label in ("known", "unknown")
+        if not case.complete and name in WHOLE_TRUTH:
+            continue
         if name == "missing":
             if (missing and case.size < WEAK) or case.label == "other_robot":
                 continue
@@ -142,16 +147,18 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
 
 
-def _robot_folds(some: Sequence) -> np.ndarray:
-    """(N,) fold of each case: whole robots together."""
-    robots = [f"{case.source}/{case.robot}" for _, _, case in some]
-    names = sorted(set(robots))
-    return np.array([names.index(robot) % ROBOT_FOLDS for robot in robots])
+def _folds(some: Sequence) -> np.ndarray:
+    """(N,) fold of each case: whole sources, or groups of robots where there is one source."""
+    sources = sorted({case.source for _, _, case in some})
+    if len(sources) > 1:
+        return np.array([sources.index(case.source) for _, _, case in some])
+    robots = sorted({case.robot for _, _, case in some})
+    return np.array([robots.index(case.robot) % ROBOT_FOLDS for _, _, case in some])
 
 
 def penalty_of(name: str, some: Sequence) -> float:
-    """The penalty with the least held-out loss, one group of robots left out in turn."""
-    fold = _robot_folds(some) if some else np.zeros(0)
+    """The penalty with the least held-out loss, one source or group of robots left out in turn."""
+    fold = _folds(some) if some else np.zeros(0)
     if len(np.unique(fold)) < 2:
         return PENALTIES[-1]
     weights = source_weights([case for _, _, case in some])

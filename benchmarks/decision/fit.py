@@ -1,10 +1,9 @@
 """Fit of the decision to stored evidence: five logistic models with weights of fixed sign.
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
-sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, however many cases
-it has. The penalty of each model is chosen by leaving out one source after another within the cases
-that the model is fitted to (groups of robots where all are of one source), so that it suits robots
-of another kind; nothing of a source that is judged enters.
+sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
+cases. The penalty of each model is chosen by leaving out one group of robots after another within
+the cases that it is fitted to, so nothing of a source that is judged enters.
 """
 
 import datetime
@@ -33,10 +32,12 @@ CONSTANT_PENALTY = 0.01
 WEAK = 0.5
 """Change by what is missing, over the validated error, below which "nothing" is right too: such
 cases take no part in the fit of `missing`."""
+MOST_WEIGHT = 3.0
+"""Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
 WHOLE_TRUTH = ("missing", "known", "network")
 """Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
-"""Groups of robots that are left out in turn for the choice of a penalty within one source."""
+"""Groups of robots that are left out in turn for the choice of a penalty."""
 
 
 def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
@@ -79,10 +80,12 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
 
 
 def source_weights(cases: Sequence[Labelled]) -> np.ndarray:
-    """(N,) weights of cases of mean 1, so that every source has the same sum."""
+    """(N,) weights of cases of mean 1: every source has the same sum, unless it has few cases."""
     names = [case.source for case in cases]
     number = {name: names.count(name) for name in names}
-    return np.array([len(names) / len(number) / number[name] for name in names])
+    weights = np.array([len(names) / len(number) / number[name] for name in names])
+    weights = np.minimum(weights, MOST_WEIGHT)
+    return weights / weights.mean()
 
 
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
@@ -148,16 +151,14 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
 
 
 def _folds(some: Sequence) -> np.ndarray:
-    """(N,) fold of each case: whole sources, or groups of robots where there is one source."""
-    sources = sorted({case.source for _, _, case in some})
-    if len(sources) > 1:
-        return np.array([sources.index(case.source) for _, _, case in some])
-    robots = sorted({case.robot for _, _, case in some})
-    return np.array([robots.index(case.robot) % ROBOT_FOLDS for _, _, case in some])
+    """(N,) fold of each case: whole robots together."""
+    names = [f"{case.source}/{case.robot}" for _, _, case in some]
+    robots = sorted(set(names))
+    return np.array([robots.index(name) % ROBOT_FOLDS for name in names])
 
 
 def penalty_of(name: str, some: Sequence) -> float:
-    """The penalty with the least held-out loss, one source or group of robots left out in turn."""
+    """The penalty with the least held-out loss, one group of robots left out in turn."""
     fold = _folds(some) if some else np.zeros(0)
     if len(np.unique(fold)) < 2:
         return PENALTIES[-1]

@@ -56,7 +56,7 @@ FLOORS = {
         ("cross_validation",),
         ("black_box", "candidates", "setup"),
         ("testability", "estimation"),
-        ("selection",),
+        ("selection", "refit"),
         ("evidence",),
         ("decision",),
         ("design",),

@@ -1,7 +1,7 @@
 """`diagnose`: which physical effect is the model missing?
 
 What is wrong with the set-up of the recordings is tested first (`setup`): where a fault is proved,
-the diagnosis ends there. Else it is a system identification of a grey-box model in five steps:
+the diagnosis ends there. Else it is a system identification of a grey-box model in six steps:
 
 1. Residual table: the model's residuals on the training rows, thinned, in blocks (`residuals`).
 2. Sensitivities: what each effect, with each choice of its nonlinear parameters, would change in
@@ -10,7 +10,9 @@ the diagnosis ends there. Else it is a system identification of a grey-box model
    are named one by one while they are beyond chance and large enough (`selection`).
 4. Decision: calibrated probabilities from the evidence, and the result that is worth most with
    them (`evidence`, `decision`).
-5. Experiment design, where effects cannot be told apart (`design`).
+5. Refit: where the error is large and no larger than the validated one, candidates are fitted
+   together with the network, and held-out data decide (`refit`).
+6. Experiment design, where effects cannot be told apart (`design`).
 """
 
 import time
@@ -20,7 +22,14 @@ from dataclasses import asdict, dataclass, replace
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CLAIM, SEARCH
 from surgisoft.diagnosis.data_quality import data_quality_warnings
-from surgisoft.diagnosis.decision import Decision, Kind, Probabilities, Reason, decide
+from surgisoft.diagnosis.decision import (
+    Decision,
+    Kind,
+    Probabilities,
+    Reason,
+    claimable,
+    decide,
+)
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
@@ -32,6 +41,8 @@ from surgisoft.diagnosis.inputs import (
     with_known_residuals,
 )
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
+from surgisoft.diagnosis.refit import Refit, refit_reason
+from surgisoft.diagnosis.refit import refit as fit_candidates_together
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
@@ -42,9 +53,11 @@ from surgisoft.diagnosis.selection import (
 )
 from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
 from surgisoft.diagnosis.testability import NotTestable, testable
-from surgisoft.errors import unknown_name
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.progress import Progress as RefitProgress
+from surgisoft.progress import silent
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -167,14 +180,17 @@ class Diagnosis:
     track: ChangeTrack | None = None
     """Key points before and after and what the named effects explain, for pictures; None without
     pairs."""
+    refit: Refit | None = None
+    """What candidates did that were fitted together with the network; None where none was."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        plain = asdict(replace(self, setup=None, track=None, change=None))
+        plain = asdict(replace(self, setup=None, track=None, change=None, refit=None))
         del plain["track"]
         return plain | {
             "setup": self.setup.to_json() if self.setup else None,
             "change": self.change.to_json() if self.change else None,
+            "refit": self.refit.to_json() if self.refit else None,
         }
 
 
@@ -188,6 +204,9 @@ def diagnose(
     setup_tests: bool = True,
     before: Recordings | None = None,
     paired: Paired = "auto",
+    refit: str = "auto",
+    refit_progress: RefitProgress = silent,
+    processes: int = 1,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
@@ -201,7 +220,11 @@ def diagnose(
     model, with those of `before` as what was known; paired: `auto`, `always` (too few common
     motions are an error) or `never`. reference: recordings, as before; or residuals of the model
     from before, default those that it keeps of its fit. without: effects that cannot act, such as a
-    contact on a bench without anything to touch.
+    contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
+    together with the network (`surgisoft.diagnosis.refit`), not where recordings from before are
+    given; refit_progress: called while that goes on; processes: how many trainings then run at
+    once, with the same result. More than one starts new Python processes, so a script has to guard
+    its start by `if __name__ == "__main__"`.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
@@ -222,10 +245,21 @@ def diagnose(
         problem, notes = both.training(), (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
+    reason = refit_reason(problem, refit)
+    if both is not None and refit == "always":
+        raise InputError(
+            "a change since recordings from before is not one that a network was fitted to: "
+            "expected --refit always without --before"
+        )
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
         result = since(result, both, found)
+    elif reason:
+        joint = fit_candidates_together(
+            problem, reason, without, progress=refit_progress, processes=processes
+        )
+        result = with_refit(result, joint, problem)
     if result.verdict.kind == "unknown_effect":
         result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
@@ -289,6 +323,63 @@ def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
         return result
     text = f"{result.verdict.sentence}; it depends most on {axis.axis} ({100 * axis.share:.0f} %)"
     return replace(result, axis=axis.axis, verdict=replace(result.verdict, sentence=text))
+
+
+def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
+    """The diagnosis in which the refit decides about the effects that it tried.
+
+    A winner is named, alone or with what competes with it. Without one, effects that the residuals
+    name are not named any more if all of them were tried: the network alone does as well.
+    """
+    error = f"error {result.error_mm.before:.3g} mm, floor {result.error_mm.floor:.3g} mm"
+    verdict, ranking, checks = result.verdict, result.ranking, result.checks
+    plan, competing = result.next_experiment, result.ambiguous_with
+    evidence, chances = result.statistics, result.probabilities
+    command = result.next_command
+    tried = {candidate.effect for candidate in joint.candidates}
+    if joint.winner is not None:
+        sure = joint.confidence
+        kind: Kind = "ambiguous" if joint.ambiguous else "identified"
+        effects = joint.names if joint.ambiguous else (joint.winner,)
+        head = f"cannot tell {' from '.join(effects)} with these recordings"
+        if kind == "identified":
+            head = f"{joint.winner} is missing (confidence {sure:.2f})"
+        verdict = Verdict(kind, effects, f"{head}: {joint.sentence}; {error}", round(sure, 4))
+        order = sorted(ranking, key=lambda row: row.effect not in joint.names)
+        order.sort(key=lambda row: row.effect != joint.winner)
+        most = min(sure, 1.0 - sure)
+        ranking = tuple(
+            replace(row, confidence=round(sure if place == 0 else min(row.confidence, most), 4))
+            for place, row in enumerate(order)
+        )
+        competing, plan = joint.competing, None
+        if kind == "ambiguous":
+            plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+        if chances is not None:
+            command = next_command(Decision(kind, effects, sure, chances))
+            command += " --refit always" if kind == "identified" else ""
+    else:
+        checks = (*checks, joint.sentence)
+        if evidence is not None and chances is not None and tried.issuperset(verdict.effects):
+            quiet = chances.nothing + chances.network
+            none = Decision("cannot_tell", (), quiet, chances, "schedule")
+            if claimable(evidence):
+                none = Decision("nothing_missing", (), quiet, chances)
+            if verdict.effects or verdict.reason == "learned":
+                sentence = sentence_of(none, result.error_mm, result.error_mm.before)
+                verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
+                ranking = tuple(replace(row, confidence=0.0) for row in ranking)
+                command, competing, plan = next_command(none), (), None
+    return replace(
+        result,
+        verdict=verdict,
+        ranking=ranking,
+        ambiguous_with=competing,
+        next_experiment=plan,
+        checks=checks,
+        refit=joint,
+        next_command=command,
+    )
 
 
 def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:

@@ -7,6 +7,7 @@ import numpy as np
 from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
+from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
@@ -77,6 +78,8 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
             parts.append(Section("What to do", [Text(f"`{command}`")]))
     if found.change:
         parts.append(_change(found))
+    if found.refit is not None:
+        parts.append(_refit(found.refit))
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
@@ -235,6 +238,42 @@ def _probabilities(chances: Probabilities) -> Section:
     if chances.two:
         rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))
     return Section("Probabilities", [Table(["what may be true", "probability"], rows)])
+
+
+def _refit(refit: Refit) -> Section:
+    """The candidates that were fitted together with the network."""
+    rows = [
+        (
+            row.effect,
+            f"{row.heldout_rmse_mm:.3f}",
+            f"{row.rival_mm:.3f}",
+            f"{row.difference_mm:.3f} ({row.ci95_mm[0]:.3f} .. {row.ci95_mm[1]:.3f})",
+            f"{row.spread_mm:.3f}",
+            f"{row.p_value:.4f}",
+            str(row.epochs),
+            "yes" if row.plausible else "no",
+        )
+        for row in refit.candidates
+    ]
+    header = [
+        "effect",
+        "held-out [mm]",
+        "network alone [mm]",
+        "difference, 95 % [mm]",
+        "spread over seeds [mm]",
+        "p-value",
+        "epochs",
+        "plausible",
+    ]
+    left = "; ".join(f"{name}: {why}" for name, why in refit.not_tried)
+    text = (
+        f"{refit.sentence[:1].upper()}{refit.sentence[1:]}. Done because {refit.reason}. "
+        f"{refit.trainings} trainings on {refit.rows} rows; {refit.unit} were left out in turn, "
+        "and the network alone was trained for as many epochs."
+    )
+    return Section(
+        "Fitted together", [Text(text), Table(header, rows), Text(f"Not tried: {left}.")]
+    )
 
 
 def _parameters(found: Diagnosis) -> Section:

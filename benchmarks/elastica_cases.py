@@ -69,15 +69,17 @@ CLEAN_A_ROUND, PAIRS_A_ROUND = 4, 2
 """Cases without any change, and with two effects, in a round."""
 CHANGE_MM = (0.4, 3.0)
 """Range of the RMS change of the key points that is drawn, log-uniformly [mm]."""
-ROBOTS = "101,102,103,104,105,106"
+ROBOTS = "101,102,103,104,105"
 """Seeds of the default robots."""
+ELEMENTS = 8
+"""Elements of each rod: a rod of 12 takes twice the time, and each is a robot of its own anyway."""
 
 BEFORE = {
     "mixed": ("ramps", "holds", "reversals", "ladder", "wander"),
     "other": ("steps", "sets", "two_speeds", "wander"),
 }
 """Recordings before the change: name -> excitation signals, one run each."""
-BEFORE_S = {"mixed": 250.0, "other": 180.0}
+BEFORE_S = {"mixed": 180.0, "other": 150.0}
 """Their durations [s]."""
 AFTER = {
     "same": ("ramps", "holds", "reversals", "ladder", "wander"),
@@ -86,11 +88,11 @@ AFTER = {
 }
 """Recordings after it. `same` has the actuation of `mixed` before; the others are drawn anew for
 each robot."""
-AFTER_S = {"same": 250.0, "mixed": 160.0, "brisk": 150.0}
+AFTER_S = {"same": 180.0, "mixed": 150.0, "brisk": 150.0}
 """Their durations [s]."""
-TRIED = ("ramps", "holds", "wander")
+TRIED = ("sets", "wander")
 """Excitation signals on which a strength is tried."""
-TRIED_S = 36.0
+TRIED_S = 40.0
 """Duration of a try [s]."""
 
 
@@ -132,6 +134,11 @@ def cases(robots: list[int], count: int, seed: int) -> list[Case]:
     return found[:count]
 
 
+def arm(robot: int, **fields) -> ElasticaRig:
+    """The rig with a robot; fields: of `ElasticaRigConfig`."""
+    return ElasticaRig(robot, elements=ELEMENTS, **fields)
+
+
 def excitation(
     rig: ElasticaRig, name: str, signals: tuple[str, ...], seconds: float, seed: int
 ) -> Protocol:
@@ -170,7 +177,7 @@ def make_robot(folder: Path, robot: int) -> None:
     plain = {}
     noise: list[float | None] = []
     for take, (name, signals) in enumerate(BEFORE.items()):
-        rig = ElasticaRig(robot, take=take)
+        rig = arm(robot, take=take)
         protocol = excitation(rig, name, signals, BEFORE_S[name], robot)
         recording, points = record(rig, protocol)
         save_recording(recording, place / "before" / f"{name}.parquet", force=True)
@@ -179,9 +186,9 @@ def make_robot(folder: Path, robot: int) -> None:
             plain["same"] = points
     for after in AFTER:
         if after != "same":
-            rig = ElasticaRig(robot, noise=0.0)
+            rig = arm(robot, noise=0.0)
             plain[after] = record(rig, after_protocol(rig, robot, after))[1]
-    rig = ElasticaRig(robot, noise=0.0)
+    rig = arm(robot, noise=0.0)
     plain["tried"] = record(rig, excitation(rig, "tried", TRIED, TRIED_S, robot))[1]
     np.savez_compressed(place / "unchanged.npz", **plain)
     about = {
@@ -202,16 +209,11 @@ def change_mm(points: np.ndarray, plain: np.ndarray) -> float:
 
 
 def strength_for(robot: int, name: str, wanted_mm: float, plain: np.ndarray) -> float:
-    """Strength at which an effect changes the key points by about so much, from two tries."""
-    strength = 1.0
-    for _ in range(2):
-        rig = ElasticaRig(robot, noise=0.0, hidden=[(name, strength)])
-        points = record(rig, excitation(rig, "tried", TRIED, TRIED_S, robot))[1]
-        factor = wanted_mm / max(change_mm(points, plain), 1e-3)
-        strength = float(np.clip(strength * np.clip(factor, 0.05, 8.0), 0.02, 10.0))
-        if 0.8 < factor < 1.25:
-            break
-    return round(strength, 4)
+    """Strength at which an effect changes the key points by about so much, in proportion to what
+    strength 1 changes on a short schedule."""
+    rig = arm(robot, noise=0.0, hidden=[(name, 1.0)])
+    points = record(rig, excitation(rig, "tried", TRIED, TRIED_S, robot))[1]
+    return round(float(np.clip(wanted_mm / max(change_mm(points, plain), 0.05), 0.1, 8.0)), 4)
 
 
 def make_case(folder: Path, case: Case) -> None:
@@ -225,7 +227,7 @@ def make_case(folder: Path, case: Case) -> None:
         (name, strength_for(case.robot, name, case.change_mm, plain["tried"]))
         for name in case.names
     ]
-    rig = ElasticaRig(case.robot, take=1000 + case.number, hidden=hidden)
+    rig = arm(case.robot, take=1000 + case.number, hidden=hidden)
     recording, points = record(rig, after_protocol(rig, case.robot, case.after))
     (place / "after").mkdir(parents=True, exist_ok=True)
     save_recording(recording, place / "after" / f"{case.after}.parquet", force=True)

@@ -112,6 +112,7 @@ ONLY_IN = {
     "gymnasium": "tasks/",
     "rsl_rl": "agents",
     "fcl": "scene/collision",
+    "elastica": "rig/elastica",
 }
 
 

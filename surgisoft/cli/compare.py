@@ -98,6 +98,10 @@ def _show(result) -> None:
         "-" if math.isnan(value) else f"{value:.4f}" for value in result.per_key_point_mm
     )
     print(f"key points base to tip: {points} mm")
+    if result.coverage is None:
+        print("the model states no prediction interval")
+    else:
+        print(f"{result.coverage:.1%} of key points within the model's 95 % prediction interval")
     if result.time_shift is not None:
         low, high = result.time_shift.ci95_s
         shift = result.time_shift.seconds

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_new_folder
-from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
+from surgisoft.cli.files import check_folder, check_free, check_new_folder, check_replay
+from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
 from surgisoft.cli.options import (
     Before,
     EffectFiles,
@@ -20,7 +20,17 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
 from surgisoft.files import write_json
+
+ReplayOfChange = Annotated[
+    Path | None,
+    typer.Option(
+        "--replay",
+        metavar="FILE.rrd",
+        help="Write a replay of the change since --before, for `surgisoft replay`.",
+    ),
+]
 
 
 @app.command()
@@ -29,6 +39,7 @@ def diagnose(
     recordings: Recordings,
     json_file: JsonFile = None,
     report: Report = None,
+    replay: ReplayOfChange = None,
     before: Before = None,
     paired: Paired = "auto",
     without: Annotated[
@@ -64,6 +75,9 @@ def diagnose(
     """
     check_free(json_file, "verdict")
     check_folder(report)
+    check_replay(replay)
+    if replay and not before:
+        raise InputError("--replay shows a change; add --before REC, or use 'surgisoft compare'")
     check_new_folder(apply)
     check_model(model)
     measured = read_recordings(recordings)
@@ -95,6 +109,15 @@ def diagnose(
 
         title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
         written.append(write_report(found, report, title))
+    if replay and found.track is not None:
+        from surgisoft.replay.comparison import write_change
+
+        track, names = found.track, ", ".join(recording.name for recording in measured)
+        points = (track.before_mm, track.after_mm, track.explained_mm)
+        write_change(track.t_s, *points, f"{model.name} on {names}", replay)
+        written.append(replay)
+    elif replay:
+        warn(f"{replay} was not written: no rows of the same actuation before and after")
     if apply and found.setup and found.setup.mendable:
         save_recordings(found.setup.mended(measured), apply)
         written.append(apply)

@@ -35,13 +35,22 @@ def fit(
             "--effects",
             metavar="NAME|FILE.py...",
             help="Physical effects of the line or the material to add, such as hysteresis, or "
-            "files of user-defined effects (docs/effects.md).",
+            "files of user-defined effects (docs/effects.md); auto: held-out data choose among "
+            "those with memory.",
         ),
     ] = None,
     network: Annotated[
         Literal["haw_nn", "constant_curvature", "recurrent"],
         typer.Option(help="HAW-NN, or one of two baselines."),
     ] = "haw_nn",
+    members: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            help="Networks whose mean is the prediction: an ensemble, each member trained without "
+            "another share of the data. Lower error where data are few; slower to evaluate.",
+        ),
+    ] = 1,
     widths: Annotated[
         str, typer.Option(metavar="N,N...", help="Widths of HAW-NN's hidden layers.")
     ] = "128,128,128,128",
@@ -89,6 +98,7 @@ def fit(
             inputs=inputs,
             effects=[name for item in effects or [] for name in item.split(",")],
             hidden=parse_widths(widths),
+            members=members,
             epochs=epochs,
             seed=seed,
         )

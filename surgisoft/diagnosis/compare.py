@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import torch
 
 from surgisoft.diagnosis.black_box import black_box
 from surgisoft.diagnosis.body_frame import COMPONENTS
@@ -32,6 +33,7 @@ from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -103,6 +105,9 @@ class Comparison:
     """Error and bias in bands of every axis."""
     worst: tuple[Moment, ...]
     """The worst moments, each from another stretch of time."""
+    coverage: float | None = None
+    """Share (0..1) of measured key points within the model's 95 % prediction interval; None for a
+    model that states none."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
     setup: str | None = None
@@ -283,6 +288,14 @@ def _floors(problem: Problem) -> tuple[Floor, ...]:
     found = {floor.source: floor for floor in (table.floor, table.holds)}
     found["repeats"] = repeat_floor(table, problem.block_of_row)
     return tuple(floor for floor in found.values() if floor.rmse_mm is not None)
+
+
+def _coverage(table: ResidualTable) -> float | None:
+    """Share of measured key points within the model's 95 % interval; None without an interval."""
+    if not table.model.states_interval:
+        return None
+    radius = table.model.error_radius(torch.from_numpy(table.pressure))
+    return coverage_of(torch.from_numpy(table.error_mm), radius)
 
 
 def _root_interval(square: np.ndarray, block: np.ndarray) -> tuple[float, float]:

@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
+import numpy as np
+
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CRITERIA
 from surgisoft.diagnosis.data_quality import data_quality_warnings
@@ -29,7 +31,7 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
-from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
@@ -128,11 +130,18 @@ class Diagnosis:
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
     """How far the recordings differ from those before the change; None where none were given."""
+    track: ChangeTrack | None = None
+    """Key points before and after and what the named effects explain, for pictures; None without
+    pairs."""
 
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
-        plain = asdict(replace(self, setup=None))
-        return plain | {"setup": self.setup.to_json() if self.setup else None}
+        plain = asdict(replace(self, setup=None, track=None, change=None))
+        del plain["track"]
+        return plain | {
+            "setup": self.setup.to_json() if self.setup else None,
+            "change": self.change.to_json() if self.change else None,
+        }
 
 
 @torch_threads(1)
@@ -179,30 +188,49 @@ def diagnose(
         problem, notes = both.training(), (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
-    result = diagnosis_of(problem, report, without)
+    found = findings_of(problem, report, without)
+    result = result_of(found)
     if both is not None:
-        result = since(result, both.change)
+        result = since(result, both, found)
+    if result.verdict.kind == "unknown_effect":
+        result = with_axis(result, problem)
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
 
 
-def diagnosis_of(
-    problem: Problem, report: Progress = lambda text: None, without: Collection[str] = ()
-) -> Diagnosis:
-    """The diagnosis of an identification problem."""
+def findings_of(problem: Problem, report: Progress, without: Collection[str]) -> Findings:
+    """What model selection finds on an identification problem."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
         if name not in names:
             raise unknown_name("effect", name, names)
     tried = candidates(problem, [name for name in names if name not in without])
-    result = result_of(find(problem, tried, report))
-    return with_axis(result, problem) if result.verdict.kind == "unknown_effect" else result
+    return find(problem, tried, report)
 
 
-def since(result: Diagnosis, change: Change) -> Diagnosis:
-    """The diagnosis of a change: its sentence says since when, and how large the change is."""
-    text = f"since {' + '.join(change.before)}: {result.verdict.sentence}; {change.sentence}"
-    return replace(result, change=change, verdict=replace(result.verdict, sentence=text))
+def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
+    """The diagnosis of a change: since when, how large it is, and what of it is explained.
+
+    The network's own error is not in a paired difference: what no effect explains there is no
+    network that was fitted too little, but something that has changed.
+    """
+    verdict, change = result.verdict, both.change
+    words = verdict.sentence
+    if both.used and verdict.kind == "surrogate_undertrained":
+        words = "something has changed and it is none of the known effects"
+        verdict = replace(verdict, kind="unknown_effect")
+    text = f"since {both.names}: {words}; {change.sentence}"
+    track = both.track(found.problem, _explained(found, verdict)) if both.used else None
+    return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def _explained(found: Findings, verdict: Verdict) -> np.ndarray:
+    """(S, n, 3) what the named effects explain, mm; of several that compete, the first."""
+    effects = verdict.effects[:1] if verdict.kind == "ambiguous" else verdict.effects
+    forms = {score.effect: score.option.chosen for score in found.first}
+    chosen = tuple(i for name in effects if name in forms for i in forms[name])
+    amplitudes = found.selection.validation.amplitudes(chosen)
+    return found.selection.sensitivities[..., list(chosen)] @ amplitudes
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

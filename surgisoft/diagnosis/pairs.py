@@ -193,6 +193,27 @@ class Change:
         return asdict(self) | {"sentence": self.sentence}
 
 
+@dataclass(frozen=True, eq=False)
+class ChangeTrack:
+    """Key points before and after, and what effects explain of the change, on S rows."""
+
+    t_s: np.ndarray
+    """(S,) time in the recording of AFTER, s."""
+    run: np.ndarray
+    """(S,) run of each row."""
+    before_mm: np.ndarray
+    """(S, n, 3) key points of BEFORE at the matching instant, base frame, mm; NaN where missing."""
+    after_mm: np.ndarray
+    """(S, n, 3) key points of AFTER, base frame, mm; NaN where missing."""
+    explained_mm: np.ndarray
+    """(S, n, 3) change that the named effects explain, mm; 0 where none is named."""
+
+    @property
+    def change_mm(self) -> np.ndarray:
+        """(S, n, 3) change that was measured, mm."""
+        return self.after_mm - self.before_mm
+
+
 DELAYS_SHOWN = 3
 """Delays that a sentence lists."""
 
@@ -734,6 +755,17 @@ class BeforeAfter:
         """The training rows of AFTER; without pairs the residuals of BEFORE are their reference."""
         problem = self.table.training(rows)
         return problem if self.used else problem.with_reference(self.before)
+
+    def track(self, problem: Problem, explained_mm: np.ndarray) -> ChangeTrack:
+        """The change along the rows of a problem, of which effects explain (S, n, 3) mm."""
+        rows = problem.index.numpy()
+        return ChangeTrack(
+            t_s=problem.time_s,
+            run=self.plain.run[rows],
+            before_mm=self.pairs.before_mm[rows],
+            after_mm=self.pairs.after_mm[rows],
+            explained_mm=explained_mm,
+        )
 
     def with_held_out_pairs(self) -> "BeforeAfter":
         """These recordings; through the model where too few held-out rows have a partner."""

@@ -8,7 +8,7 @@ from typing import Any
 from surgisoft.measurement.histories import arm_spec, check_fits, history_of
 from surgisoft.measurement.recordings import Recording, check_same_arm, load_recordings
 from surgisoft.surrogate.effects import named_effect
-from surgisoft.surrogate.fit import FitConfig, FitResult
+from surgisoft.surrogate.fit import AUTO, FitConfig, FitResult
 from surgisoft.surrogate.fit import fit as fit_histories
 from surgisoft.workers import torch_threads
 
@@ -41,7 +41,8 @@ def fit(
     """
     config = replace(config or FitConfig(), **fields)
     effects = [config.effects] if isinstance(config.effects, str) else config.effects
-    config = replace(config, effects=tuple(map(named_effect, effects)), hidden=tuple(config.hidden))
+    chosen = tuple(name if name == AUTO else named_effect(name) for name in effects)
+    config = replace(config, effects=chosen, hidden=tuple(config.hidden))
     train = load_recordings(recordings)
     held = None if valid is None else load_recordings(valid)
     check_same_arm(train)

@@ -1,4 +1,4 @@
-"""Replay of a model compared with a recording: measured and predicted body, with the errors."""
+"""Replays of a model beside a recording, and of a recording before and after a change."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from surgisoft.errors import InputError
-from surgisoft.replay.colours import BACKGROUND, PLAN_COLOUR, SHAFT_COLOUR, error_colours
+from surgisoft.replay.colours import (
+    BACKGROUND,
+    PLAN_COLOUR,
+    REAL_COLOUR,
+    SHAFT_COLOUR,
+    error_colours,
+)
 from surgisoft.replay.episode_view import Replay
 from surgisoft.replay.plots import Line, series_colour
 from surgisoft.replay.recording import TIME, Columns, new_recording
@@ -52,7 +58,8 @@ def write_comparison(
     large = _quantile(error, LARGE)
     stretch = _stretch(measured, large)
     lines = _lines(error, None if pressure is None else np.asarray(pressure, float)[keep], unit)
-    blueprint = _blueprint(name, measured, stretch, large, lines)
+    title = f"{name}: errors x {stretch:g}, red from {large:.2g} mm"
+    blueprint = _blueprint(title, measured, ("/measured", "/predicted", "/errors"), lines)
     with new_recording(path, "surgisoft_comparison", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -63,6 +70,74 @@ def write_comparison(
             columns.plot(line)
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(time_s[-1] - time_s[0]), cost)
+
+
+def write_change(
+    t_s: np.ndarray,
+    before_mm: np.ndarray,
+    after_mm: np.ndarray,
+    explained_mm: np.ndarray,
+    name: str,
+    path: str | Path,
+) -> Replay:
+    """Write key points before and after a change, and what effects explain of it, as an .rrd file.
+
+    t_s (S,) s; a new run begins where it decreases. before_mm, after_mm (S, n, 3) key points in the
+    base frame, nan where missing; explained_mm (S, n, 3) the explained change. Both changes are
+    drawn as arrows from the body before, magnified by the factor in the view's title: the measured
+    one in the colour of the body after, the explained one in that of a plan.
+    """
+    began, path = time.perf_counter(), Path(path)
+    given = (t_s, before_mm, after_mm, explained_mm)
+    t_s, before, after, explained = (np.asarray(x, float) for x in given)
+    _check(t_s, before, after)
+    _check(t_s, before, before + explained)
+    keep = np.unique(np.linspace(0, len(t_s) - 1, min(len(t_s), MOST_ROWS)).round().astype(int))
+    time_s = continued(t_s)[keep]
+    before, after, explained = before[keep], after[keep], explained[keep]
+    change = after - before
+    size = np.linalg.norm(change, axis=-1)
+    large = _quantile(size, LARGE)
+    stretch = _stretch(before, large)
+    along = _main_direction(change[:, -1])
+    lines = {
+        "Change of the tip along its main direction (mm)": [
+            Line("/plots/change/measured", "measured", change[:, -1] @ along, REAL_COLOUR),
+            Line("/plots/change/explained", "explained", explained[:, -1] @ along, PLAN_COLOUR),
+        ],
+        "Change of each key point (mm)": [
+            Line(f"/plots/size/k{i}", f"k{i}", size[:, i], series_colour(i))
+            for i in range(size.shape[1])
+        ],
+    }
+    title = f"{name}: changes x {stretch:g}"
+    blueprint = _blueprint(title, before, ("/before", "/after", "/change"), lines)
+    with new_recording(path, "surgisoft_change", name, blueprint) as recording:
+        columns = Columns(recording, time_s)
+        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        _log_body(columns, "/before", before, SHAFT_COLOUR, 0.5)
+        _log_body(columns, "/after", after, REAL_COLOUR, 0.3)
+        _log_arrows(columns, "/change/measured", before, stretch * change, REAL_COLOUR)
+        _log_arrows(columns, "/change/explained", before, stretch * explained, PLAN_COLOUR)
+        for line in (line for group in lines.values() for line in group):
+            columns.plot(line)
+    cost = time.perf_counter() - began
+    return Replay(path, path.stat().st_size / 1e6, float(time_s[-1] - time_s[0]), cost)
+
+
+def _main_direction(change: np.ndarray) -> np.ndarray:
+    """(3,) unit vector along which changes (S, 3) are largest."""
+    return np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
+
+
+def _log_arrows(columns: Columns, entity: str, origins, vectors, colour) -> None:
+    """Log one arrow from each key point; missing values are omitted."""
+    known = np.isfinite(origins + vectors).all(-1)
+    rows, counts = np.flatnonzero(known.any(1)), known.sum(1)
+    style = rr.Arrows3D.from_fields(colors=colour, radii=0.35)
+    columns.recording.log(entity, style, static=True)
+    arrows = rr.Arrows3D.columns(origins=origins[known], vectors=vectors[known])
+    columns.send(entity, rows, arrows.partition(counts[rows]))
 
 
 def continued(t_s: np.ndarray) -> np.ndarray:
@@ -144,15 +219,16 @@ def _log_errors(columns: Columns, measured, predicted, error, stretch: float, la
     columns.send("/errors/arrows", rows, arrows.partition(counts))
 
 
-def _blueprint(name: str, measured, stretch: float, large: float, lines) -> rrb.Blueprint:
+def _blueprint(title: str, measured, entities, lines) -> rrb.Blueprint:
+    """A view of some entities in space, beside the plots."""
     points = measured[np.isfinite(measured).all(-1)]
     low, high = points.min(axis=0), points.max(axis=0)
     middle, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
     eye = middle + 1.3 * size * np.array([0.35, -0.9, 0.3])
     scene = rrb.Spatial3DView(
         origin="/",
-        contents=["+ /measured/**", "+ /predicted/**", "+ /errors/**"],
-        name=f"{name}: errors x {stretch:g}, red from {large:.2g} mm",
+        contents=[f"+ {entity}/**" for entity in entities],
+        name=title,
         background=rrb.Background(BACKGROUND),
         eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
     )

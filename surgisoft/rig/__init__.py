@@ -3,7 +3,8 @@
 `interface` defines a rig, real or virtual; `collect` drives any of them through a protocol
 into a recording. `virtual` is the simulated rig: `arm` (with `rod`, `wall`, `friction`),
 `pneumatics`, `motion_capture` and the hidden `effects`, stepped together in `bench`. It shares no
-code and no formula with the arm models and imports neither them nor torch.
+code and no formula with the arm models and imports neither them nor torch. `elastica` is a second
+simulated rig, with PyElastica's mechanics; `trial` records on either by name.
 """
 
 from surgisoft.rig.collect import collect

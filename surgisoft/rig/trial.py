@@ -89,19 +89,21 @@ def collect(
     `roll_deg`, `payload_g` and `noise` of the simulated rig.
     points: number of steady-state points, or of frames; default: by the protocol.
     """
-    simulated = None
     if rig is None or isinstance(rig, str):
         number = zlib.crc32(f"{protocol} {trial}".encode())
-        given = hidden_effects(hidden)
-        rig = simulated = simulated_rig(rig or "virtual", seed, take=number, hidden=given, **mount)
+        effects = hidden_effects(hidden)
+        simulated = simulated_rig(rig or "virtual", seed, take=number, hidden=effects, **mount)
+        bench: Rig = simulated
     elif mount or hidden:
-        options = ", ".join([*mount, *(["hidden"] if hidden else [])])
+        given = ", ".join([*mount, *(["hidden"] if hidden else [])])
         raise InputError(
-            f"{options}: options of the virtual rig and of elastica, but another rig is given"
+            f"{given}: options of the virtual rig and of elastica, but another rig is given"
         )
+    else:
+        bench, simulated = rig, None
     if not isinstance(protocol, Protocol):
         drawn = seed + TRIAL_STEP * trial
-        protocol = make_protocol(protocol, rig.limits, points, seed=drawn)
+        protocol = make_protocol(protocol, bench.limits, points, seed=drawn)
     if simulated is not None:
         return simulated.record(protocol, progress)[0]
-    return collect_samples(rig, protocol, progress)
+    return collect_samples(bench, protocol, progress)

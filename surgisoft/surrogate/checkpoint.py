@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -17,8 +17,9 @@ from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
+from surgisoft.surrogate.interval import ErrorInterval
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
-from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
@@ -33,6 +34,7 @@ OWN_FILES = ("config.json", "weights.safetensors", "report.json", RESIDUALS_FILE
 
 NETWORKS = {
     "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
+    "haw_ensemble": (HawEnsemble, ("key_points", "hidden", "directions", "members")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
     "recurrent": (RecurrentArm, ("key_points", "width")),
 }
@@ -47,8 +49,9 @@ def _network_config(network) -> dict:
 
 
 def _validation_config(validation: Validation) -> dict:
-    """JSON form of a validation, without the values that are not known."""
-    known = {name: value for name, value in asdict(validation).items() if value is not None}
+    """JSON form of a validation, without its interval and the values that are not known."""
+    values = asdict(replace(validation, interval=None))
+    known = {name: value for name, value in values.items() if value is not None}
     return known if validation.rmse_mm is not None else {}
 
 
@@ -107,6 +110,9 @@ def save_model(
         "effect_files": files_of(model.effects),
         "validation": _validation_config(model.validation),
     }
+    if model.validation.interval is not None:
+        # Beside the validation, where versions without intervals do not look.
+        config["interval"] = model.validation.interval.to_json()
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         # Not by `save_file`, which makes a file that only its owner can read.
@@ -174,12 +180,14 @@ def load_model(
         }
         validation = dict(config["validation"])
         points = tuple(validation.pop("per_key_point_mm", ()))
+        stated = config.get("interval")
+        interval = None if stated is None else ErrorInterval.from_json(stated)
         model = ArmModel(
             spec,
             NETWORKS[kind][0](low, high, **network),
             effects,
             None,
-            Validation(per_key_point_mm=points, **validation),
+            Validation(per_key_point_mm=points, interval=interval, **validation),
         )
         model.load_state_dict(weights)
     except InputError:

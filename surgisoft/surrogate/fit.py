@@ -21,14 +21,19 @@ from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.chain import Taps
 from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
+from surgisoft.surrogate.ensemble import train_ensemble
 from surgisoft.surrogate.history import History
+from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
 from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
     CHECK_EVERY,
     Data,
+    Rows,
+    dealt,
     held_rows,
     model_rows,
     new_recurrent,
@@ -38,7 +43,7 @@ from surgisoft.surrogate.training import (
     validated_error,
 )
 from surgisoft.surrogate.training import train as train_model
-from surgisoft.surrogate.training_residuals import TrainingResiduals
+from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
 NEIGHBOURS = 24
 """Rows of nearby pressure that are compared with each row."""
@@ -161,6 +166,21 @@ SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that precedes others, or comes after an effect."""
 EFFECT_SHARE = 0.5
 """Share of the epochs for an effect's stage, whose epochs are longer and fewer needed."""
+AUTO = "auto"
+"""In the place of an effect's name: effects with memory are tried, and the best are added."""
+MEMORY_EFFECTS = ("line_lag", "rate_dependence", "creep", "hysteresis")
+"""Effects that `auto` tries. The last one needs no clock."""
+TRIAL_SHARE = 0.25
+"""Share of the epochs for which `auto` trains each candidate before it compares them."""
+MEMBER_SHARE = 1.0
+"""Share of the epochs for which the members of an ensemble are trained, all at once."""
+MOST_MEMBERS = 50
+"""Most members of an ensemble."""
+MOST_AUTO = 2
+"""Most effects that `auto` adds."""
+AUTO_GAIN = 0.1
+"""Least fall of the held-out squared error, as a share of it, for which `auto` adds an effect: its
+memory makes each later step of the model slower."""
 STILL_SHARE = 0.15
 """Share of its range that a chamber has to move; below it the fit adds a note."""
 LEAST_BLOCKS = 5
@@ -180,7 +200,10 @@ class FitConfig:
     inputs: str = "pressure+direction"
     """`pressure` or `pressure+direction`."""
     effects: tuple[str, ...] = ()
-    """Names of effects to add, in order."""
+    """Names of effects to add, in order; `auto` at the end lets held-out data choose more."""
+    members: int = 1
+    """Networks whose mean is the prediction; above 1 an ensemble is trained behind the selection
+    of inputs and effects, each member without another share of the training data."""
     hidden: tuple[int, ...] = HIDDEN
     """Widths of the hidden layers of HAW-NN."""
     sections: int = 0
@@ -216,6 +239,9 @@ class StageReport:
     """Why the stage was rejected; empty if it was accepted."""
     simpler_rmse_mm: float | None = None
     """Held-out RMSE of the simpler model trained just as long, mm."""
+    tried_mm: dict[str, float] = field(default_factory=dict)
+    """Held-out RMSE of each effect with which `auto` compared the stage's, after a short training,
+    mm; `none`: without any."""
 
 
 @dataclass
@@ -234,6 +260,9 @@ class FitResult:
     """Duration of the fit, s."""
     loss: list[tuple[str, int, float, float]] = field(default_factory=list)
     """(stage, epoch, training loss, validation loss), losses in mm^2."""
+    covered: float | None = None
+    """Share of the held-out key points within the model's 95 % interval; None where these rows
+    calibrated the interval themselves, or without one."""
     known: TrainingResiduals | None = None
     """Residuals on the rows that the model was fitted to and validated on."""
 
@@ -244,6 +273,7 @@ class FitResult:
             "excitation": [asdict(chamber) for chamber in self.excitation],
             "warnings": self.warnings,
             "seconds": self.seconds,
+            "coverage_held_out": self.covered,
             "loss": [
                 dict(zip(("stage", "epoch", "training_mm2", "held_out_mm2"), row, strict=True))
                 for row in self.loss
@@ -259,6 +289,10 @@ class FitResult:
             + (f" (without it {stage.simpler_rmse_mm:.4f} mm)" if stage.simpler_rmse_mm else "")
             for stage in self.stages
         ]
+        for stage in self.stages:
+            if stage.tried_mm:
+                tried = ", ".join(f"{name} {rmse:.3f}" for name, rmse in stage.tried_mm.items())
+                lines.append(f"tried for {stage.name}, held-out RMSE in mm: {tried}")
         lines += [f"note: {warning}" for warning in self.warnings]
         error = self.model.validation
         points = " ".join(
@@ -268,6 +302,13 @@ class FitResult:
             f"held-out RMSE {error.rmse_mm:.4f} mm over {error.rows} rows; "
             f"key points base to tip: {points} mm"
         )
+        if error.interval is not None:
+            lines.append(error.interval.sentence())
+        if self.covered is not None:
+            lines.append(
+                f"coverage of that interval on held-out rows, which gave it only one factor: "
+                f"{self.covered:.1%}"
+            )
         return lines
 
 
@@ -303,11 +344,19 @@ def fit(
         names = _stages(config)
         grown = [name for name in names if _supported(result, name, config, support)]
         for name in grown:
+            if name == AUTO:
+                _add_memory(data, spec, config, support, result, progress)
+                continue
             candidate = _grow(result.model, name, spec, config, support, train)
             epochs = _stage_epochs(name, grown, config)
             _stage(candidate, name, epochs, config, data, result, progress)
+        interval = None
+        if config.members > 1:
+            interval = _ensemble(data, config, result, progress)
         rows = data.validation_rows(result.model)
-        result.model.validation = validated_error(rows.target, model_rows(result.model, rows))
+        validation = validated_error(rows.target, model_rows(result.model, rows))
+        result.model.validation = replace(validation, interval=interval)
+    _state_interval(data, result)
     validation = replace(result.model.validation, noise_mm=data.validation.noise_mm)
     result.model.validation = validation
     if not math.isfinite(validation.rmse_mm):
@@ -351,7 +400,13 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
     if config.inputs not in INPUTS:
         raise unknown_name("inputs", config.inputs, INPUTS)
     known = known_effects()
+    if not 1 <= config.members <= MOST_MEMBERS:
+        raise InputError(f"{config.members} members, expected 1 to {MOST_MEMBERS}")
+    if config.members > 1 and config.network != "haw_nn":
+        raise InputError(f"an ensemble needs the network haw_nn, not {config.network}")
     for name in config.effects:
+        if name == AUTO:
+            continue
         if name not in known:
             raise unknown_name("effect", name, known)
         if known[name].stage not in ("line", "material"):
@@ -424,7 +479,7 @@ class _Support:
 
 def _supported(result: FitResult, name: str, config: FitConfig, support: _Support) -> bool:
     """Whether the recordings support a stage in any chamber; notes the unsupported chambers."""
-    if name in ("pressure", "constant curvature") or not config.check_excitation:
+    if name in ("pressure", "constant curvature", AUTO) or not config.check_excitation:
         return True
     if name != "direction" and not hypothesis_of(known_effects()[name]).needs_reversals:
         return True
@@ -471,7 +526,7 @@ def _stage(
         simpler = copy.deepcopy(result.model)
         train_model(simpler, data, f"without {name}", epochs, config, result.loss, progress)
         before = _square(simpler, data)
-        simpler_rmse = math.sqrt(float(before.sum(-1).nanmean()))
+        simpler_rmse = _rmse(before)
         kept, reason = _better(before, after, data.validation_rows(simpler).block)
         if not kept:
             result.warnings.append(f"{name} left out: {reason}")
@@ -479,9 +534,124 @@ def _stage(
     if kept:
         result.model = candidate
     result.model.rest_mm.copy_(rest_shape(data.train))
-    rmse = math.sqrt(float(after.sum(-1).nanmean()))
+    rmse = _rmse(after)
     seconds = time.perf_counter() - begin
     result.stages.append(StageReport(name, rmse, done, seconds, kept, reason, simpler_rmse))
+
+
+def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, progress) -> None:
+    """Add the effects with memory that held-out data rewards most, one after another.
+
+    Each candidate is trained together with the network for a share of the epochs, and so is the
+    model without any. The best one then goes through a stage of its own, as if it had been named.
+    """
+    timed = bool((data.train.dt_s > 0).any()) and (
+        data.train.stood is None or bool(data.train.stood.isfinite().any())
+    )
+    names = [name for name in MEMORY_EFFECTS if timed or name == MEMORY_EFFECTS[-1]]
+    if not timed:
+        result.warnings.append(
+            "the rows have no clock, so that lags, rates and creep cannot show: not tried"
+        )
+    taken = set(result.model.effects)
+    names = [
+        name
+        for name in names
+        if name not in taken
+        and (not hypothesis_of(known_effects()[name]).needs_reversals or support.use(name).any())
+    ]
+    epochs = max(CHECK_EVERY, round(TRIAL_SHARE * config.epochs))
+    for _ in range(MOST_AUTO):
+        if not names:
+            return
+        tried = {}
+        for name in ("none", *names):
+            candidate = copy.deepcopy(result.model)
+            if name != "none":
+                candidate = _grow(result.model, name, spec, config, support, data.train)
+            label = name if name != "none" else "without effects"
+            train_model(candidate, data, label, epochs, config, result.loss, progress)
+            tried[name] = _rmse(_square(candidate, data))
+        best = min(names, key=tried.get)
+        if tried[best] ** 2 > (1 - AUTO_GAIN) * tried["none"] ** 2:
+            text = ", ".join(f"{name} {rmse:.3f}" for name, rmse in tried.items())
+            result.warnings.append(f"no effect with memory added; held-out RMSE in mm: {text}")
+            return
+        candidate = _grow(result.model, best, spec, config, support, data.train)
+        stage_epochs = max(CHECK_EVERY, round(EFFECT_SHARE * config.epochs))
+        _stage(candidate, best, stage_epochs, config, data, result, progress)
+        result.stages[-1].tried_mm = tried
+        if not result.stages[-1].kept:
+            return
+        names.remove(best)
+
+
+def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval | None:
+    """Train an ensemble and keep it if its held-out error is less; returns the error's interval.
+
+    The interval is calibrated with errors of single members that were trained on less data, so it
+    would be too wide for the model that is kept. The ratio of both errors on the held-out rows
+    corrects it.
+    """
+    begin = time.perf_counter()
+    epochs = max(CHECK_EVERY, round(MEMBER_SHARE * config.epochs))
+    before = _rmse(_square(result.model, data))
+    model, interval = train_ensemble(
+        result.model, data, config.members, epochs, config, result.loss, progress
+    )
+    after = _rmse(_square(model, data))
+    rows = data.validation_rows(model)
+    with torch.no_grad():
+        inputs = _network_inputs(model, rows)
+        single = _rmse((model.network.each(*inputs) - rows.target).square().flatten(0, 1))
+    kept = after < before
+    reason = "" if kept else "its held-out error is no less than that of the single network"
+    if kept:
+        model.rest_mm.copy_(result.model.rest_mm)
+        result.model = model
+    else:
+        result.warnings.append(f"ensemble left out: {reason}")
+    name, seconds = f"{config.members} members", time.perf_counter() - begin
+    result.stages.append(StageReport(name, after, epochs, seconds, kept, reason, before))
+    return None if interval is None else interval.scaled(min(before, after) / single)
+
+
+def _network_inputs(model: ArmModel, rows: Rows) -> tuple[Tensor, Tensor]:
+    """(S, m) actuation and direction in front of the network in rows."""
+    taps = Taps(rows.pressure, rows.direction, rows.memory, {})
+    effects = model.stage("material")
+    return (
+        model.chain.around(effects[-1][0], taps)[1] if effects else rows.pressure
+    ), rows.direction
+
+
+def _state_interval(data: Data, result: FitResult) -> None:
+    """Calibrate the interval on the held-out rows, or measure its coverage there.
+
+    The coverage is measured where other rows calibrated the interval (those that members of an
+    ensemble left out).
+    """
+    model = result.model
+    history, span = data.validation, torch.tensor(model.spec.span)
+    with torch.no_grad():
+        error = (model.predict(history) - history.key_points).norm(dim=-1)
+    held = history.valid if data.held is None else data.held
+    held = held & ~history.key_points.isnan().any(-1).all(-1)
+    fitted = data.train.pressure[data.train.valid if data.held is None else ~data.held]
+    thin = fitted[:: max(1, -(-len(fitted) // ROWS))]
+    distance = distance_to(history.pressure[held], thin, span)
+    interval = model.validation.interval
+    if interval is not None:
+        result.covered = coverage_of(error[held], interval.radius_mm(distance))
+        return
+    group = dealt(history)[held[history.valid]]
+    interval = calibrate(error[held], distance, group, "held-out rows")
+    model.validation = replace(model.validation, interval=interval)
+
+
+def _rmse(square: Tensor) -> float:
+    """RMS distance in mm, from squared errors (S, n, 3) in mm^2, NaN where missing."""
+    return math.sqrt(float(square.sum(-1).nanmean()))
 
 
 def _square(model: ArmModel, data: Data) -> Tensor:

@@ -1,24 +1,27 @@
 """The arm model: a network between line and material effects in front, body and sensor behind."""
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.chain import Chain, Taps
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.networks import ConstantCurvature, HawNN, RecurrentArm
+from surgisoft.surrogate.interval import LEVEL, ErrorInterval, distance_to
+from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import ROWS, TrainingResiduals
 
 AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
 share of its range."""
 
-Network = HawNN | ConstantCurvature | RecurrentArm
+Network = HawNN | HawEnsemble | ConstantCurvature | RecurrentArm
 """Networks that the chain may have."""
 
 
@@ -34,6 +37,21 @@ class Validation:
     """Number of validation rows."""
     noise_mm: float | None = None
     """Standard deviation of one coordinate of the key points in those rows, mm, where known."""
+    interval: ErrorInterval | None = None
+    """How far measured key points lie from predicted ones; None for models that were fitted before
+    this was computed, and after effects were added to the fitted ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionInterval:
+    """Balls around predicted key points in which measured ones lie."""
+
+    key_points_mm: Tensor
+    """(R, T, n, 3) predicted key points, mm, base frame."""
+    radius_mm: Tensor
+    """(R, T, n) radius around each, mm."""
+    coverage: float
+    """Share (0..1) of measured key points that lie inside, on runs like those of the fit."""
 
 
 class ArmModel(nn.Module):
@@ -81,17 +99,21 @@ class ArmModel(nn.Module):
     ) -> "ArmModel":
         """A model with some parts replaced; it shares all others with this one.
 
-        Training residuals belong to the network and effects that were fitted together: a model
-        with another network or other effects has none.
+        Training residuals and prediction intervals belong to the network and effects that were
+        fitted together: a model with another network or other effects has none.
         """
+        changed = network is not None or effects is not None
+        kept = self.validation
+        if changed and kept.interval is not None:
+            kept = dataclasses.replace(kept, interval=None)
         fresh = ArmModel(
             spec or self.spec,
             network or self.network,
             dict(self.effects) if effects is None else effects,
             self.rest_mm if rest_mm is None else rest_mm,
-            validation or self.validation,
+            validation or kept,
         )
-        if network is None and effects is None:
+        if not changed:
             fresh.training_residuals = self.training_residuals
         return fresh.to(self.rest_mm.device).train(self.training)
 
@@ -198,12 +220,54 @@ class ArmModel(nn.Module):
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
         return self.chain.scan(history, self.first_pressure(history)).behind["sensor"]
 
+    @property
+    def states_interval(self) -> bool:
+        """Whether `predict_interval` knows how far off this model may be."""
+        interval = self.validation.interval
+        return interval is not None and (
+            interval.growth == 0 or self.training_residuals is not None
+        )
+
+    @torch.no_grad()
+    def error_radius(self, actuation: Tensor, coverage: float = LEVEL) -> Tensor:
+        """(S, n) radii in mm around predicted key points within which measured ones lie.
+
+        actuation: (S, m) in the arm's unit; coverage: share (0..1) of measured key points to
+        enclose, on runs like those of the fit. Raises InputError where the model states none.
+        """
+        if not 0 < coverage < 1:
+            raise InputError(f"coverage {coverage:g}: expected a share between 0 and 1")
+        if not self.states_interval:
+            raise InputError(
+                "this model states no prediction interval: it was fitted by an earlier version, "
+                "or effects were added to it since; fit it again"
+            )
+        interval, distance = self.validation.interval, torch.zeros_like(actuation[:, 0])
+        if interval.growth > 0:
+            span = torch.tensor(self.spec.span, dtype=actuation.dtype, device=actuation.device)
+            reference = self.training_residuals.actuation.to(actuation)
+            distance = distance_to(actuation, reference, span)
+        return interval.radius_mm(distance, coverage)
+
+    @torch.no_grad()
+    def predict_interval(self, history: History, coverage: float = LEVEL) -> PredictionInterval:
+        """Predicted key points of whole runs, and the radii within which measured ones lie.
+
+        Arguments and error as those of `error_radius`.
+        """
+        radius = self.error_radius(history.pressure.flatten(0, 1), coverage)
+        shaped = radius.view(*history.valid.shape, -1)
+        return PredictionInterval(self.predict(history), shaped, coverage)
+
     def summary(self) -> str:
         """One line of text: inputs, network and effects."""
         inputs = "pressure+direction" if self.network.directions else "pressure"
         effects = " + ".join(self.effects) or "none"
+        kind = type(self.network).__name__
+        if isinstance(self.network, HawEnsemble):
+            kind = f"{self.network.members} x HawNN"
         return (
-            f"{type(self.network).__name__} ({inputs}), {self.spec.chambers} chambers in "
+            f"{kind} ({inputs}), {self.spec.chambers} chambers in "
             f"{self.spec.unit} ({self.spec.actuation}), {self.spec.key_points} key points, "
             f"effects: {effects}"
         )

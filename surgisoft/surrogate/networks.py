@@ -1,4 +1,4 @@
-"""Networks from actuation to key points: HAW-NN, constant curvature and a recurrent baseline.
+"""Networks from actuation to key points: HAW-NN, ensembles of it, and two baselines.
 
 HAW-NN is the Hysteresis-Aware Whole-body Neural Network of Chen et al. (2025, sec. III-A).
 """
@@ -91,6 +91,81 @@ class HawNN(nn.Module):
         state["use"] = use.to(first)
         grown.load_state_dict(state)
         return grown
+
+
+class HawEnsemble(nn.Module):
+    """K HAW-NN of one layout; the mean of their key points is the prediction.
+
+    Averaging networks that were trained from other weights on other shares of the data lowers the
+    part of the error that differs between them (Breiman 1996; Lakshminarayanan et al. 2017). All
+    K are evaluated by one batched product a layer.
+    """
+
+    def __init__(
+        self,
+        low: Tensor,
+        high: Tensor,
+        key_points: int,
+        hidden: tuple[int, ...] = HIDDEN,
+        directions: bool = True,
+        members: int = 5,
+    ):
+        """Pressure range low, high (m,) in the arm's unit; `key_points` is n, `members` K."""
+        super().__init__()
+        self.members = members
+        first = HawNN(low, high, key_points, hidden, directions)
+        self.key_points, self.hidden, self.directions = key_points, first.hidden, directions
+        for name, value in first.named_buffers():
+            self.register_buffer(name, value)
+        linear = [layer for layer in first.layers if isinstance(layer, nn.Linear)]
+        self.weights = nn.ParameterList(
+            torch.zeros(members, layer.in_features, layer.out_features) for layer in linear
+        )
+        self.biases = nn.ParameterList(
+            torch.zeros(members, 1, layer.out_features) for layer in linear
+        )
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, networks: list[HawNN]) -> "HawEnsemble":
+        """The ensemble of networks of one layout and one normalisation."""
+        first = networks[0]
+        low, high = first.centre - first.half_range, first.centre + first.half_range
+        made = cls(low, high, first.key_points, first.hidden, first.directions, len(networks))
+        made.load_state_dict(dict(first.named_buffers()), strict=False)
+        for member, network in enumerate(networks):
+            linear = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
+            for layer, weight, bias in zip(linear, made.weights, made.biases, strict=True):
+                weight[member], bias[member, 0] = layer.weight.T, layer.bias
+        return made.to(first.centre.device)
+
+    def each(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        """(K, ..., n, 3) key points in mm of every member, base frame."""
+        x = self._inputs(pressure, direction)
+        leading = x.shape[:-1]
+        points = self._through(x.reshape(1, -1, x.shape[-1]).expand(self.members, -1, -1))
+        return points.reshape(self.members, *leading, self.key_points, 3)
+
+    def members_at(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        """(K, B, n, 3) key points in mm, each member at other rows (K, B, m)."""
+        return self._through(self._inputs(pressure, direction))
+
+    def _inputs(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        x = (pressure - self.centre) / self.half_range
+        return torch.cat([x, direction * self.use], dim=-1) if self.directions else x
+
+    def _through(self, x: Tensor) -> Tensor:
+        """(K, B, n, 3) key points in mm from scaled inputs (K, B, m or 2 m)."""
+        last = len(self.weights) - 1
+        for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if number < last:
+                x = nn.functional.silu(x)
+        return torch.addcmul(self.mean, x, self.scale).unflatten(-1, (self.key_points, 3))
+
+    def forward(self, pressure: Tensor, direction: Tensor) -> Tensor:
+        """Key points (..., n, 3) in mm, base frame, from pressure and direction, each (..., m)."""
+        return self.each(pressure, direction).mean(0)
 
 
 def range_weights(key_points: Tensor) -> Tensor:

@@ -16,6 +16,8 @@ from surgisoft.surrogate.networks import RecurrentArm, range_weights, weighted_m
 
 HOLD_BLOCKS = 20
 """Blocks that a single run is cut into where no validation recording is given."""
+RUNS = 5
+"""Fewest runs of which whole ones are held out, and not blocks of time."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def hold_out(history: History, seed: int) -> Tensor:
     """(R, T) mask of held-out rows: a fifth of the runs, or of long blocks where runs are few."""
     generator = torch.Generator().manual_seed(seed)
     held = torch.zeros_like(history.valid)
-    if history.runs >= 5:
+    if history.runs >= RUNS:
         order = torch.randperm(history.runs, generator=generator)
         held[order[: max(1, round(0.2 * history.runs))]] = True
         return held & history.valid
@@ -58,6 +60,19 @@ def hold_out(history: History, seed: int) -> Tensor:
         for block in torch.randperm(HOLD_BLOCKS, generator=generator)[: HOLD_BLOCKS // 5].tolist():
             held[run, edges[block] : edges[block + 1]] = True
     return held
+
+
+def dealt(history: History) -> Tensor:
+    """(S,) number of the run of each row, or of its block of time where runs are few.
+
+    Such groups are held out together; runs are few below `RUNS`, as in `hold_out`.
+    """
+    if history.runs >= RUNS:
+        return history.run_of_row
+    count = history.valid.sum(1, keepdim=True).clamp(min=1)
+    along = torch.arange(history.valid.shape[1]) * HOLD_BLOCKS // count
+    runs = torch.arange(history.runs)[:, None]
+    return history.rows(runs * HOLD_BLOCKS + along)
 
 
 def measured_rows(history: History) -> Tensor:
@@ -212,7 +227,7 @@ def train(
     batch = min(config.batch, max(32, len(rows.target) // 16))
     steps = max(1, len(rows.target) // batch)
     optimiser = torch.optim.Adam(flat, lr=RATES.get(name, 1.0) * config.learning_rate)
-    schedule = _schedule(optimiser, epochs * steps, 2 * steps)
+    schedule = cosine_schedule(optimiser, epochs * steps, 2 * steps)
     through = _Through(model, data, deep, weights, config, epochs, generator) if deep else None
     average = copy.deepcopy(model)
     fast, slow = list(model.parameters()), list(average.parameters())
@@ -273,7 +288,7 @@ class _Through:
         self.history, self.targets = data.train, data.targets
         self.first = model.first_pressure(data.train)
         self.optimiser = torch.optim.Adam(parameters, lr=MEMORY_RATE * config.learning_rate)
-        self.schedule = _schedule(self.optimiser, epochs * MEMORY_STEPS, 0)
+        self.schedule = cosine_schedule(self.optimiser, epochs * MEMORY_STEPS, 0)
         lengths = data.train.valid.sum(1)
         self.window = min(WINDOW, int(lengths.max()))
         self.starts = torch.tensor(
@@ -323,7 +338,7 @@ class _Through:
         self.optimiser.step()
 
 
-def _schedule(optimiser, steps: int, warm_up: int):
+def cosine_schedule(optimiser, steps: int, warm_up: int):
     """Linear warm-up, then a cosine down to a thousandth."""
 
     def factor(step: int) -> float:

@@ -28,6 +28,7 @@ from surgisoft.rig.elastica.rod import (
     straight_body,
 )
 from surgisoft.rig.elastica.wall import Wall, new_memory, strain_wall
+from surgisoft.rig.interface import Rig, SimulatedRig
 
 PLAIN = Wall(np.zeros(2), np.ones(2), np.zeros(3), 0.0, 0.0, 0.0)
 """A linear wall."""
@@ -216,7 +217,7 @@ def test_flow_is_that_of_iso_6358(high, low):
 def test_a_narrow_tube_fills_its_chamber_in_the_time_of_the_integral():
     """t = int V dp / (C p_1 phi(p / p_1)), from the room to 40 kPa with the tube held at 50 kPa."""
     gas = Gas(
-        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 0.0
+        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 1e9, 0.0
     )  # a tube of a litre's tenth holds its pressure
     air = Air(np.array([50e3]), np.array([50e3]), np.zeros(1), np.array([2e-6]))
     one = AMBIENT_PA + 50e3
@@ -289,17 +290,21 @@ def test_stiffening_is_gents():
 
 @pytest.fixture(scope="module")
 def rig():
-    return ElasticaRig(2)
+    return ElasticaRig(2, elements=8)
 
 
 def brief(rig, seconds=2.0):
-    """A protocol of one second up and the rest at half of the limit, all chambers apart."""
-    high = rig.limits[:, 1] * np.linspace(0.6, 0.2, rig.chambers)
-    rows = np.array([0 * high, high, high])
-    return Protocol("brief", "continuous", rows, np.zeros(3), np.array([0.0, 1.0, seconds]))
+    """A protocol: half of the time up, to the limit of the first chamber, then down to 40 %."""
+    high = rig.limits[:, 1] * np.linspace(1.0, 0.0, rig.chambers)
+    rows = np.array([0 * high, high, 0.4 * high])
+    return Protocol("brief", "continuous", rows, np.zeros(3), seconds * np.array([0.0, 0.5, 1.0]))
 
 
 def test_it_is_a_rig_that_collect_drives(rig):
+    members = {name for name in dir(SimulatedRig) if not name.startswith("_")}
+    assert {"command", "read", "read_beside_truth", "gravity"} <= members
+    for name in members | set(Rig.__annotations__):
+        assert hasattr(rig, name), name
     recording = collect(rig, brief(rig))
     assert recording.samples == round(2.0 / rig.period_s)
     assert recording.key_points == rig.key_planes
@@ -327,7 +332,7 @@ def test_a_reset_takes_the_arm_back_to_where_it_was(rig):
 def test_equal_seeds_give_equal_recordings_and_other_takes_other_noise():
     made = []
     for take in (0, 0, 1):
-        rig = ElasticaRig(2, take=take, hidden=[("hysteresis", 1.0)])
+        rig = ElasticaRig(2, elements=8, take=take, hidden=[("hysteresis", 1.0)])
         made.append(rig.record(brief(rig)))
     (one, _), (again, _), (other, truth) = made
     np.testing.assert_array_equal(one.key_points_mm, again.key_points_mm)
@@ -339,8 +344,8 @@ def test_equal_seeds_give_equal_recordings_and_other_takes_other_noise():
 @pytest.mark.parametrize("name", [name for name in HIDDEN if name not in ("knock", "contact")])
 def test_each_hidden_effect_moves_the_key_points(name):
     """By more than a hundredth of a millimetre within seconds, and not by more than 2 cm."""
-    plain = ElasticaRig(2, noise=0.0)
-    changed = ElasticaRig(2, noise=0.0, hidden=[(name, 2.0)])
+    plain = ElasticaRig(2, elements=8, noise=0.0)
+    changed = ElasticaRig(2, elements=8, noise=0.0, hidden=[(name, 2.0)])
     protocol = brief(plain, 3.0)
     points = [rig.record(protocol)[1].noise_free_mm for rig in (plain, changed)]
     change = np.linalg.norm(points[1] - points[0], axis=2)
@@ -348,8 +353,8 @@ def test_each_hidden_effect_moves_the_key_points(name):
 
 
 def test_a_wall_is_met_by_one_chamber_at_least():
-    plain = ElasticaRig(2, noise=0.0)
-    changed = ElasticaRig(2, noise=0.0, hidden=[("contact", 2.0)])
+    plain = ElasticaRig(2, elements=8, noise=0.0)
+    changed = ElasticaRig(2, elements=8, noise=0.0, hidden=[("contact", 2.0)])
     tips = []
     for rig in (plain, changed):
         tips.append([])
@@ -364,8 +369,10 @@ def test_a_wall_is_met_by_one_chamber_at_least():
 
 def test_a_knock_turns_the_base_at_its_moment():
     """Before the moment nothing; after it the tip has moved by the angle times the length."""
-    plain = ElasticaRig(2, noise=0.0)
-    rig = ElasticaRig(2, noise=0.0, hidden=[("knock", 1.0)], event_window_s=(31.0, 31.0))
+    plain = ElasticaRig(2, elements=8, noise=0.0)
+    rig = ElasticaRig(
+        2, elements=8, noise=0.0, hidden=[("knock", 1.0)], event_window_s=(31.0, 31.0)
+    )
     moved = []
     for each in (plain, rig):
         each.reset()

@@ -1,5 +1,7 @@
 """Fitting: it finds what is there, leaves out what the data cannot support, and is repeatable."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,8 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.interval import coverage_of
+from surgisoft.surrogate.networks import HawEnsemble
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 
 NOISE = 0.05
@@ -228,3 +232,67 @@ def test_a_lag_of_the_line_is_fitted_through_whole_runs():
 def test_effects_behind_the_network_are_left_to_amend(walks):
     with pytest.raises(InputError, match=r"payload acts on the body.*surgisoft amend --effect pay"):
         fit(walks[0], None, SPEC, FitConfig(effects=("payload",)))
+
+
+def runs(seeds, length: int = 150, hysteresis: float = 0.0):
+    """Runs of random walks of the arm, one a seed."""
+    rng = np.random.default_rng(100 + seeds[0])
+    return history([walk(length, rng) for _ in seeds], hysteresis, NOISE, seed=seeds[0])
+
+
+SMALL = FitConfig(hidden=(32, 32), epochs=60, inputs="pressure", batch=128)
+
+
+def test_an_ensemble_knows_its_error_on_runs_that_took_no_part():
+    train, fresh = runs(range(12)), runs(range(50, 62))
+    result = fit(train, None, SPEC, replace(SMALL, members=4))
+    assert isinstance(result.model.network, HawEnsemble)
+    interval = result.model.validation.interval
+    assert interval.source == "cross-validation"
+    assert interval.groups == 10, "two of twelve runs are held out"
+    assert interval.rows == 1500
+    found = result.model.predict_interval(fresh)
+    error = (found.key_points_mm - fresh.key_points).norm(dim=-1)
+    assert 0.91 <= coverage_of(error, found.radius_mm) <= 0.985
+    assert result.stages[-1].valid_rmse_mm < result.stages[-1].simpler_rmse_mm
+    assert any("4 members" in line for line in result.lines())
+
+
+def test_a_single_network_states_an_interval_of_its_held_out_rows():
+    train, fresh = runs(range(12)), runs(range(50, 62))
+    result = fit(train, None, SPEC, SMALL)
+    assert result.model.validation.interval.source == "held-out rows"
+    found = result.model.predict_interval(fresh)
+    error = (found.key_points_mm - fresh.key_points).norm(dim=-1)
+    assert 0.88 <= coverage_of(error, found.radius_mm) <= 0.99
+    assert result.covered is None, "those rows calibrated it"
+
+
+def test_auto_finds_the_lag_of_the_line():
+    some = [lagging(300, seed) for seed in range(8)]
+    train, valid = (
+        pack(*([run[k] for run in part] for k in range(3))) for part in (some[:6], some[6:])
+    )
+    result = fit(train, valid, SPEC, replace(SMALL, effects=("auto",), epochs=80))
+    assert "line_lag" in result.model.effects
+    stage = next(stage for stage in result.stages if stage.name == "line_lag")
+    assert stage.tried_mm["line_lag"] == min(stage.tried_mm.values())
+    assert stage.tried_mm["none"] > 2 * stage.tried_mm["line_lag"]
+
+
+def test_auto_adds_nothing_to_an_arm_without_memory():
+    result = fit(runs(range(10)), None, SPEC, replace(SMALL, effects=("auto",)))
+    assert not result.model.effects
+    assert any("no effect with memory added" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"members": 0}, "0 members, expected 1 to"),
+        ({"members": 3, "network": "recurrent"}, "an ensemble needs the network haw_nn"),
+    ],
+)
+def test_impossible_ensembles_are_refused(walks, change, message):
+    with pytest.raises(InputError, match=message):
+        fit(walks[0], walks[1], SPEC, FitConfig(**change))

@@ -8,6 +8,7 @@ import torch
 from surgisoft.errors import InputError
 from surgisoft.surrogate.networks import (
     ConstantCurvature,
+    HawEnsemble,
     HawNN,
     arc_point,
     arc_rotation,
@@ -91,3 +92,31 @@ def test_equal_sections_make_one_arc(sections):
     share = torch.linspace(0, 1, 5)[:, None]
     expected = arc_point(torch.tensor([1.2, 0.0]) * share, 70 * share[:, 0])
     assert torch.allclose(points, expected, atol=1e-3)
+
+
+def made(seed: int) -> HawNN:
+    """A network with random weights and an output scale."""
+    torch.manual_seed(seed)
+    network = HawNN(LOW, HIGH, 5, hidden=(16, 16))
+    network.mean.copy_(torch.arange(15.0))
+    network.scale.fill_(7.0)
+    return network
+
+
+def test_an_ensemble_of_identical_members_is_one_of_them():
+    one = made(0)
+    ensemble = HawEnsemble.of([one] * 4)
+    pressure, direction = torch.rand(2, 20, 3) * 60 - 10, torch.randn(2, 20, 3).sign()
+    assert torch.allclose(ensemble(pressure, direction), one(pressure, direction), atol=1e-5)
+
+
+def test_an_ensemble_is_the_mean_of_its_members():
+    networks = [made(seed) for seed in range(3)]
+    ensemble = HawEnsemble.of(networks)
+    pressure, direction = torch.rand(20, 3) * 60 - 10, torch.randn(20, 3).sign()
+    each = torch.stack([network(pressure, direction) for network in networks])
+    assert torch.allclose(ensemble.each(pressure, direction), each, atol=1e-5)
+    assert torch.allclose(ensemble(pressure, direction), each.mean(0), atol=1e-5)
+    other = torch.rand(3, 7, 3) * 60 - 10, torch.randn(3, 7, 3).sign()
+    apart = torch.stack([network(*(x[k] for x in other)) for k, network in enumerate(networks)])
+    assert torch.allclose(ensemble.members_at(*other), apart, atol=1e-5)

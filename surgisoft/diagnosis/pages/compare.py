@@ -92,6 +92,8 @@ def _facts(result: Comparison) -> Facts:
         items.append(("explainable", f"{100 * result.explainable:.0f} %"))
     if result.time_shift is not None:
         items.append(("the arm trails by", f"{result.time_shift.seconds:.3f} s"))
+    if result.coverage is not None:
+        items.append(("within the 95 % prediction interval", f"{100 * result.coverage:.1f} %"))
     items.append(("rows", f"{result.samples}"))
     if result.missing:
         items.append(("rows without key points", f"{result.missing}"))

@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from surgisoft.diagnosis.diagnose import Diagnosis
+from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
 from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
 
@@ -33,6 +36,19 @@ TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
 """Tone of a verdict; the others are warnings."""
 
 
+HOW_CHANGE = (
+    "Change: measured after less measured before at the instant with the same actuation, a small "
+    "difference of the actuation corrected by the model. The model's own error is in neither "
+    "curve. What an effect explains is to first order; `surgisoft amend --before` fits it."
+)
+STRETCHES_SHOWN = 8
+"""Pairs of runs that the page lists."""
+STRETCH_S = 20.0
+"""Length of the stretch of the chart, s."""
+LEAST_POINTS = 10
+"""Fewest rows of a stretch."""
+
+
 def diagnosis_page(found: Diagnosis, title: str) -> Page:
     """The page of a diagnosis."""
     error, verdict = found.error_mm, found.verdict
@@ -49,6 +65,8 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         parts.append(_setup(found.setup))
     else:
         parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+    if found.change:
+        parts.append(_change(found))
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
@@ -73,6 +91,77 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         tone=TONES.get(verdict.kind, "warn"),
         parts=parts,
     )
+
+
+def _change(found: Diagnosis) -> Section:
+    """How far AFTER differs from BEFORE, and what the named effects explain of it."""
+    change = found.change
+    parts: list = [Text(change.sentence[:1].upper() + change.sentence[1:] + ".")]
+    rows = [
+        (
+            f"{each.after}, run {each.after_run}",
+            f"{each.before}, run {each.before_run}",
+            f"{each.delay_s:.3f}",
+            f"{each.rows}",
+            f"{100 * each.mismatch:.2f} %",
+        )
+        for each in change.stretches[:STRETCHES_SHOWN]
+    ]
+    if rows:
+        header = ["after", "before", "delay [s]", "rows", "difference of the actuation"]
+        parts.append(Table(header, rows))
+    if found.track is not None:
+        parts += [_change_chart(found.track, found.verdict.effects), Text(HOW_CHANGE)]
+    return Section("Before and after", parts)
+
+
+def _change_chart(track: ChangeTrack, effects: tuple[str, ...]):
+    """The tip before and after, and its change, along the stretch in which it changes most."""
+    from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
+
+    rows = worst_stretch(track)
+    change = track.change_mm[rows, -1]
+    along = np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
+    time = track.t_s[rows]
+    name = " + ".join(effects) if effects else "the named effects (none)"
+    with drawing():
+        figure, (top, below) = plt.subplots(2, 1, figsize=(7.2, 4.6), sharex=True)
+        rest = np.nanmean(track.before_mm[:, -1], axis=0)
+        for points, colour, label in (
+            (track.before_mm, BLUE, "before"),
+            (track.after_mm, AMBER, "after"),
+        ):
+            top.plot(time, (points[rows, -1] - rest) @ along, c=colour, lw=1, label=label)
+        below.plot(time, change @ along, c=RED, lw=1, label="change measured")
+        below.plot(
+            time,
+            track.explained_mm[rows, -1] @ along,
+            c=GREEN,
+            lw=1.4,
+            label=f"change explained by {name}",
+        )
+        top.set_ylabel("tip [mm]")
+        below.set_ylabel("change of the tip [mm]")
+        below.set_xlabel("time [s]")
+        top.legend(fontsize=7)
+        below.legend(fontsize=7)
+        caption = "Tip before and after where it changes most, along the main direction of change"
+        return chart(figure, caption, caption)
+
+
+def worst_stretch(track: ChangeTrack) -> np.ndarray:
+    """Rows of the STRETCH_S seconds of one run in which the key points change most (RMS)."""
+    square = np.nanmean(np.square(track.change_mm).sum(2), axis=1)
+    best, most = np.arange(len(track.t_s)), -np.inf
+    for run in np.unique(track.run):
+        rows = np.flatnonzero(track.run == run)
+        begins = np.arange(track.t_s[rows[0]], track.t_s[rows[-1]] + 1e-9, STRETCH_S / 2)
+        for begin in begins:
+            inside = (track.t_s[rows] >= begin) & (track.t_s[rows] <= begin + STRETCH_S)
+            some = rows[inside]
+            if len(some) >= LEAST_POINTS and (level := np.nanmean(square[some])) > most:
+                best, most = some, level
+    return best
 
 
 def _setup(setup: SetupResult) -> Section:

@@ -216,6 +216,10 @@ def error_over_time(table: ResidualTable, title: str = ""):
     # Rows that lack a key point are left out: a mean over the others jumps to the base's error.
     whole = np.flatnonzero(~np.isnan(error).any(axis=1))
     left.plot(whole, error[whole, -1], c=PREDICTED, lw=0.6, label="tip")
+    if table.model.states_interval:
+        radius = table.model.error_radius(torch.from_numpy(table.pressure[whole]))[:, -1].numpy()
+        band = {"color": PREDICTED, "alpha": 0.15, "lw": 0}
+        left.fill_between(whole, 0, radius, label="tip, 95 % interval", **band)
     mean = error[whole].mean(axis=1)
     left.plot(whole, mean, c=MEASURED, lw=0.6, label="mean of the key points")
     for edge in np.flatnonzero(np.diff(table.run)):

@@ -52,8 +52,8 @@ class ElasticaRigConfig:
     """Hidden effects: (name, amplitude), see `hidden`."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
     """Window of time since switching on in which hidden events that occur once fall [s]."""
-    elements: int = 10
-    """Elements of the rod."""
+    elements: int = 12
+    """Elements of the rod; the time of a recording goes with their square."""
 
     def __post_init__(self):
         object.__setattr__(self, "hidden", tuple((name, x) for name, x in self.hidden))

@@ -1,0 +1,278 @@
+"""Before and after: pairs of rows with the same actuation, and what their difference says."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.pairs import before_and_after
+from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import default_arm, save_model
+from surgisoft.surrogate.model import Validation
+from tests.diagnosis.synthetic import NOISE_MM, PERIOD_S, POINTS, recording, still_model, walk
+
+ROWS = 2400
+SMOOTHNESS = 25
+"""Rows over which the actuation of these tests is averaged: it has a slope everywhere."""
+
+
+@pytest.fixture(scope="module")
+def model():
+    model = still_model()
+    model.validation = Validation(1.5, (0.5, 1.0, 2.0), ROWS)
+    return model
+
+
+def smooth_walk(seed):
+    """Function of time (T,) s -> (T, 2) actuation in 0 to 10 without corners."""
+    knots = walk(ROWS + 200, seed=seed)
+    kernel = np.ones(SMOOTHNESS) / SMOOTHNESS
+    smooth = np.stack([np.convolve(column, kernel, "same") for column in knots.T], 1)
+    time = PERIOD_S * np.arange(len(smooth))
+    return lambda t: np.stack([np.interp(t, time, column) for column in smooth.T], 1)
+
+
+def unlearned(pressure):
+    """(T,) mm: what the network never learned, ten times the size of what changes."""
+    a, b = pressure.T / 10
+    return 8.0 * np.sin(2.5 * a) + 6.0 * np.cos(3.0 * b) * a
+
+
+def made(motion, start_s, rows=ROWS, seed=1, actuation_noise=0.0, change=None, name="made"):
+    """A recording of a motion from some time on, its clock beginning at 0."""
+    pressure = motion(start_s + PERIOD_S * np.arange(rows))
+    effect = unlearned(pressure) + (0.0 if change is None else change(pressure))
+    noisy = pressure + np.random.default_rng(seed).normal(0, actuation_noise, pressure.shape)
+    return replace(recording(effect, noisy, seed=seed), name=name)
+
+
+def paired(model, after, before, how="auto"):
+    return before_and_after(residual_table(model, [after]), [before], how)
+
+
+# Alignment -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize(("after_s", "before_s"), [(6.0, 2.53), (1.0, 8.37)])
+def test_delay_is_found_to_a_fraction_of_a_sample(model, after_s, before_s, noise):
+    """The two clocks begin at different times of one motion, apart by no multiple of a sample."""
+    motion = smooth_walk(3)
+    both = paired(
+        model, made(motion, after_s, actuation_noise=noise),
+        made(motion, before_s, seed=2, rows=ROWS - 300, actuation_noise=noise),
+    )  # fmt: skip
+    (stretch,) = both.pairs.stretches
+    assert stretch.delay_s == pytest.approx(after_s - before_s, abs=0.05 * PERIOD_S)
+    overlap = min(ROWS, ROWS - 300 + (before_s - after_s) / PERIOD_S)
+    overlap -= max(0.0, (before_s - after_s) / PERIOD_S)
+    assert stretch.rows == pytest.approx(overlap, abs=30)
+
+
+def test_partner_is_the_measurement_at_the_matching_instant(model):
+    """Without noise and network, the partner of a row is BEFORE between its two nearest rows."""
+    motion = smooth_walk(4)
+    after, before = (replace(made(motion, s), key_points_mm=np.zeros((ROWS, 3, 3))) for s in (3, 1))
+    before.key_points_mm[:, -1, 0] = before.t_s
+    pairs = paired(model, after, before).pairs
+    there = pairs.paired
+    assert there.sum() > ROWS - 100
+    expected = after.t_s[there] + 2.0
+    np.testing.assert_allclose(pairs.partner_t_s[there], expected, atol=0.01)
+    np.testing.assert_allclose(pairs.before_mm[there][:, -1, 0], expected, atol=0.01)
+
+
+def test_only_the_common_part_is_paired(model):
+    """AFTER follows the motion of BEFORE for its second half only."""
+    one, other = smooth_walk(5), smooth_walk(6)
+    begin, rest = other(PERIOD_S * np.arange(ROWS // 2)), one(PERIOD_S * np.arange(ROWS // 2))
+    mixed = np.concatenate([begin, rest])
+    after = recording(unlearned(mixed), mixed)
+    pairs = paired(model, after, made(one, 0.0, seed=2), "auto").pairs
+    assert pairs.paired[: ROWS // 2].mean() < 0.05
+    assert pairs.paired[ROWS // 2 + 30 :].mean() > 0.95
+    assert pairs.stretches[0].delay_s == pytest.approx(-PERIOD_S * (ROWS // 2), abs=0.1)
+
+
+def test_repeated_runs_of_before_are_averaged_and_show_its_repeatability(model):
+    """Each recording has a shift of its own, of 0.3 mm RMS in each coordinate of the tip."""
+    motion, rng = smooth_walk(7), np.random.default_rng(0)
+    shifts = rng.normal(0, 0.3, (5, 3))
+    takes = []
+    for seed, shift in enumerate(shifts):
+        take = made(motion, 0.0, seed=seed, name=f"take{seed}")
+        take.key_points_mm[:, -1] += shift
+        takes.append(take)
+    table = residual_table(model, takes[:1])
+    alone = before_and_after(table, takes[1:2]).pairs
+    several = before_and_after(table, takes[1:]).pairs
+    assert (alone.source, several.source) == ("noise", "repeats")
+    assert set(several.partners) == {4}
+    pooled = np.sqrt(np.square(shifts[1:] - shifts[1:].mean(0)).sum() / 3 + 3 * NOISE_MM**2)
+    assert several.repeatability_mm[-1] == pytest.approx(pooled, rel=0.1)
+    assert several.repeatability_mm[0] == pytest.approx(np.sqrt(3) * NOISE_MM, rel=0.1)
+
+
+def test_noise_of_a_measured_actuation_is_no_change(model):
+    """A network with a slope turns the sensor's noise into motion that no arm made."""
+    steep = copy.deepcopy(default_arm())
+    rng = np.random.default_rng(0)
+    low, high = np.array(steep.spec.low), np.array(steep.spec.high)
+    signal = low + (high - low) * smooth_walk(8)(PERIOD_S * np.arange(ROWS))[:, [0, 1, 0]] / 10
+    points = np.tile(steep.rest_mm.numpy(), (ROWS, 1, 1))
+
+    def take():
+        return Recording(
+            "take", PERIOD_S * np.arange(ROWS), signal + rng.normal(0, 0.5, signal.shape), points
+        )
+
+    pairs = paired(steep, take(), take()).pairs
+    fast = np.diff(pairs.change_mm[pairs.paired], axis=0)
+    table = residual_table(steep, [take()])
+    raw = np.diff(table.predicted_mm, axis=0)
+    assert np.nanstd(fast) < 0.35 * raw.std()
+
+
+# Diagnosis -----------------------------------------------------------------------------------
+
+
+def test_the_same_again_has_nothing_missing(model):
+    motion = smooth_walk(9)
+    found = diagnose(model, [made(motion, 2.0)], before=[made(motion, 0.37, seed=2)])
+    assert found.verdict.kind == "nothing_missing"
+    assert found.error_mm.before == pytest.approx(np.sqrt(3 * (1 + 2 / 3)) * NOISE_MM, rel=0.25)
+    assert found.change.paired_share > 0.95
+    assert "since made" in found.verdict.sentence
+
+
+def bent_arm():
+    """The package's arm with a network that is off by several times what a payload changes."""
+    model = copy.deepcopy(default_arm())
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, value in model.network.layers.named_parameters():
+            if name.endswith("weight"):
+                value.add_(0.12 * value.std() * torch.randn(value.shape, generator=generator))
+    model.training_residuals = None
+    return model
+
+
+@pytest.fixture(scope="module")
+def rig_takes():
+    """(before, after): the same protocol without and with a payload, other noise, later start."""
+    takes = []
+    for take, hidden in ((1, ()), (2, (("payload", 1.5),))):
+        rig = VirtualRig(0, take=take, hidden=hidden)
+        takes.append(rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))[0])
+    before, after = takes
+    cut = {n: getattr(after, n)[50:] for n in ("measured", "key_points_mm", "commanded", "run")}
+    later = replace(after, name="after", t_s=after.t_s[50:] - after.t_s[50], **cut)
+    return replace(before, name="before"), later
+
+
+def test_payload_is_named_behind_a_wrong_network(rig_takes):
+    before, after = rig_takes
+    model = bent_arm()
+    table = residual_table(model, [before])
+    wrong = float(np.sqrt(np.nanmean(np.square(table.error_mm))))
+    model.validation = Validation(wrong, (wrong,) * model.spec.key_points, 100)
+    found = diagnose(model, [after], before=[before], setup_tests=False)
+    assert wrong > 2 * found.change.change_mm
+    assert found.verdict.effects == ("payload",)
+    assert found.change.paired_share > 0.9
+    assert found.track.explained_mm.shape == found.track.change_mm.shape
+    left = found.track.change_mm - found.track.explained_mm
+    assert np.nanstd(left) < 0.6 * np.nanstd(found.track.change_mm)
+    result = amend(model, [after], "payload", before=[before], retune_network=False)
+    assert result.claimed
+    assert result.held_out.after < 0.6 * result.held_out.before
+    assert result.model_error.before > 1.5 * result.held_out.before
+
+
+# Inputs --------------------------------------------------------------------------------------
+
+
+def test_no_common_motion_is_a_note_and_an_error_if_pairs_are_asked_for(model):
+    after, before = made(smooth_walk(10), 0.0), made(smooth_walk(11), 0.0, seed=2, name="other")
+    found = diagnose(model, [after], before=[before])
+    assert found.change.change_mm is None
+    assert any("compared through the model" in note for note in found.notes)
+    with pytest.raises(InputError, match="same actuation as other"):
+        diagnose(model, [after], before=[before], paired="always")
+    with pytest.raises(InputError, match="pairing"):
+        diagnose(model, [after], before=[before], paired="perhaps")
+
+
+def test_recordings_and_reference_are_before(model):
+    """`reference` with recordings, the older name of the argument, gives the same."""
+    motion = smooth_walk(12)
+    after, before = made(motion, 2.0), made(motion, 0.0, seed=2)
+    one, other = (diagnose(model, [after], **{n: [before]}) for n in ("before", "reference"))
+    assert one.verdict == other.verdict
+    assert one.change.to_json() == other.change.to_json()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"measured": np.zeros((ROWS, 3))}, "chambers: 3"),
+        ({"key_points_mm": np.tile(POINTS[:2], (ROWS, 1, 1))}, "key points: 2"),
+        ({"unit": "psi"}, "unit: psi"),
+        ({"measured": 20.0 + walk(ROWS)}, "no common actuation"),
+    ],
+)
+def test_before_of_another_robot_is_one_line(model, change, words, tmp_path, capsys):
+    motion = smooth_walk(13)
+    save_model(model, tmp_path / "arm")
+    save_recording(made(motion, 0.0), tmp_path / "after.parquet")
+    save_recording(replace(made(motion, 0.0), **change), tmp_path / "before.parquet")
+    arm, after, before = (str(tmp_path / n) for n in ("arm", "after.parquet", "before.parquet"))
+    for command in (["diagnose", arm, after], ["compare", arm, after]):
+        assert run([*command, "--before", before]) == 2
+        error = capsys.readouterr().err.strip().splitlines()
+        assert len(error) == 1
+        assert words in error[0]
+
+
+def test_pairing_without_before_is_refused(model, tmp_path, capsys):
+    save_model(model, tmp_path / "arm")
+    save_recording(made(smooth_walk(14), 0.0), tmp_path / "after.parquet")
+    arm, after = str(tmp_path / "arm"), str(tmp_path / "after.parquet")
+    assert run(["diagnose", arm, after, "--paired", "always"]) == 2
+    assert "--before" in capsys.readouterr().err
+    assert run(["diagnose", arm, after, "--replay", str(tmp_path / "x.rrd")]) == 2
+    assert "--before" in capsys.readouterr().err
+
+
+def test_command_and_function_give_the_same(rig_takes, tmp_path):
+    import json
+
+    before, after = rig_takes
+    save_model(default_arm(), tmp_path / "arm")
+    for each in rig_takes:
+        save_recording(each, tmp_path / f"{each.name}.parquet")
+    arm, after, before = (str(tmp_path / n) for n in ("arm", "after.parquet", "before.parquet"))
+    out, page, replay = (tmp_path / n for n in ("out.json", "page", "change.rrd"))
+    command = ["diagnose", arm, after, "--before", before, "--json", str(out)]
+    assert run([*command, "--report", str(page), "--replay", str(replay)]) == 0
+    written = json.loads(out.read_text())
+    found = diagnose(arm, load_recording(after), before=before)
+    expected = json.loads(json.dumps(found.to_json()))
+    for values in (written, expected):
+        del values["seconds"]
+    assert written == expected
+    assert written["verdict"]["effects"] == ["payload"]
+    assert written["change"]["paired_share"] > 0.9
+    text = (page / "diagnosis.html").read_text()
+    assert "Before and after" in text
+    assert "change explained by payload" in text or "explained" in text
+    assert replay.stat().st_size > 10_000

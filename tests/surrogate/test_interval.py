@@ -1,0 +1,165 @@
+"""Prediction intervals: coverage on synthetic errors, growth with distance, round trips."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.interval import (
+    LEVEL,
+    ErrorInterval,
+    calibrate,
+    coverage_of,
+    distance_to,
+)
+from surgisoft.surrogate.model import Validation
+from surgisoft.surrogate.networks import HawEnsemble
+from tests.surrogate.test_model import HIGH, LOW
+
+
+def gaussian(rows: int, seed: int, scale: torch.Tensor | float = 1.0) -> torch.Tensor:
+    """(S, 2) norms of Gaussian errors in space, the second key point three times as far off."""
+    generator = torch.Generator().manual_seed(seed)
+    error = torch.randn(rows, 2, 3, generator=generator, dtype=torch.float64).norm(dim=-1)
+    return (
+        error * torch.tensor([1.0, 3.0]) * (scale if isinstance(scale, float) else scale[:, None])
+    )
+
+
+def test_the_quantiles_of_gaussian_errors_are_those_of_the_chi_distribution():
+    found = calibrate(gaussian(20000, 0), torch.zeros(20000), torch.arange(20000) // 100, "s")
+    radius = found.radius_mm(torch.zeros(1, dtype=torch.float64))[0]
+    assert radius.tolist() == pytest.approx([stats.chi(3).ppf(0.95) * k for k in (1, 3)], rel=0.02)
+    assert found.growth == 0.0, "distance explains nothing"
+    assert (found.rows, found.groups) == (20000, 200)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.7, 0.9, 0.95, 0.985])
+def test_fresh_errors_are_covered_within_binomial_bounds(level):
+    """Levels between the stored ones are interpolated."""
+    found = calibrate(gaussian(4000, 1), torch.zeros(4000), torch.zeros(4000), "s")
+    fresh = gaussian(4000, 2)
+    covered = coverage_of(fresh, found.radius_mm(torch.zeros(4000, dtype=torch.float64), level))
+    # Calibration and test are both samples: their variances add.
+    spread = math.sqrt(2 * level * (1 - level) / 4000)
+    assert abs(covered - level) < 4 * spread + 0.004
+
+
+def test_the_interval_widens_where_errors_grow_with_distance():
+    """Errors ten times as large at distance 1 than at 0: coverage holds at both ends."""
+    far = torch.rand(8000, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = calibrate(gaussian(8000, 4, 1 + 10 * far), far, torch.zeros(8000), "s")
+    assert found.growth == pytest.approx(10.0)
+    for at in (0.05, 0.95):
+        fresh = gaussian(3000, 5, torch.full((3000,), 1 + 10 * at, dtype=torch.float64))
+        radius = found.radius_mm(torch.full((3000,), at, dtype=torch.float64))
+        assert coverage_of(fresh, radius) == pytest.approx(LEVEL, abs=0.02)
+
+
+@given(
+    rows=st.integers(100, 400),
+    seed=st.integers(0, 2**16),
+    missing=st.floats(0.0, 0.3),
+    level=st.floats(0.05, 0.985),
+)
+@settings(max_examples=30, deadline=None)
+def test_calibration_rows_are_covered_and_levels_are_nested(rows, seed, missing, level):
+    error = gaussian(3 * rows, seed)
+    rng = torch.Generator().manual_seed(seed)
+    error[torch.rand(error.shape, generator=rng) < missing] = torch.nan
+    distance = torch.rand(3 * rows, generator=rng, dtype=torch.float64)
+    found = calibrate(error, distance, torch.zeros(3 * rows), "s")
+    radius = found.radius_mm(distance)
+    assert coverage_of(error, radius) >= LEVEL
+    assert (found.radius_mm(distance, level) <= found.radius_mm(distance, level + 0.01)).all()
+
+
+def test_too_few_rows_calibrate_nothing():
+    assert calibrate(gaussian(99, 0), torch.zeros(99), torch.zeros(99), "s") is None
+    hidden = gaussian(300, 0)
+    hidden[:250, 1] = torch.nan
+    assert calibrate(hidden, torch.zeros(300), torch.zeros(300), "s") is None
+
+
+def test_distance_is_in_ranges_of_the_chambers():
+    reference = torch.tensor([[0.0, 0.0], [10.0, 0.0]])
+    at = torch.tensor([[0.0, 0.0], [7.0, 20.0]])
+    found = distance_to(at, reference, torch.tensor([10.0, 20.0]))
+    assert found.tolist() == pytest.approx([0.0, math.hypot(0.3, 1.0)], abs=1e-6)
+
+
+INTERVAL = ErrorInterval((0.5, 0.95), ((0.1,) * 5, (0.4,) * 5), 2.0, 500, 7, "cross-validation")
+
+
+def test_a_model_keeps_its_interval_in_its_folder(tmp_path):
+    arm = default_arm()
+    stated = Validation(1.0, (1.0,) * 5, 500, interval=INTERVAL)
+    kept = arm.replace(validation=stated)
+    save_model(kept, tmp_path / "arm")
+    again = load_model(tmp_path / "arm")
+    assert again.validation == stated
+    config = json.loads((tmp_path / "arm" / "config.json").read_text())
+    assert "interval" not in config["validation"], "earlier versions read that part whole"
+
+
+def test_models_of_earlier_versions_open_and_say_that_they_have_no_interval(tmp_path):
+    arm = default_arm()
+    save_model(arm.replace(validation=Validation(1.0, (1.0,) * 5, 9)), tmp_path / "old")
+    config = json.loads((tmp_path / "old" / "config.json").read_text())
+    assert "interval" not in config
+    old = load_model(tmp_path / "old")
+    assert old.validation.interval is None
+    with pytest.raises(InputError, match=r"states no prediction interval.*fit it again"):
+        old.predict_interval(walk(old))
+
+
+def walk(arm):
+    """A history of 50 rows inside an arm's range."""
+    rng = np.random.default_rng(0)
+    pressure = torch.tensor(rng.uniform(arm.spec.low, arm.spec.high, (50, arm.spec.chambers)))
+    points = torch.zeros(50, arm.spec.key_points, 3)
+    return pack([torch.arange(50) * 0.1], [pressure], [points])
+
+
+def test_predict_interval_surrounds_the_prediction():
+    arm = default_arm()
+    kept = arm.replace(validation=Validation(1.0, interval=INTERVAL))
+    history = walk(arm)
+    found = kept.predict_interval(history)
+    assert torch.equal(found.key_points_mm, arm.predict(history))
+    apart = torch.cdist(
+        history.pressure[0] / torch.tensor(arm.spec.span),
+        arm.training_residuals.actuation / torch.tensor(arm.spec.span),
+    )
+    expected = 0.4 * (1 + 2 * apart.amin(1))[:, None].expand(50, 5)
+    assert torch.allclose(found.radius_mm[0], expected.to(found.radius_mm), rtol=1e-4)
+    with pytest.raises(InputError, match="expected a share between 0 and 1"):
+        kept.predict_interval(history, coverage=95)
+
+
+def test_an_added_effect_voids_the_interval():
+    arm = default_arm().replace(validation=Validation(1.0, interval=INTERVAL))
+    assert arm.replace().validation.interval is INTERVAL
+    assert arm.replace(effects={}).validation.interval is None
+
+
+def test_ensembles_share_the_format(tmp_path):
+    torch.manual_seed(0)
+    arm = default_arm()
+    network = HawEnsemble(LOW, HIGH, 5, (8, 8), members=3)
+    for value in network.parameters():
+        torch.nn.init.normal_(value)
+    model = arm.replace(network=network, effects={})
+    save_model(model, tmp_path / "ensemble")
+    again = load_model(tmp_path / "ensemble")
+    history = walk(arm)
+    assert torch.equal(again.predict(history), model.predict(history))
+    assert "3 x HawNN" in again.summary()

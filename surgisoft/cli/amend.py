@@ -10,6 +10,7 @@ from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended,
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
+    REFIT_PROCESSES,
     Before,
     EffectFiles,
     Force,
@@ -17,6 +18,7 @@ from surgisoft.cli.options import (
     Model,
     NewModel,
     Paired,
+    Refit,
     Report,
     with_effect_files,
 )
@@ -60,6 +62,7 @@ def amend(
             "effects if that lowers the error on held-out data.",
         ),
     ] = False,
+    refit: Refit = "auto",
 ) -> None:
     """Amend a model: add a physical effect and validate it on held-out data.
 
@@ -90,6 +93,9 @@ def amend(
             lambda text: tell(next(stages), 4, text),
             before=earlier,
             paired=paired,
+            refit=refit,
+            refit_progress=tell,
+            processes=REFIT_PROCESSES,
         )
     warn_all(result.notes)
     saved = result.claimed or anyway
@@ -111,6 +117,8 @@ def amend(
     show_parameters(result.parameters)
     if result.retuned:
         print("the network's last layer was fitted again, which lowers the error on held-out data")
+    if result.refit is not None:
+        print(f"{result.refit.sentence}, with parts of the training data left out")
     for path in written:
         print(f"wrote {path}")
     print(result.sentence)

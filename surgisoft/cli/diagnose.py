@@ -10,12 +10,14 @@ from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_new_folder, check_replay
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
 from surgisoft.cli.options import (
+    REFIT_PROCESSES,
     Before,
     EffectFiles,
     JsonFile,
     Model,
     Paired,
     Recordings,
+    Refit,
     Report,
     with_effect_files,
 )
@@ -49,6 +51,7 @@ def diagnose(
             help="Effects to exclude, because the setup rules them out, such as contact.",
         ),
     ] = None,
+    refit: Refit = "auto",
     apply: Annotated[
         Path | None,
         typer.Option(
@@ -98,6 +101,9 @@ def diagnose(
             setup_tests=setup_tests,
             before=earlier,
             paired=paired,
+            refit=refit,
+            refit_progress=tell,
+            processes=REFIT_PROCESSES,
         )
     warn_all(found.notes)
     written = []
@@ -129,16 +135,9 @@ def diagnose(
         _next_after_setup(found.setup, model, data, apply)
     elif apply:
         print(f"nothing to mend: {apply} was not written")
-    if found.verdict.kind == "ambiguous":
-        between = " ".join(found.verdict.effects)
-        command = f"surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv"
-        print(f"next: {with_effect_files(command)}")
-    elif found.verdict.kind in ("identified", "several"):
-        effects = " ".join(found.verdict.effects)
-        command = f"surgisoft amend {model} --effect {effects} --data {data}"
-        if before:
-            command += f" --before {' '.join(map(str, before))}"
-        command += " -o NEW"
+    if found.next_command:
+        option = f" --before {' '.join(map(str, before))}" if before else ""
+        command = found.next_command.format(model=model, data=data, before=option)
         print(f"next: {with_effect_files(command)}")
 
 
@@ -187,8 +186,28 @@ def _show(found) -> None:
             f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "
             f"{100 * row.gain_unique:6.1f}% {row.heldout_rmse_mm:10.4f} [{low:.4f}, {high:.4f}] mm"
         )
+    for each in found.not_testable:
+        print(f"not testable: {each.effect}: {each.reason}")
+    if found.refit is not None:
+        _show_refit(found.refit)
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
         print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, tells {pairs}")
     print(f"{found.seconds:.1f} s")
+
+
+def _show_refit(refit) -> None:
+    """Print the candidates that were fitted together with the network."""
+    print(f"fitted together with the network, because {refit.reason}:")
+    print(f"{'effect':18s} {'left of the network alone':>28s} {'difference, 95 %':>28s} {'p':>7s}")
+    for row in refit.candidates:
+        low, high = row.ci95_mm
+        note = "" if row.plausible else "  implausible parameters"
+        print(
+            f"{row.effect:18s} {row.heldout_rmse_mm:10.4f} of {row.rival_mm:8.4f} mm "
+            f"{row.difference_mm:12.4f} [{low:.4f}, {high:.4f}] mm {row.p_value:7.4f}{note}"
+        )
+    rates = [name for name, why in refit.not_tried if why.startswith("steady-state")]
+    if rates:
+        print(f"not tried, because steady-state samples cannot show them: {', '.join(rates)}")

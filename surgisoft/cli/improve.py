@@ -10,12 +10,14 @@ from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended,
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
+    REFIT_PROCESSES,
     EffectFiles,
     Force,
     JsonFile,
     Model,
     NewModel,
     Recordings,
+    Refit,
     Report,
 )
 from surgisoft.cli.progress import progress
@@ -32,6 +34,7 @@ def improve(
     ] = 6,
     json_file: JsonFile = None,
     report: Report = None,
+    refit: Refit = "auto",
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
@@ -57,7 +60,15 @@ def improve(
             done.append(each)
             tell(len(done), most + 2, each.step or each.verdict)
 
-        result = improve_model(arm, measured, most, after)
+        result = improve_model(
+            arm,
+            measured,
+            most,
+            after,
+            refit=refit,
+            refit_progress=tell,
+            processes=REFIT_PROCESSES,
+        )
     warn_all(result.notes)
     written = []
     if result.claimed:
@@ -81,6 +92,7 @@ def _show(result) -> None:
     """Print each round, then the parameters and the errors on the held-out part."""
     for number, done in enumerate(result.rounds, 1):
         what = f"+ {done.step}" if done.step else "no further effect"
+        what += ", fitted together with the network" if done.together else ""
         rivals = f" (or {', '.join(done.rivals)})" if done.rivals else ""
         print(f"round {number}: {done.verdict}: {done.sentence}")
         print(f"  {what}{rivals}: error on the training part {done.error_open_mm:.4f} mm")

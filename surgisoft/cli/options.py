@@ -1,7 +1,8 @@
 """Arguments and options that several commands share: one name, metavar and help text for each."""
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from typer import Argument, Option
 
@@ -131,6 +132,18 @@ Threads = Annotated[
         "--threads", min=1, max=256, help="Threads; more than one is faster on idle cores only."
     ),
 ]
+
+Refit = Annotated[
+    Literal["auto", "never", "always"],
+    Option(
+        "--refit",
+        help="Fit candidate effects together with the network and let held-out runs decide: auto "
+        "where the error is far above the noise floor and no larger than the model's validated "
+        "error, as when a network imitates a lag. Takes minutes.",
+    ),
+]
+REFIT_PROCESSES = min(2, os.cpu_count() or 1)
+"""Processes that a refit trains in; the result does not depend on them."""
 
 Web = Annotated[bool, Option("--web", help="Show it in a browser; served to this machine only.")]
 Screenshot = Annotated[

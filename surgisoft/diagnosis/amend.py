@@ -1,9 +1,9 @@
 """`amend`: put a named effect into a model and evaluate it on held-out data.
 
-The parameters are fitted to the training rows, three quarters of each recording. The held-out
-quarter is evaluated once, for the error before and after. A fall of the error is claimed only where
-its 95 % interval, from a bootstrap of blocks of time, is above zero and where the fall is large
-enough to matter.
+The parameters are fitted to the training rows, three quarters of each recording; together with the
+whole network where that may have imitated the effect. The held-out quarter is evaluated once, for
+the error before and after. A fall of the error is claimed only where its 95 % interval, from a
+bootstrap of blocks of time, is above zero and where the fall is large enough to matter.
 """
 
 import time
@@ -17,9 +17,14 @@ from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
+from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recordings
+from surgisoft.progress import Progress as RefitProgress
+from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effect
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
@@ -99,7 +104,8 @@ class Amendment:
     held_out: Fall
     """The error on the held-out rows."""
     alone: Fall
-    """The error on the held-out rows with the effects alone, the network left as it was."""
+    """What the effects do on the held-out rows: with the network left as it was; where both were
+    fitted together, compared with the network trained on as long without the effects."""
     training: Fall
     """The error on the training rows, to which the parameters were fitted."""
     retuned: bool
@@ -116,6 +122,8 @@ class Amendment:
     model_error: Fall | None = None
     """The error of the model itself on the held-out rows, where the others are paired
     differences."""
+    refit: Refit | None = None
+    """The comparison that fitted network and effects together; None where they were not."""
 
     @property
     def claimed(self) -> bool:
@@ -125,6 +133,8 @@ class Amendment:
     @property
     def sentence(self) -> str:
         """The outcome in words."""
+        if self.refit is not None:
+            return f"{' + '.join(self.effects)}: {self._together}"
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
         if self.model_error is not None:
             whole = self.model_error
@@ -134,6 +144,17 @@ class Amendment:
         if not self.retuned:
             return text
         return f"{text}; {self.held_out.after:.3f} mm with the network's last layer re-tuned behind"
+
+    @property
+    def _together(self) -> str:
+        """The outcome of a joint fit in words."""
+        network = f"the network alone, trained on as long, reaches {self.alone.before:.3f} mm"
+        if self.held_out.claimed and not self.alone.claimed:
+            return (
+                f"no fall of the error is claimed for the effects: {network}, and with them "
+                f"{self.alone.after:.3f} mm remain"
+            )
+        return f"{self.held_out.sentence}, fitted together with the network; {network}"
 
     def to_json(self) -> dict:
         """Plain values, as `amend --json` writes them and as the new model's folder keeps them."""
@@ -148,6 +169,7 @@ class Amendment:
             "error_open_mm": asdict(training) | {"ci95": list(training.ci95)},
             "parameters": [parameter.to_json() for parameter in self.parameters],
             "network_retuned": self.retuned,
+            "refit": None if self.refit is None else self.refit.to_json(),
             "notes": list(self.notes),
             "seconds": self.seconds,
             "change": self.change and self.change.to_json(),
@@ -165,6 +187,9 @@ def amend(
     progress: Progress | None = None,
     before: Recordings | None = None,
     paired: Paired = "auto",
+    refit: str = "auto",
+    refit_progress: RefitProgress = silent,
+    processes: int = 1,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
@@ -175,6 +200,9 @@ def amend(
     effects alone make the error fall. before: recordings from before a change. Where they were made
     with the same actuation, effects are fitted to the paired difference (`pairs`), so that the
     network's error does not enter; paired: as for `diagnose`.
+    refit: `always` fits the whole network together with the
+    effects, `auto` does where a network may have imitated them (`surgisoft.diagnosis.refit`) and
+    held-out runs reward it, `never` does not; refit_progress and processes as for `diagnose`.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -187,30 +215,51 @@ def amend(
         both = before_and_after(plain, load_recordings(before), paired).with_held_out_pairs()
         notes, table = (*notes, *both.notes), both.table
     problem = table.training()
-    tell(f"fitting {' + '.join(names)}")
-    fitted = fit_effects(problem, names)
-    better, retuned = fitted.model, False
-    if retune_network:
-        tell("re-tuning the network")
-        # The network is tuned to what was measured: its own error is not in a paired difference.
-        tried = retune(better, plain.training())
-        better, retuned = tried.model, tried.kept
-    tell("evaluating on the held-out part")
-    held_out, whole = table.final_check(), plain.final_check()
-    alone = fall_of(held_out, held_out.with_model(fitted.model))
-    if retuned and not (alone.claimed and fall_of(whole, whole.with_model(better)).claimed):
+    names = list(dict.fromkeys(names))
+    judged = None
+    reason = refit_reason(problem, refit) if both is None else ""
+    if refit == "always" and (both is not None or not retune_network):
+        raise InputError(
+            "a refit changes the network, and a change since BEFORE is not one of the network: "
+            "expected --refit always without --before and without --keep-network"
+        )
+    if reason and (refit == "always" or (retune_network and all(map(can_hide, names)))):
+        judged = refit_effects(
+            problem, reason, together=names, progress=refit_progress, processes=processes
+        )
+    if judged is not None and (refit == "always" or judged.winner is not None):
+        joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
+        better, retuned, parameters = joint.model, False, joint.parameters
+        refitted = tuple(name for name in names if name in model.effects)
+        held_out = whole = table.final_check()
+        alone = fall_of(held_out.with_model(joint.alone), held_out.with_model(better))
+    else:
+        judged = None
+        tell(f"fitting {' + '.join(names)}")
+        fitted = fit_effects(problem, names)
+        parameters, refitted = fitted.parameters, fitted.refitted
         better, retuned = fitted.model, False
-    # The residuals of the fit say nothing of a network that was re-tuned since.
-    better.training_residuals = None if retuned else model.training_residuals
+        if retune_network:
+            tell("re-tuning the network")
+            # Tuned to what was measured: the network's own error is not in a paired difference.
+            tried = retune(better, plain.training())
+            better, retuned = tried.model, tried.kept
+        tell("evaluating on the held-out part")
+        held_out, whole = table.final_check(), plain.final_check()
+        alone = fall_of(held_out, held_out.with_model(fitted.model))
+        if retuned and not (alone.claimed and fall_of(whole, whole.with_model(better)).claimed):
+            better, retuned = fitted.model, False
+        # The residuals of the fit say nothing of a network that was re-tuned since.
+        better.training_residuals = None if retuned else model.training_residuals
     is_paired = both is not None and both.used
     # The paired difference holds for the network that predicted BEFORE.
     shown = fitted.model if is_paired else better
     falls = [(part, part.with_model(shown)) for part in (problem, held_out)]
     return Amendment(
         model=better,
-        effects=tuple(dict.fromkeys(names)),
-        refitted=fitted.refitted,
-        parameters=fitted.parameters,
+        effects=tuple(names),
+        refitted=refitted,
+        parameters=parameters,
         held_out=fall_of(*falls[1]),
         alone=alone,
         training=fall_of(*falls[0]),
@@ -220,6 +269,7 @@ def amend(
         notes=notes,
         change=None if both is None else both.change,
         model_error=fall_of(whole, whole.with_model(better)) if is_paired else None,
+        refit=judged,
     )
 
 

@@ -23,9 +23,14 @@ def _far_from_fit(problem: Problem) -> float:
     known = problem.reference
     if known is None or len(known.pressure) < 2:
         return 0.0
-    tree = cKDTree(known.pressure)
-    own = tree.query(known.pressure, k=2, p=np.inf)[0][:, 1]
-    apart = tree.query(problem.pressure, p=np.inf)[0]
+    return far_share(known.pressure, problem.pressure)
+
+
+def far_share(known: np.ndarray, asked: np.ndarray) -> float:
+    """Share of actuations (S, m) that lie far from all known ones (K, m), in half ranges."""
+    tree = cKDTree(known)
+    own = tree.query(known, k=2, p=np.inf)[0][:, 1]
+    apart = tree.query(asked, p=np.inf)[0]
     return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, 0.97), LEAST_FAR)))
 
 

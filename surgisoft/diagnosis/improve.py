@@ -12,13 +12,16 @@ from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.amend import Fall, Track, fall_of, track_of
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
-from surgisoft.diagnosis.estimation.effects import fit_effects, fit_plausible
+from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plausible
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.diagnosis.refit import JointFit, fit_together
+from surgisoft.diagnosis.residuals import model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress as RefitProgress
+from surgisoft.progress import silent
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -50,6 +53,8 @@ class Round:
     """RMS distance on the training rows after the round, mm."""
     error_mm: float | None = None
     """RMS distance on the held-out rows after the round, known when all rounds have ended, mm."""
+    together: bool = False
+    """Whether the effect was fitted together with the whole network."""
 
 
 Progress = Callable[[Round], None]
@@ -114,19 +119,23 @@ def improve(
     most_effects: int = MOST_EFFECTS,
     progress: Progress | None = None,
     reference: Sequence[Recording] | TrainingResiduals | None = None,
+    refit: str = "auto",
+    refit_progress: RefitProgress = silent,
+    processes: int = 1,
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 
     Model and recordings may be given by their paths.
 
-    reference: as for `diagnose`.
+    reference, refit, refit_progress, processes: as for `diagnose`. An effect that a refit names is
+    fitted together with the whole network.
     """
     if most_effects < 1:
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
     model, recordings, notes = open_inputs(model, recordings)
-    reference = model.training_residuals if reference is None else reference
+    known = model.training_residuals
     table = residual_table(model, recordings)
     problem = table.training()
     models, rounds, parameters = [model], [], ()
@@ -138,17 +147,34 @@ def improve(
 
     going = True
     while going and len(added) < most_effects:
-        found = diagnose(models[-1], recordings, reference=reference, setup_tests=not added)
+        found = diagnose(
+            models[-1],
+            recordings,
+            reference=known if reference is None else reference,
+            refit=refit,
+            refit_progress=refit_progress,
+            processes=processes,
+            setup_tests=not added,
+        )
         error = fall_of(problem, problem.with_model(models[-1])).after
         current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]
         going = False
         for name in names[: most_effects - len(added)]:
             before = problem.with_model(models[-1])
-            fitted = fit_effects(before, [*added, name])
+            fitted: Fitted | JointFit
+            together = found.refit is not None and found.refit.winner == name
+            if found.refit is not None and together:
+                validated = found.refit.of(name)
+                fitted = fit_together(before, [*added, name], validated, progress=refit_progress)
+            else:
+                fitted = fit_effects(before, [*added, name])
             fall = fall_of(before, problem.with_model(fitted.model))
             doubt = _doubt(name, fall, fitted.parameters)
-            if doubt and fall.claimed:
+            if not doubt and isinstance(fitted, JointFit):
+                pair = [problem.with_model(each) for each in (fitted.alone, fitted.model)]
+                doubt = _idle(name, fall_of(*pair))
+            if doubt and fall.claimed and isinstance(fitted, Fitted):
                 tried = fit_plausible(before, fitted, [*added, name], name)
                 if tried is not None:
                     less = fall_of(before, problem.with_model(tried.model))
@@ -161,7 +187,11 @@ def improve(
             added.append(name)
             models.append(fitted.model)
             parameters = fitted.parameters
-            note(_step(current, name, found, fall.after))
+            if isinstance(fitted, JointFit):
+                known = fitted.model.training_residuals
+                discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
+                problem = replace(problem, discrepancy_mm=discrepancy)
+            note(replace(_step(current, name, found, fall.after), together=together))
             current = replace(current, sentence=f"named beside {name} by the same diagnosis")
         if not going:
             note(current)
@@ -174,7 +204,7 @@ def improve(
     if models[-1] is not model:
         kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
-        models[-1].training_residuals = model.training_residuals if kept else None
+        models[-1].training_residuals = known if kept else None
     held_out = table.final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []
@@ -219,6 +249,16 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
         f"{name} would lower the error to {fall.after:.3f} mm only with an implausible "
         f"{wrong[0].name} = {values_text(wrong[0].value)}, expected {low:.3g} to {high:.3g}"
     )
+
+
+def _idle(name: str, fall: Fall) -> str:
+    """Why an effect that was fitted together with the network is not added; empty if it may be.
+
+    fall: from the network trained on as long without the effect to the network with it.
+    """
+    if fall.claimed:
+        return ""
+    return f"the network alone, trained on as long as with {name}, lowers the error as far"
 
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:

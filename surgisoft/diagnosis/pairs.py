@@ -22,7 +22,6 @@ place of a correlation, because the level of an actuation counts.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -725,10 +724,10 @@ def slope_error(table: ResidualTable) -> float:
 
 # Before and after ----------------------------------------------------------------------------
 
-Paired = Literal["auto", "always", "never"]
+Paired = str
 """Whether rows are paired: where enough have a partner, or it is an error if too few have, or not
 at all."""
-PAIRED: tuple[Paired, ...] = get_args(Paired)
+PAIRED: tuple[Paired, ...] = ("auto", "always", "never")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,8 @@
 
 import copy
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -116,6 +117,11 @@ class Data:
         return make_rows(model, self.train).take(held)
 
     @property
+    def fitted(self) -> History:
+        """The history to fit to, with key points missing in the rows that are held out."""
+        return replace(self.train, key_points=self.targets)
+
+    @property
     def targets(self) -> Tensor:
         """(R, T, n, 3) key points to fit to, mm; NaN where missing or held out."""
         if self.held is None:
@@ -164,9 +170,15 @@ def validated_error(target: Tensor, predicted: Tensor) -> Validation:
     return Validation(math.sqrt(float(square.nanmean())), tuple(points), len(target))
 
 
+@torch.no_grad()
 def normalise(network: nn.Module, history: History) -> None:
-    """Set a network's output mean and scale (3n,) in mm from the measured key points."""
+    """Set a network's output mean and scale (3n,) in mm from the measured key points.
+
+    With a prior mean: from what it leaves of them.
+    """
     points = history.rows(history.key_points)
+    if getattr(network, "prior", None) is not None:
+        points = points - network.prior(history.rows(history.pressure))
     seen = ~points.isnan()
     count = seen.sum(0).clamp(min=1)
     mean = points.nan_to_num().sum(0) / count
@@ -266,6 +278,73 @@ def train(
     return epoch
 
 
+@dataclass(frozen=True)
+class JointTraining:
+    """Settings of `train_jointly`."""
+
+    batch: int = 128
+    """Most rows per step; a 32nd of the rows where they are few."""
+    learning_rate: float = 3e-3
+    """Adam's largest learning rate, that of a fit; it falls along a cosine."""
+    memory_steps: int = 6
+    """Steps of the memory parameters through windows after each epoch."""
+    seed: int = 0
+    """Seed of the order of rows and windows."""
+
+
+def train_jointly(
+    model: ArmModel,
+    data: Data,
+    epochs: int,
+    config: JointTraining,
+    hold: Callable[[ArmModel], None] | None = None,
+) -> None:
+    """Train the network of a model and all its effects together, in place, on the fitted rows.
+
+    The number of epochs is fixed and no validation row is looked at, so two models are compared
+    after the same training. The model ends with the running average of its weights. hold: called
+    after each epoch, to keep parameters in their ranges.
+    """
+    deep = [p for effect in model.effects.values() for p in effect.memory_parameters()]
+    deep += [p for _, effect in model.stage("line") for p in effect.amplitudes().values()]
+    mine = {id(p) for p in deep}
+    flat = [p for p in model.parameters() if id(p) not in mine]
+    model.train().requires_grad_(True)
+    generator = torch.Generator().manual_seed(config.seed)
+    trace = _trace(model, data)
+    rows = data.fitted_rows(model, trace)
+    weights = range_weights(rows.target)
+    batch = min(config.batch, max(16, len(rows.target) // 32))
+    steps = max(1, len(rows.target) // batch)
+    optimiser = torch.optim.Adam(flat, lr=config.learning_rate)
+    schedule = cosine_schedule(optimiser, epochs * steps, 2 * steps)
+    through = None
+    if deep:
+        steps_each = config.memory_steps
+        through = _Through(model, data, deep, weights, config, epochs, generator, steps_each)
+    average = copy.deepcopy(model)
+    fast, slow = list(model.parameters()), list(average.parameters())
+    for _ in range(epochs):
+        order = torch.randperm(len(rows.target), generator=generator)
+        for part in order[: steps * batch].split(batch):
+            _step(model, rows.take(part), weights, optimiser)
+            schedule.step()
+            with torch.no_grad():
+                share = max(1 / (AVERAGE_EPOCHS * steps), 1 / (schedule.last_epoch + 1))
+                torch._foreach_lerp_(slow, fast, share)
+        if through is not None:
+            through.steps(trace)
+        if hold is not None:
+            hold(model)
+        if through is not None:
+            trace = _trace(model, data)
+            rows = data.fitted_rows(model, trace)
+    model.load_state_dict(average.state_dict())
+    if hold is not None:
+        hold(model)
+    model.eval().requires_grad_(False)
+
+
 def _trace(model: ArmModel, data: Data) -> Taps:
     with torch.no_grad():
         return model.trace(data.train)
@@ -283,12 +362,23 @@ def _step(model: ArmModel, rows: Rows, weights: Tensor, optimiser) -> float:
 class _Through:
     """Training of memory parameters by gradients through windows of runs."""
 
-    def __init__(self, model, data: Data, parameters, weights, config, epochs, generator):
+    def __init__(
+        self,
+        model,
+        data: Data,
+        parameters,
+        weights,
+        config,
+        epochs,
+        generator,
+        steps_each=MEMORY_STEPS,
+    ):
+        self.steps_each = steps_each
         self.model, self.weights, self.generator = model, weights, generator
         self.history, self.targets = data.train, data.targets
         self.first = model.first_pressure(data.train)
         self.optimiser = torch.optim.Adam(parameters, lr=MEMORY_RATE * config.learning_rate)
-        self.schedule = cosine_schedule(self.optimiser, epochs * MEMORY_STEPS, 0)
+        self.schedule = cosine_schedule(self.optimiser, epochs * steps_each, 0)
         lengths = data.train.valid.sum(1)
         self.window = min(WINDOW, int(lengths.max()))
         self.starts = torch.tensor(
@@ -302,7 +392,7 @@ class _Through:
     def steps(self, trace: Taps) -> None:
         """A few steps, each through some windows that begin with the memory of the trace."""
         order = torch.randperm(len(self.starts), generator=self.generator)
-        for number in range(MEMORY_STEPS):
+        for number in range(self.steps_each):
             picked = order[(torch.arange(WINDOWS) + number * WINDOWS) % len(order)]
             self._step(trace, self.starts[picked.unique()])
             self.schedule.step()

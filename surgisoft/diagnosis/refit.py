@@ -1,0 +1,805 @@
+"""Fitted together: effects are trained jointly with the network, and held-out data decide.
+
+A network that was fitted to recordings without an effect has learned to imitate some of it: from a
+lag it takes directions of change and motions that are too small. What it cannot imitate counts as
+its validated error, and the residuals then say "no more than the model's own error". The question
+that residuals cannot answer is whether network and effect *together* would have been better. Here
+it is tried: from the weights of the model (a warm start), the network is trained on with each
+effect that a network can hide, and as long without any effect (the rival). Whole runs, or blocks of
+time where runs are few, are left out in turn, each by a training with another seed, and the errors
+there are compared.
+
+The effort is fixed in epochs and rows, not in seconds, so that the result does not depend on the
+machine. All effects get few epochs; those that come out first get more (successive halving:
+Jamieson & Talwalkar 2016, "Non-stochastic best arm identification").
+"""
+
+import copy
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import torch
+
+from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
+from surgisoft.diagnosis.estimation.effects import shrink, starts
+from surgisoft.diagnosis.estimation.intervals import Parameter
+from surgisoft.diagnosis.estimation.nuisance import kinds
+from surgisoft.diagnosis.residuals import TOGETHER, Problem
+from surgisoft.diagnosis.statistics import (
+    block_interval,
+    block_sums,
+    sign_flip_p_values,
+    win_shares,
+)
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.progress import Progress, silent
+from surgisoft.surrogate.effects import Memoryless, known_effects
+from surgisoft.surrogate.model import ArmModel, Validation
+from surgisoft.surrogate.networks import RecurrentArm
+from surgisoft.surrogate.training import Data, JointTraining, train_jointly
+from surgisoft.workers import torch_threads, workers
+
+Mode = Literal["auto", "never", "always"]
+"""When candidates are fitted together with the network: `auto` where `reason_to_refit` gives a
+reason."""
+MODES: tuple[Mode, ...] = ("auto", "never", "always")
+
+
+@dataclass(frozen=True)
+class RefitConfig:
+    """Effort of a refit and what decides in it."""
+
+    rows: int = 4000
+    """Most rows that networks are trained on; memories follow every row."""
+    seeds: int = 3
+    """Trainings of each candidate, each with another part of the recordings left out, another order
+    of the rows and other windows."""
+    first_epochs: int = 8
+    """Epochs of the first rung, for all candidates and the rival."""
+    epochs: int = 30
+    """Epochs of the second rung, for the best candidates and the rival."""
+    finalists: int = 3
+    """Most candidates of the second rung."""
+    seed: int = 0
+    """Seed of all trainings."""
+
+
+REFIT = RefitConfig()
+"""The effort of the commands."""
+
+
+@dataclass(frozen=True)
+class RefitCriteria:
+    """What starts a refit, and what decides in it.
+
+    The values are those of the selection among residuals (`criteria`), which were set on virtual
+    robots; none was set by looking at a refit.
+    """
+
+    over_floor: float = 2.0
+    """Factor on the noise floor from which an error is far above it."""
+    within: float = 1.2
+    """Most error above the floor, in units of the model discrepancy, that the fit validated."""
+    p_value: float = 0.02
+    """Largest family-wise p-value of an effect that is named."""
+    gain: float = 0.25
+    """Least share of the rival's squared error above the noise floor that has to go."""
+    log_gain: float = 0.08
+    """Least mean of log(error of the rival / error with the effect)."""
+    competing_gain: float = 0.8
+    """Gain, as a share of the winner's, from which another effect can compete with it."""
+    win_share: float = 0.9
+    """Share of bootstrap samples in which the winner must beat a competing effect."""
+    tie_of_gain: float = 0.02
+    """Difference of two gains, as a share of the better one, up to which they are alike."""
+    tie_of_left: float = 0.3
+    """The same as a share of what the better one leaves; the smaller of both counts."""
+    most_confidence: float = 0.81
+    """Most confidence where others do about as well (`criteria.Calibration.ambiguous`)."""
+
+
+ASKED = RefitCriteria()
+"""The criteria in force."""
+
+
+@dataclass(frozen=True)
+class RefitCandidate:
+    """One effect, fitted together with the network."""
+
+    effect: str
+    """Its name; names joined by ` + ` where several were fitted at once."""
+    heldout_rmse_mm: float
+    """Error on the rows that were left out, over all seeds, mm."""
+    per_key_point_mm: tuple[float | None, ...]
+    """The same of each key point, base to tip, mm; None where it was never measured."""
+    seeds_mm: tuple[float, ...]
+    """Error of each seed on the part that it left out, mm."""
+    rival_mm: float
+    """Error of the rival (the network alone) after as many epochs, on the same rows, mm."""
+    difference_mm: float
+    """Rival less candidate, mm."""
+    ci95_mm: tuple[float, float]
+    """95 % interval of the difference from a bootstrap of runs or motions, mm."""
+    spread_mm: float
+    """Standard deviation over the seeds of the difference, mm."""
+    gain: float
+    """Share of the rival's squared error above the noise floor that goes."""
+    log_gain: float
+    """Mean over runs or motions of log(error of the rival / error of the candidate)."""
+    p_value: float
+    """Family-wise p-value: chance of so large a gain in any of the effects if none were missing."""
+    epochs: int
+    """Epochs of each training."""
+    plausible: bool
+    """Whether the effect's parameters lay in their ranges after every training."""
+    parameters: dict
+    """Its parameters after the training of the first seed, with units in their names."""
+
+    @property
+    def named(self) -> bool:
+        """Whether the effect meets the acceptance criteria of significance and size."""
+        large = self.gain >= ASKED.gain and self.log_gain >= ASKED.log_gain
+        return self.plausible and large and self.p_value <= ASKED.p_value
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Result of a refit."""
+
+    reason: str
+    """Why it was done."""
+    alone_mm: float
+    """Held-out error of the network, trained on as long as the finalists without an effect, mm."""
+    candidates: tuple[RefitCandidate, ...]
+    """All effects that were tried, the best first."""
+    winner: str | None
+    """The effect that is missing; None where none meets the criteria."""
+    competing: tuple[str, ...]
+    """Effects that do about as well as the winner."""
+    of_line: bool
+    """Whether a tie was settled for the lag of the line, because the model's input is a command."""
+    confidence: float
+    """Share of bootstrap samples in which the winner leaves the least error of all candidates, less
+    its p-value; 0 without a winner."""
+    not_tried: tuple[tuple[str, str], ...]
+    """(effect, why it was not tried)."""
+    unit: str
+    """What was left out and drawn: `runs` or `blocks of time`."""
+    units: int
+    """How many independent ones of them there are."""
+    rows: int
+    """Rows that were trained on, the part left out included."""
+    trainings: int
+    """Number of trainings."""
+    seconds: float
+    """Time that it took, s."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The winner and what competes with it; empty without a winner."""
+        return () if self.winner is None else (self.winner, *self.competing)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the winner cannot be told from others; a lag of a line (LINE) is named alone."""
+        return bool(self.competing) and not self.of_line
+
+    @property
+    def sentence(self) -> str:
+        """The result in words."""
+        if self.winner is None:
+            return (
+                "fitted together with the network, no effect leaves significantly less than the "
+                f"network alone ({self.alone_mm:.3g} mm on held-out {self.unit})"
+            )
+        best = self.of(self.winner)
+        text = (
+            f"fitted together with the network, {self.winner} leaves {best.heldout_rmse_mm:.3g} mm "
+            f"of {best.rival_mm:.3g} mm on held-out {self.unit}"
+        )
+        if not self.competing:
+            return text
+        others = " and ".join(self.competing)
+        if not self.of_line:
+            return f"{text}; {others} would do about as well"
+        return (
+            f"{text}; {others} would do about as well, but the model's input is a command, which "
+            "has to pass the line: measure the actuation to tell them"
+        )
+
+    def of(self, effect: str) -> RefitCandidate:
+        """The result of one effect."""
+        return next(one for one in self.candidates if one.effect == effect)
+
+    def to_json(self) -> dict:
+        """Plain values, as `diagnose --json` writes them."""
+        return asdict(self) | {
+            "sentence": self.sentence,
+            "not_tried": [{"effect": name, "why": why} for name, why in self.not_tried],
+        }
+
+
+# When, and which effects ----------------------------------------------------------------------
+
+
+def refit_reason(problem: Problem, mode: str) -> str:
+    """Why candidates are fitted together with the network; empty where they are not.
+
+    Raises InputError unless the mode is one of `MODES`.
+    """
+    if mode not in MODES:
+        raise unknown_name("refit", mode, MODES)
+    if mode == "auto":
+        return reason_to_refit(problem)
+    return "it was asked for" if mode == "always" else ""
+
+
+def reason_to_refit(problem: Problem) -> str:
+    """Why the residuals of a model cannot decide and a refit can; empty where they can.
+
+    The error is far above the noise floor, and no larger than the validated error: an effect that
+    the network has learned to imitate would look like this.
+    """
+    error, floor = problem.rmse_mm, problem.floor_mm
+    seen = np.isfinite(problem.residual).all(2).sum(0)
+    validated = float(np.sqrt(seen @ np.square(problem.discrepancy_mm) / seen.sum()))
+    excess = float(np.sqrt(max(error**2 - floor**2, 0.0)))
+    if error < ASKED.over_floor * floor:
+        return ""
+    if excess > ASKED.within * validated or not _trainable(problem.model):
+        return ""
+    return (
+        f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and no larger "
+        f"than the model's validated error ({validated:.3g} mm), so the network may imitate what "
+        "is missing"
+    )
+
+
+def _trainable(model: ArmModel) -> bool:
+    return not isinstance(model.network, RecurrentArm)
+
+
+def can_hide(name: str) -> bool:
+    """Whether a network can hide an effect by imitation: one with memory that acts in front."""
+    kind = known_effects()[name]
+    return kind.stage in ("line", "material") and not issubclass(kind, Memoryless)
+
+
+def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], dict[str, str]]:
+    """The effects that a refit can decide about, and why it cannot about the others.
+
+    A network of actuation and direction learns every static function by itself, so a static effect
+    leaves no trace in a joint fit. Effects behind the network act on the shape; the network does
+    not see what they need. Effects that the model has already were fitted with it.
+    """
+    tried, left = [], {}
+    timed = bool(problem.table.timed[problem.index.numpy()].any())
+    for name, kind in known_effects().items():
+        if name in without:
+            continue
+        if name in problem.model.effects:
+            left[name] = "the model has it already, and it was fitted with the network"
+        elif kind.stage not in ("line", "material"):
+            left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
+        elif issubclass(kind, Memoryless):
+            left[name] = "is a function of the actuation, which a network learns by itself"
+        elif not timed:
+            left[name] = "steady-state samples cannot show it: they have no rates and no past"
+        else:
+            tried.append(name)
+    return tried, left
+
+
+# One training ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training of the network with an effect, or without."""
+
+    model: ArmModel
+    """The model to start from, the effect in place."""
+    effects: tuple[str, ...]
+    """Effects whose parameters are held in their plausible ranges."""
+    part: int | None
+    """The part that is left out; None: none is."""
+    epochs: int
+    """Epochs."""
+    seed: int
+    """Seed of the training."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a training came to."""
+
+    model: ArmModel
+    """The trained model."""
+    losses: np.ndarray
+    """(B, n) sum of squared distances of each block and key point, mm^2."""
+    epochs: int
+    """Epochs that it took."""
+
+
+Rung = dict[str | None, list[Outcome]]
+"""The outcome of each seed, of each effect and of the rival (None)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """A problem's training rows, dealt to parts that are left out in turn."""
+
+    problem: Problem
+    """The problem."""
+    data: Data
+    """Its thinned rows; none is held out."""
+    part: np.ndarray
+    """(B,) the part of each block."""
+    unit: np.ndarray
+    """(B,) independent unit of each block: its run or its motion."""
+    unit_name: str
+    """`runs` or `blocks of time`."""
+    rows: int
+    """Rows that are trained on."""
+
+    @classmethod
+    def of(cls, problem: Problem, config: RefitConfig) -> "Split":
+        """Deal the blocks of a problem to as many parts as there are seeds."""
+        history = problem.history
+        seen = np.flatnonzero(problem.block_of_row >= 0)
+        kept = np.zeros(len(problem.block_of_row), bool)
+        kept[seen[:: max(1, -(-len(seen) // config.rows))]] = True
+        points = history.key_points.clone()
+        points[history.valid] = points[history.valid].masked_fill(
+            ~torch.from_numpy(kept)[:, None, None], torch.nan
+        )
+        by_run = _parts_of_runs(problem, config.seeds)
+        part = problem.motion // TOGETHER % config.seeds
+        run_of_block = _run_of_block(problem)
+        enough = by_run is not None and int(run_of_block.max()) + 1 >= least_units()
+        return cls(
+            problem=problem,
+            data=Data(replace(history, key_points=points), None, None),
+            part=part if by_run is None else by_run,
+            unit=run_of_block if enough else problem.motion,
+            unit_name="blocks of time" if by_run is None else "runs",
+            rows=int(kept.sum()),
+        )
+
+    def held(self, part: int | None) -> Data:
+        """The data with one part held out."""
+        history = self.problem.history
+        out = np.zeros(len(self.problem.block_of_row), bool)
+        if part is not None:
+            inside = self.problem.block_of_row >= 0
+            out[inside] = self.part[self.problem.block_of_row[inside]] == part
+        mask = torch.zeros_like(history.valid)
+        mask[history.valid] = torch.from_numpy(out)
+        return replace(self.data, held=mask)
+
+    def losses(self, model: ArmModel) -> np.ndarray:
+        """(B, n) sum of squared distances of a model in each block and key point, mm^2."""
+        square = np.square(self.problem.with_model(model).residual).sum(2)
+        return block_sums(square, self.problem.block)
+
+    def by_unit(self, values: np.ndarray) -> np.ndarray:
+        """(..., U) sums of values (..., B) of the blocks over units."""
+        names, place = np.unique(self.unit, return_inverse=True)
+        sums = np.zeros((len(names), *values.shape[:-1]))
+        np.add.at(sums, place, np.moveaxis(values, -1, 0))
+        return np.moveaxis(sums, 0, -1)
+
+
+def _run_of_block(problem: Problem) -> np.ndarray:
+    """(B,) run of each block, from 0."""
+    run = problem.history.run_of_row[problem.index].numpy()
+    answer = np.zeros(int(problem.block.max()) + 1, int)
+    answer[problem.block] = np.unique(run, return_inverse=True)[1]
+    return answer
+
+
+def _parts_of_runs(problem: Problem, parts: int) -> np.ndarray | None:
+    """(B,) part of each block where whole runs can be left out; None where blocks have to be.
+
+    Kinds of runs where there are enough, else runs. Runs cannot be left out where they are few, or
+    where a part's actuation lies far from that of all others: the error there is that of the
+    network beyond its data, which no effect changes.
+    """
+    run_of_block = _run_of_block(problem)
+    runs = int(run_of_block.max()) + 1
+    if runs < parts:
+        return None
+    kind = kinds(problem.pressure, run_of_block[problem.block])
+    part = (kind if kind.max() + 1 >= parts else np.arange(runs))[run_of_block] % parts
+    row_part = part[problem.block]
+    for number in range(parts):
+        out = row_part == number
+        if far_share(problem.pressure[~out], problem.pressure[out]) > FAR_ROWS:
+            return None
+    return part
+
+
+def least_units() -> int:
+    """Fewest units of which a sign-flip test can reach the asked p-value for every effect.
+
+    K units have 2^K patterns of signs, so no p-value is below 2^-K, and a family of effects needs
+    its share of the asked one (Bonferroni's bound).
+    """
+    family = sum(not issubclass(kind, Memoryless) for kind in known_effects().values())
+    return int(np.ceil(np.log2(family / ASKED.p_value)))
+
+
+@torch_threads(1)
+def run_job(split: Split, job: Job) -> Outcome:
+    """Train a copy of the job's model."""
+    model = copy.deepcopy(job.model)
+    hold = partial(_hold_plausible, effects=job.effects) if job.effects else None
+    train_jointly(model, split.held(job.part), job.epochs, JointTraining(seed=job.seed), hold)
+    return Outcome(model, split.losses(model), job.epochs)
+
+
+def _hold_plausible(model: ArmModel, effects: Iterable[str]) -> None:
+    """Shrink the amplitudes of effects to the plausible range, where that makes them plausible."""
+    for name in effects:
+        added = model.effects[name]
+        if not added.plausible():
+            before = copy.deepcopy(added.state_dict())
+            if not shrink(added):
+                added.load_state_dict(before)
+
+
+_SPLIT: list[Split] = []
+
+
+def _prepare(split: Split) -> None:
+    _SPLIT[:] = [split]
+
+
+def _run_prepared(job: Job) -> Outcome:
+    return run_job(_SPLIT[0], job)
+
+
+# The refit ------------------------------------------------------------------------------------
+
+
+@torch_threads(1)
+def refit(
+    problem: Problem,
+    reason: str = "it was asked for",
+    without: Iterable[str] = (),
+    together: Iterable[str] = (),
+    config: RefitConfig = REFIT,
+    progress: Progress = silent,
+    processes: int = 1,
+) -> Refit:
+    """Fit candidate effects together with the network, and compare them on held-out data.
+
+    problem: training rows of a residual table. without: effects that cannot act. together: effects
+    to fit at once, as the one candidate; without them each effect that a network can hide is one.
+    processes: how many trainings run at once; the result is the same. Raises InputError where the
+    model's network is a recurrent one, which takes no effects.
+    """
+    begin = time.perf_counter()
+    check_trainable(problem.model, together)
+    together = tuple(dict.fromkeys(together))
+    names, left = ([], {}) if together else hideable(problem, without)
+    sets = {name: (name,) for name in names} | ({JOIN.join(together): together} if together else {})
+    split = Split.of(problem, config)
+    models: dict[str | None, ArmModel] = {None: problem.model}
+    for number, (label, effects) in enumerate(sets.items()):
+        progress(0.0, 1.0, f"start of {label} ({number + 1} of {len(sets)})")
+        try:
+            models[label] = starting_model(problem, effects)
+        except InputError as error:
+            if together:
+                raise
+            left[label] = str(error)
+    tried = [label for label in sets if label in models]
+    finalists = min(config.finalists, len(tried))
+    rungs = [(config.first_epochs, 1 + len(tried)), (config.epochs, 1 + finalists)]
+    work, done = config.seeds * sum(epochs * count for epochs, count in rungs), 0
+    first: Rung = {}
+    second: Rung = {}
+    best: list[str] = []
+    with ExitStack() as stack:
+        pool: Executor | None = None
+        if processes > 1 and tried:
+            pool = stack.enter_context(workers(processes, partial(_prepare, split)))
+
+        def rung(labels: list[str], epochs: int, before: Rung) -> Rung:
+            """Trainings of the rival and of some candidates, one a seed, from the rung before."""
+            nonlocal done
+            keys = [(label, part) for part in range(config.seeds) for label in (None, *labels)]
+            jobs = [
+                Job(
+                    before[label][part].model if before else models[label],
+                    sets[label] if label else (),
+                    part,
+                    epochs,
+                    config.seed + part,
+                )
+                for label, part in keys
+            ]
+            found: Rung = {label: [] for label in (None, *labels)}
+            outcomes = pool.map(_run_prepared, jobs) if pool else map(partial(run_job, split), jobs)
+            for (label, _), outcome in zip(keys, outcomes, strict=True):
+                found[label].append(outcome)
+                done += epochs
+                progress(done, work, f"fitted together: {label or 'the network alone'}")
+            return found
+
+        if tried:
+            first = rung(tried, config.first_epochs, {})
+            scores = _scores(split, dict.fromkeys(tried, first), sets)
+            order = sorted(tried, key=lambda label: -scores[label].log_gain)
+            best = [label for label in order if scores[label].plausible][:finalists]
+        if best:
+            second = rung(best, config.epochs, first)
+            second = {label: _better(split, first[label], second[label]) for label in second}
+    last = {label: second if label in best else first for label in tried}
+    scores = _scores(split, last, sets) if tried else {}
+    shown = sorted(tried, key=lambda label: (label not in best, -scores[label].log_gain))
+    ahead = [scores[label] for label in shown if label in best]
+    winner, competing, of_line, sure = _decided(split, ahead, last)
+    final = second or first
+    return Refit(
+        reason=reason,
+        alone_mm=_rmse(split, _held_losses(split, final[None])) if final else problem.rmse_mm,
+        candidates=tuple(scores[label] for label in shown),
+        winner=winner,
+        competing=competing,
+        of_line=of_line,
+        confidence=sure,
+        not_tried=tuple(left.items()),
+        unit=split.unit_name,
+        units=len(np.unique(split.unit)),
+        rows=split.rows,
+        trainings=sum(len(some) for found in (first, second) for some in found.values()),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _better(split: Split, *rungs: list[Outcome]) -> list[Outcome]:
+    """The rung with the least held-out error: training on may overfit (early stopping)."""
+    return min(rungs, key=lambda outcomes: float(_held_losses(split, outcomes).sum()))
+
+
+JOIN = " + "
+"""What joins the names of effects that are fitted at once."""
+
+
+def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
+    """Raise InputError unless a model's network can be trained together with the effects."""
+    if not _trainable(model):
+        raise InputError(
+            "the recurrent baseline takes no effects, so nothing can be fitted together with it: "
+            "pass --refit never, or fit a model with --network haw_nn"
+        )
+    for name in effects:
+        stage = known_effects()[name].stage
+        if stage not in ("line", "material"):
+            raise InputError(
+                f"{name} acts on the {stage}, behind the network, and is not fitted together with "
+                "it: expected effects of line or material; pass --refit never"
+            )
+
+
+def starting_model(problem: Problem, effects: Iterable[str]) -> ArmModel:
+    """The problem's model with effects at their first-order estimates, as far as plausible.
+
+    Effects that the model has already stay as they are.
+    """
+    model = problem.model
+    for name in effects:
+        if name not in model.effects:
+            model = starts(problem.with_model(model), name, 1)[0]
+            _hold_plausible(model, [name])
+    return model
+
+
+def _held_losses(split: Split, outcomes: list[Outcome]) -> np.ndarray:
+    """(B, n) sum of squared distances, by the seed that left a block's part out, mm^2."""
+    losses = np.stack([outcome.losses for outcome in outcomes])
+    return losses[split.part, np.arange(losses.shape[1])]
+
+
+def _counts(split: Split) -> np.ndarray:
+    """(B, n) measured rows of each block and key point."""
+    seen = np.isfinite(split.problem.residual).all(2)
+    return block_sums(seen.astype(float), split.problem.block)
+
+
+def _rmse(split: Split, losses: np.ndarray) -> float:
+    return float(np.sqrt(losses.sum() / _counts(split).sum()))
+
+
+def _log_gain(split: Split, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(U,) log of errors before over after, by unit, the noise added to both."""
+    floor = _counts(split).sum(1) * split.problem.floor_mm**2
+    before, after, floor = (split.by_unit(x) for x in (before.sum(1), after.sum(1), floor))
+    return np.log((before + floor) / (after + floor))
+
+
+def _gains_of(split: Split, rung: Rung, label: str) -> np.ndarray:
+    """(U,) log gain of one candidate over the rival of its rung, by unit."""
+    return _log_gain(split, _held_losses(split, rung[None]), _held_losses(split, rung[label]))
+
+
+def _scores(
+    split: Split, rungs: dict[str, Rung], sets: dict[str, tuple[str, ...]]
+) -> dict[str, RefitCandidate]:
+    """The result of each candidate in the last rung that it was in, against the rival there."""
+    gains = np.stack([_gains_of(split, rung, label) for label, rung in rungs.items()])
+    chances = sign_flip_p_values(gains, np.arange(len(gains)))
+    return {
+        label: _score(split, rung, label, sets[label], gain, float(chance))
+        for (label, rung), gain, chance in zip(rungs.items(), gains, chances, strict=True)
+    }
+
+
+def _score(
+    split: Split, rung: Rung, label: str, effects: tuple[str, ...], gain: np.ndarray, chance: float
+) -> RefitCandidate:
+    """The result of one candidate."""
+    counts = _counts(split)
+    before, after = (_held_losses(split, rung[key]) for key in (None, label))
+    sums = tuple(split.by_unit(each.sum(1)) for each in (before, after, counts))
+    low, high = block_interval(_difference, sums)
+    seeds = range(len(rung[label]))
+    by_seed = np.sqrt(
+        [
+            [each[split.part == part].sum() / counts[split.part == part].sum() for part in seeds]
+            for each in (before, after)
+        ]
+    )
+    difference = by_seed[0] - by_seed[1]
+    floor = float(counts.sum()) * split.problem.floor_mm**2
+    excess = max(before.sum() - floor, 0.02 * before.sum(), 1e-30)
+    fitted = [[outcome.model.effects[name] for name in effects] for outcome in rung[label]]
+    points = [
+        float(np.sqrt(square / count)) if count else None
+        for square, count in zip(after.sum(0), counts.sum(0), strict=True)
+    ]
+    return RefitCandidate(
+        effect=label,
+        heldout_rmse_mm=_rmse(split, after),
+        per_key_point_mm=tuple(points),
+        seeds_mm=tuple(by_seed[1].tolist()),
+        rival_mm=_rmse(split, before),
+        difference_mm=_rmse(split, before) - _rmse(split, after),
+        ci95_mm=(float(low), float(high)),
+        spread_mm=float(difference.std(ddof=1)) if len(difference) > 1 else 0.0,
+        gain=float((before.sum() - after.sum()) / excess),
+        log_gain=float(gain.mean()),
+        p_value=chance,
+        epochs=rung[label][0].epochs,
+        plausible=all(effect.plausible() for some in fitted for effect in some),
+        parameters={q.name: q.value for effect in fitted[0] for q in effect.quantities()},
+    )
+
+
+def _difference(before: np.ndarray, after: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """(...) difference of two RMS errors from sums of squares and counts (...)."""
+    count = np.maximum(count, 1)
+    return np.sqrt(before / count) - np.sqrt(after / count)
+
+
+def _decided(
+    split: Split, ahead: list[RefitCandidate], rungs: dict[str, Rung]
+) -> tuple[str | None, tuple[str, ...], bool, float]:
+    """The winner, what competes with it, whether LINE settled a tie, and the confidence in it.
+
+    ahead: candidates of the last rung, the best first.
+    """
+    ahead = [score for score in ahead if score.plausible]
+    named = [score for score in ahead if score.named]
+    if not named:
+        return None, (), False, 0.0
+    best = named[0]
+    gains = {score.effect: _gains_of(split, rungs[score.effect], score.effect) for score in ahead}
+    tie = min(ASKED.tie_of_gain * best.gain, ASKED.tie_of_left * (1.0 - best.gain))
+    competing = []
+    for other in ahead:
+        if other is best or other.gain < ASKED.competing_gain * best.gain:
+            continue
+        shares = win_shares(-np.stack([gains[best.effect], gains[other.effect]]))
+        if best.gain - other.gain < tie or shares[0] < ASKED.win_share:
+            competing.append(other)
+    line = [score for score in (best, *competing) if score.named and score.effect == LINE]
+    of_line = bool(line and competing and split.problem.model.spec.actuation == "commanded")
+    if of_line:
+        competing = [score for score in (best, *competing) if score is not line[0]]
+        best = line[0]
+    others = [gain for name, gain in gains.items() if name != best.effect]
+    shares = win_shares(-np.stack([gains[best.effect], *others]))
+    sure = max(float(shares[0]) - best.p_value, 0.0)
+    if competing:
+        sure = min(sure, ASKED.most_confidence)
+    return best.effect, tuple(score.effect for score in competing), of_line, sure
+
+
+LINE = "line_lag"
+"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
+of the wall are the same operator on the actuation: where both do as well and the model's input is a
+command, which has passed a line in any case, the lag is that of the line."""
+
+
+# The model that results -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Network and effects, fitted together to all training rows."""
+
+    model: ArmModel
+    """The model with the effects; its validated error is that of the refit."""
+    alone: ArmModel
+    """The given model, its network trained on as long without the effects that it lacked."""
+    parameters: tuple[Parameter, ...]
+    """The effects' parameters; intervals are not known, so their ends are the values."""
+
+
+ALL_ROWS = 10**9
+"""More rows than any recording has: no row is left out of the last fit."""
+
+
+@torch_threads(1)
+def fit_together(
+    problem: Problem,
+    effects: Iterable[str],
+    validated: RefitCandidate,
+    config: RefitConfig = REFIT,
+    progress: Progress = silent,
+) -> JointFit:
+    """Fit effects together with the network to all rows of a problem, and the network alone.
+
+    Both are trained for the epochs of both rungs of a refit. validated: the result of these effects
+    in that refit, whose held-out error becomes the new model's validated error. Effects that the
+    model has already are trained on in both.
+    """
+    effects = tuple(dict.fromkeys(effects))
+    check_trainable(problem.model, effects)
+    split = Split.of(problem, replace(config, rows=ALL_ROWS))
+    starts_of = {
+        f"network and {JOIN.join(effects)}": starting_model(problem, effects),
+        "the network alone": problem.model,
+    }
+    trained = []
+    for number, (note, start) in enumerate(starts_of.items()):
+        held = tuple(name for name in effects if name in start.effects)
+        progress(number, len(starts_of), f"fitted to all rows: {note}")
+        for epochs in (config.first_epochs, config.epochs):
+            start = run_job(split, Job(start, held, None, epochs, config.seed)).model
+        trained.append(start)
+    validation = Validation(
+        rmse_mm=validated.heldout_rmse_mm,
+        per_key_point_mm=validated.per_key_point_mm,
+        rows=int(np.isfinite(problem.residual).all(2).any(1).sum()),
+        noise_mm=problem.model.validation.noise_mm,
+    )
+    model = trained[0].replace(validation=validation).eval().requires_grad_(False)
+    model.training_residuals = model.residuals_on([problem.history])
+    return JointFit(model, trained[1], tuple(_parameters(model, effects)))
+
+
+def _parameters(model: ArmModel, effects: Iterable[str]) -> Iterator[Parameter]:
+    """The quantities of effects without intervals."""
+    for name in effects:
+        for quantity in model.effects[name].quantities():
+            yield Parameter(
+                effect=name,
+                name=quantity.name,
+                value=quantity.value,
+                low=quantity.value,
+                high=quantity.value,
+                unit=quantity.unit,
+                plausible=quantity.plausible,
+                plausible_range=(quantity.low, quantity.high),
+                source=quantity.source,
+            )

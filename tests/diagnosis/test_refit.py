@@ -1,0 +1,309 @@
+"""A refit names a lag that the network has learned to imitate, and leaves a clean arm alone."""
+
+import json
+from dataclasses import asdict, replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.cli import diagnose as diagnose_command
+from surgisoft.cli import run
+from surgisoft.diagnosis import amend as amending
+from surgisoft.diagnosis import diagnose as diagnosing
+from surgisoft.diagnosis import improve as improving
+from surgisoft.diagnosis import refit as refitting
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict, with_refit
+from surgisoft.diagnosis.inputs import identification_problem
+from surgisoft.diagnosis.refit import RefitConfig, fit_together, reason_to_refit, refit
+from surgisoft.errors import InputError
+from surgisoft.measurement.fitting import fit
+from surgisoft.measurement.recordings import Recording, save_recording
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.model import ArmModel, Validation
+
+PERIOD_S, LAG_S, NOISE_MM = 0.1, 0.4, 0.1
+SHORT = RefitConfig(rows=800, seeds=2, first_epochs=2, epochs=5, finalists=2)
+"""A budget of seconds."""
+
+
+def command(rows: int, seed: int = 0) -> np.ndarray:
+    """(rows, 2) pressures of 0 to 60 kPa: ramps at three rates and rests, by a loop of its own."""
+    rng = np.random.default_rng(seed)
+    columns = []
+    for _ in range(2):
+        values = [0.0]
+        while len(values) < rows:
+            goal = rng.uniform(0.0, 60.0)
+            count = max(1, int(abs(goal - values[-1]) / rng.choice([1.5, 4.0, 10.0])))
+            values += list(np.linspace(values[-1], goal, count + 1)[1:])
+            values += [goal] * int(rng.integers(0, 25))
+        columns.append(values[:rows])
+    return np.array(columns).T
+
+
+def arm_by_hand(lag_s: float = LAG_S, rows: int = 1200) -> Recording:
+    """An arm of constant curvature behind a first-order lag, from formulas written here."""
+    asked = command(rows)
+    chamber, now = np.empty_like(asked), np.zeros(2)
+    for row, value in enumerate(asked):
+        now = value + (now - value) * (np.exp(-PERIOD_S / lag_s) if lag_s else 0.0)
+        chamber[row] = now
+    bend = 0.02 * chamber
+    angle = np.maximum(np.hypot(*bend.T), 1e-9)
+    length = 80.0 + 0.05 * chamber.sum(1)
+    points = []
+    for share in (0.5, 1.0):
+        turned = share * angle
+        across = share * length * (1.0 - np.cos(turned)) / turned
+        along = share * length * np.sin(turned) / turned
+        points.append(np.stack([*(across * bend.T / angle), along], axis=1))
+    noise = np.random.default_rng(1).normal(0.0, NOISE_MM, (rows, 2, 3))
+    return Recording(
+        name="hand",
+        t_s=PERIOD_S * np.arange(rows),
+        measured=asked,
+        commanded=asked,
+        key_points_mm=np.stack(points, axis=1) + noise,
+        noise_mm=NOISE_MM,
+    )
+
+
+def fitted_to(recording: Recording, **more) -> ArmModel:
+    given = {"actuation": "commanded", "hidden": (24, 24), "epochs": 40, "inputs": "pressure"}
+    return fit([recording], **(given | more)).model
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    """A recording of the lagging arm, and a network that was fitted to it without the lag."""
+    recording = arm_by_hand()
+    return recording, fitted_to(recording)
+
+
+@pytest.fixture(scope="module")
+def problem(lagging):
+    return identification_problem(lagging[1], [lagging[0]])
+
+
+@pytest.fixture(scope="module")
+def found(problem):
+    return refit(problem, config=SHORT)
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """The commands with a budget of seconds and two candidates, in this process."""
+    monkeypatch.setattr(refitting, "hideable", lambda *given: (["creep", "line_lag"], {}))
+    together = partial(refit, config=SHORT)
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", together)
+    monkeypatch.setattr(amending, "refit_effects", together)
+    for module in (amending, improving):
+        monkeypatch.setattr(module, "fit_together", partial(fit_together, config=SHORT))
+    monkeypatch.setattr(diagnose_command, "REFIT_PROCESSES", 1)
+
+
+def test_a_lag_that_the_network_imitates_is_named(problem, found):
+    """Its error is that of its validation, so the residuals alone say nothing."""
+    assert "may imitate" in reason_to_refit(problem)
+    assert found.winner == "line_lag"
+    best = found.of("line_lag")
+    assert best.plausible
+    assert best.p_value <= 0.02
+    assert best.ci95_mm[0] > 0
+    assert best.heldout_rmse_mm < 0.5 * best.rival_mm
+    assert found.confidence > 0.5
+    time = best.parameters["tau_up_s"] + best.parameters["dead_s"]
+    assert time == pytest.approx(LAG_S, rel=0.35)
+
+
+def test_the_error_of_the_candidate_is_that_of_left_out_blocks(found):
+    """By hand: mean square over seeds of parts of nearly equal size."""
+    for row in found.candidates:
+        assert len(row.seeds_mm) == SHORT.seeds
+        together = np.sqrt(np.mean(np.square(row.seeds_mm)))
+        assert row.heldout_rmse_mm == pytest.approx(together, rel=0.1)
+        assert row.difference_mm == pytest.approx(row.rival_mm - row.heldout_rmse_mm)
+        assert row.ci95_mm[0] <= row.difference_mm <= row.ci95_mm[1]
+
+
+def test_the_rival_trains_on_the_same_rows_for_as_many_epochs(problem, monkeypatch):
+    done = []
+    train = refitting.train_jointly
+
+    def counted(model, data, epochs, config, hold=None):
+        done.append((tuple(model.effects), epochs, config.seed, data.held.sum().item()))
+        train(model, data, 1, config, hold)
+
+    monkeypatch.setattr(refitting, "train_jointly", counted)
+    refit(problem, together=["line_lag"], config=SHORT)
+    with_it = [rest for effects, *rest in done if effects]
+    alone = [rest for effects, *rest in done if not effects]
+    assert len(with_it) == 2 * SHORT.seeds
+    assert sorted(with_it) == sorted(alone)
+    assert {epochs for epochs, *_ in with_it} == {SHORT.first_epochs, SHORT.epochs}
+    assert all(held > 0 for *_, held in with_it)
+
+
+def test_left_out_rows_are_no_part_of_a_training(problem, monkeypatch):
+    """Training targets and held-out rows have no row in common, and all rows are left out once."""
+    seen = []
+
+    def look(model, data, epochs, config, hold=None):
+        target = ~data.targets.isnan().all(-1).all(-1)
+        assert not (target & data.held).any()
+        assert target.any()
+        seen.append(data.held & data.train.valid)
+
+    monkeypatch.setattr(refitting, "train_jointly", look)
+    refit(problem, together=["line_lag"], config=SHORT)
+    parts = torch.stack(seen[: 2 * SHORT.seeds : 2]).int().sum(0).flatten()
+    inside = torch.from_numpy(problem.block_of_row >= 0)
+    assert (parts[inside] == 1).all()
+    assert (parts[~inside] == 0).all()
+
+
+def test_the_same_seed_gives_the_same_result_and_another_seed_another(problem):
+    brief = replace(SHORT, first_epochs=1, epochs=1)
+    first, again, other = (
+        refit(problem, together=["line_lag"], config=replace(brief, seed=seed))
+        for seed in (0, 0, 1)
+    )
+    assert replace(first, seconds=0.0) == replace(again, seconds=0.0)
+    assert first.candidates[0].heldout_rmse_mm != other.candidates[0].heldout_rmse_mm
+
+
+def test_a_clean_model_at_its_floor_costs_nothing(monkeypatch):
+    """A network that fits an arm without a lag: auto does not start a refit; never and always."""
+    recording = arm_by_hand(lag_s=0.0)
+    model = fitted_to(recording, epochs=150)
+    clean = identification_problem(model, [recording])
+    assert clean.rmse_mm < 2.0 * clean.floor_mm
+    assert reason_to_refit(clean) == ""
+    assert refitting.refit_reason(clean, "never") == ""
+    assert refitting.refit_reason(clean, "always")
+    with pytest.raises(InputError, match="auto"):
+        refitting.refit_reason(clean, "sometimes")
+
+    def refuse(*given, **more):
+        raise AssertionError("a refit was started")
+
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", refuse)
+    assert diagnosing.diagnose(model, [recording]).refit is None
+
+
+def test_never_does_not_refit_where_auto_would(lagging, monkeypatch):
+    recording, model = lagging
+    monkeypatch.setattr(diagnosing, "fit_candidates_together", None)
+    found = diagnosing.diagnose(model, [recording], refit="never")
+    assert found.refit is None
+    assert found.to_json()["refit"] is None
+
+
+def test_an_error_beyond_the_validated_one_is_left_to_the_residuals(problem):
+    """Something has changed since the fit: the network cannot have learned it."""
+    model = problem.model.replace(
+        validation=Validation(0.4 * problem.rmse_mm, (0.4 * problem.rmse_mm,) * 2, 300)
+    )
+    small = 0.4 * np.sqrt(np.nanmean(np.square(problem.residual).sum(2), axis=0))
+    assert reason_to_refit(replace(problem, model=model, discrepancy_mm=small)) == ""
+
+
+def test_effects_that_a_refit_cannot_decide_are_not_tried(problem, found):
+    why = dict(found.not_tried)
+    assert "function of the actuation" in why["gain_mismatch"]
+    assert "behind the network" in why["payload"]
+    still = replace(problem, table=replace(problem.table, timed=np.zeros_like(problem.table.timed)))
+    names, left = refitting.hideable(still)
+    assert names == []
+    assert "steady-state" in left["creep"]
+    assert "steady-state" in left["line_lag"]
+
+
+def named(effect: str | None, found) -> Diagnosis:
+    """A diagnosis of the residuals that names an effect."""
+    row = Ranked("creep", 0.9, 0.5, 0.5, 1.0, (0.9, 1.1), 0.01, 0.3, {})
+    verdict = (
+        Verdict("identified", (effect,), "so") if effect else Verdict("nothing_missing", (), "")
+    )
+    return Diagnosis(verdict, ErrorLevels(2.0, 0.1, 1.0), (row, replace(row, effect="line_lag")))
+
+
+def test_without_a_winner_an_effect_that_was_tried_is_not_named_any_more(problem, found):
+    """The residuals name creep, but the network alone does as well; or a payload, which stays."""
+    none = replace(found, winner=None, competing=(), of_line=False, confidence=0.0)
+    evidence = diagnosing.diagnose(problem.model, [arm_by_hand(rows=800)], refit="never").statistics
+    said = replace(named("creep", none), statistics=evidence)
+    result = with_refit(said, none, problem)
+    assert result.verdict.effects == ()
+    assert result.verdict.kind not in ("identified", "several", "ambiguous")
+    assert none.sentence in result.checks
+    load = replace(named("payload", none), statistics=evidence)
+    assert with_refit(load, none, problem).verdict == load.verdict
+
+
+def test_the_refit_decides_over_the_residuals(problem, found):
+    result = with_refit(named("creep", found), found, problem)
+    assert result.verdict.effects[0] == "line_lag"
+    assert result.verdict.kind == "identified"
+    assert found.sentence in result.verdict.sentence
+    assert result.ranking[0].effect == "line_lag"
+    assert result.ranking[0].confidence == pytest.approx(found.confidence, abs=1e-4)
+    assert result.ranking[1].confidence <= 1.0 - found.confidence + 1e-4
+
+
+def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
+    lagging, tmp_path, capsys, short
+):
+    recording, model = lagging
+    save_model(model, tmp_path / "arm")
+    save_recording(recording, tmp_path / "hand.parquet")
+    arm, data = str(tmp_path / "arm"), str(tmp_path / "hand.parquet")
+    assert (
+        run(["diagnose", arm, data, "--json", f"{tmp_path}/x.json", "--report", f"{tmp_path}/r"])
+        == 0
+    )
+    out = capsys.readouterr().out
+    assert "identified: line_lag is missing" in out
+    assert "fitted together with the network, line_lag leaves" in out
+    assert "--refit always" in out
+    written = json.loads((tmp_path / "x.json").read_text())
+    called = diagnosing.diagnose(arm, data)
+    assert written["verdict"]["effects"] == list(called.verdict.effects) == ["line_lag"]
+    rows = [asdict(row) for row in called.refit.candidates]
+    assert written["refit"]["candidates"] == json.loads(json.dumps(rows))
+    assert written["refit"]["winner"] == "line_lag"
+    assert "Fitted together" in (tmp_path / "r" / "diagnosis.html").read_text()
+    amended = amending.amend(arm, data, "line_lag")
+    assert amended.claimed
+    assert amended.held_out.after < 0.5 * amended.held_out.before
+    assert amended.alone.before > amended.held_out.after
+    assert amended.refit.winner == "line_lag"
+    assert amended.model.validation.rmse_mm < 0.5 * model.validation.rmse_mm
+    assert "fitted together with the network" in amended.sentence
+    better = improving.improve(arm, data, most_effects=1)
+    assert [name for name, _ in better.steps] == ["line_lag"]
+    assert better.rounds[0].together
+    assert better.claimed
+
+
+@pytest.mark.parametrize("name", ["diagnose", "amend", "improve"])
+def test_a_bad_mode_is_one_line_and_code_2(name, tmp_path, capsys):
+    more = [] if name == "diagnose" else ["-o", str(tmp_path / "new")]
+    more += ["--effect", "creep", "--data", "x.csv"] if name == "amend" else []
+    given = ["default"] if name == "amend" else ["default", "x.csv"]
+    assert run([name, *given, *more, "--refit", "sometimes"]) == 2
+    assert "sometimes" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_cannot_be_fitted_together_is_refused(problem, tmp_path, capsys):
+    with pytest.raises(InputError, match="behind the network"):
+        refit(problem, together=["payload"], config=SHORT)
+    save_recording(arm_by_hand(rows=600), tmp_path / "hand.parquet")
+    save_model(problem.model, tmp_path / "arm")
+    command = ["amend", str(tmp_path / "arm"), "--effect", "line_lag", "--data"]
+    command += [str(tmp_path / "hand.parquet"), "-o", str(tmp_path / "new")]
+    assert run([*command, "--refit", "always", "--keep-network"]) == 2
+    assert "--keep-network" in capsys.readouterr().err

@@ -80,9 +80,6 @@ FREE_POWER = 4.0
 LEAST_BINS = 8
 """Lowest frequency at which motion can be free, in steps of the spectrum: below it the few bins say
 little, and creep and drift act there."""
-UNSEEN_NOISE = 1.0
-"""Repeatability beyond the noise floor, in noise floors, where BEFORE has no repeats that show it:
-slow noise is then taken to be as large as fast noise."""
 
 
 @dataclass(frozen=True)
@@ -696,16 +693,18 @@ def _enough(after: ResidualTable, pairs: Pairs) -> bool:
 def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
     """(n,) RMS distance by which a recording of the same motion differs, mm, and its source.
 
-    Two recordings of BEFORE differ by twice the variance of one.
+    Two recordings of BEFORE differ by twice the variance of one. Where BEFORE has no repeats, the
+    noise floor is what is known of it.
     """
     found = _partners(before, before, itself=True)
-    difference = before.residual_mm - found.residual_mm
-    square = np.square(difference).sum(2)
+    difference = before.measured_mm - found.residual_mm - found.predicted_mm
+    correction = before.predicted_mm - found.predicted_mm
+    square = np.square(difference - without_noise(before, difference, correction)).sum(2)
     # A mean of several partners has less of a variance.
     square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
     seen = np.isfinite(square)
     if (seen.sum(0) < 2 * LEAST_BLOCKS * BLOCK_ROWS).any():
-        return np.hypot(1.0, UNSEEN_NOISE) * before.noise_mm, "noise"
+        return before.noise_mm, "noise"
     return np.sqrt(np.nanmean(square, axis=0)), "repeats"
 
 

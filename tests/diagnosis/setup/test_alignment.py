@@ -44,6 +44,17 @@ def test_the_rotation_of_noisy_points_is_that_of_scipy():
     np.testing.assert_allclose(frame.rotation, expected.as_matrix(), atol=1e-9)
 
 
+def test_a_mirrored_frame_is_not_taken_for_a_turned_one():
+    true = points(7)
+    recorded = true * [1.0, 1.0, -1.0]
+    sums = moments(recorded[None], true[None])[0, 0]
+    frame = fitted(sums, 1.0, np.asarray(1.0))
+    assert np.linalg.det(frame.rotation) == pytest.approx(1.0)
+    flat = [part.reshape(-1, 3) - part.mean((0, 1)) for part in (recorded, true)]
+    expected, _ = Rotation.align_vectors(*flat)
+    np.testing.assert_allclose(frame.rotation, expected.as_matrix(), atol=1e-9)
+
+
 def test_the_error_is_the_mean_over_the_points_that_are_seen():
     true, recorded = points(3), points(4)
     recorded[5:9, 1] = np.nan

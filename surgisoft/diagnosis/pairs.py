@@ -133,8 +133,9 @@ class Pairs:
     discrepancy_mm: np.ndarray
     """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
     tolerance_mm: np.ndarray
-    """(n,) what the right effect may leave, mm: the discrepancy, and the share of the change that
-    the sensitivities of the effects are off by (`slope_error`)."""
+    """(n,) what the right effect may leave, mm: the discrepancy, the share of the change that the
+    sensitivities of the effects are off by (`slope_error`), and where BEFORE has no repeats slow
+    noise of the size of its noise floor."""
 
     @property
     def paired(self) -> np.ndarray:
@@ -564,6 +565,8 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
     repeatability, source = _repeatability(before)
     slope = slope_error(after)
     discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
+    # Without repeats slow noise may be as large as fast noise.
+    slow = noise if source == "noise" else np.zeros_like(noise)
     noise = np.maximum(noise, free)
     return Pairs(
         before=before.names,
@@ -578,7 +581,9 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         free_mm=free,
         noise_mm=noise,
         discrepancy_mm=discrepancy,
-        tolerance_mm=np.hypot(discrepancy, slope * rms_by_point(change[training])),
+        tolerance_mm=np.sqrt(
+            discrepancy**2 + slow**2 + (slope * rms_by_point(change[training])) ** 2
+        ),
     )
 
 

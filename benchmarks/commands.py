@@ -1,6 +1,7 @@
 """The sub-commands of `surgisoft benchmark`: long studies whose results are committed."""
 
 import datetime
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -104,6 +105,51 @@ def diagnosis(
     if images:
         print(f"wrote {draw(outcomes, images)}")
     _show("Diagnosis results", command, markdown(outcomes), output)
+
+
+@app.command()
+def decision(
+    cases: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SOURCE=FOLDER...",
+            help="Further sources of cases: folders with recordings before and after a change.",
+        ),
+    ] = None,
+    robots: Annotated[
+        str, typer.Option(help="Seeds of the own rig's robots, with commas.")
+    ] = "200,201,202,203,204,205",
+    undertrained: Annotated[
+        str, typer.Option(help="Those among them with an undertrained model too.")
+    ] = "200,201,203",
+    count: Annotated[
+        int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
+    ] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    work: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of models and of each case's evidence."),
+    ] = Path("runs/benchmark-decision"),
+    asset: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the decision fitted to all cases to this file."),
+    ] = None,
+    output: Output = None,
+) -> None:
+    """Fit the decision of `diagnose` to cases of several sources, and judge each left out."""
+    from benchmarks.decision import own_rig
+    from benchmarks.decision.study import run
+    from benchmarks.decision.table import markdown
+
+    check_folder(work)
+    plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
+    with progress("decision") as report:
+        some, values = run(plan, count, seed, cases or [], work, processes, report)
+    if asset:
+        write_atomically(asset, json.dumps(values, indent=1) + "\n")
+        print(f"wrote {asset}")
+    _show("Decision results", values["command"], markdown(some, values), output)
 
 
 @app.command("setup-faults")

@@ -51,7 +51,12 @@ PAIRS = (
     ("misalignment", "gain_mismatch"),
 )
 """Pairs that are hidden at once."""
-EXCITATIONS = {"poor": ("ramps", 3000), "medium": ("mixed", 6000), "rich": ("mixed", 12000)}
+EXCITATIONS = {
+    "short": ("mixed", 1500),
+    "poor": ("ramps", 3000),
+    "medium": ("mixed", 6000),
+    "rich": ("mixed", 12000),
+}
 """Name -> protocol and samples at 20 Hz."""
 
 

@@ -1,10 +1,10 @@
 """Cases with injected effects: which, how large, on which recordings; and the folders they fill.
 
-    FOLDER/ROBOT/before/before.parquet     recordings without injection, for the fit
-    FOLDER/ROBOT/model/                    the arm model that was fitted to them
-    FOLDER/ROBOT/robot.json                the rod's error, the model's validated error, the noise
-    FOLDER/ROBOT/CASE/after/after.parquet  other rows of the robot's recordings, with injection
-    FOLDER/ROBOT/CASE/truth.json           what was injected
+    FOLDER/robots/ROBOT/before/*.parquet  recordings without injection, for the fit
+    FOLDER/robots/ROBOT/model/            the arm model that was fitted to them
+    FOLDER/robots/ROBOT/robot.json        the rod's error, the model's validated error, the noise
+    FOLDER/cases/CASE/after/*.parquet     other rows of the robot's recordings, with injection
+    FOLDER/cases/CASE/truth.json          what was injected
 
 A case is drawn from its seed, its robot and its number only; no diagnosis is looked at.
 """
@@ -132,7 +132,7 @@ class Case:
     def name(self) -> str:
         """Name of the case's folder."""
         what = "-".join(self.effects) or "clean"
-        return f"{self.number:03d}-{what}" + ("-same" if self.same_rows else "")
+        return f"{self.robot}-{self.number:03d}-{what}" + ("-same" if self.same_rows else "")
 
 
 def cases_of(name: str, seed: int) -> list[Case]:
@@ -332,7 +332,7 @@ def make_robot(name: str, data: Path, folder: Path, seed: int, tell: Progress) -
     plan, robot = cases_of(name, seed), ROBOTS[name]
     before = _recordings(robot.before, data, "before")
     after = [_clocked(recording) for recording in _recordings(robot.after, data, "after")]
-    place = folder / name
+    place = folder / "robots" / name
     model = fitted(before, FitOptions(), "measured", Cache(folder / "fits"), tell)
     save_model(model, place / "model", {}, force=True)
     bench = bench_of(before, after)
@@ -354,7 +354,7 @@ def make_robot(name: str, data: Path, folder: Path, seed: int, tell: Progress) -
     made, left_out = 0, []
     for done, case in enumerate(plan):
         tell(done, len(plan), case.name)
-        if make_case(case, bench, validated, noise, place / case.name, seed):
+        if make_case(case, bench, validated, noise, folder / "cases" / case.name, seed):
             made += 1
         else:
             left_out.append(case.name)

@@ -1,12 +1,12 @@
 """Diagnoses of case folders: one model for each robot, one answer for each case.
 
-A case folder holds `truth.json` and `after/` with recordings; the folder of its robot holds
-`before/`, and `model/` where it was fitted already. The robot's folder is the next one above the
-case, or the one of its name below the folder of all cases.
+FOLDER/robots/ROBOT/before/*.parquet  recordings of the unchanged robot
+FOLDER/robots/ROBOT/model/            the model that was fitted to them; made where it is absent
+FOLDER/cases/CASE/after/*.parquet     recordings after the change
+FOLDER/cases/CASE/truth.json          what changed, and the name of the robot
 """
 
 import json
-import time
 from collections.abc import Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
@@ -15,7 +15,16 @@ from pathlib import Path
 from benchmarks.cache import Cache
 from benchmarks.injected.laws import UNKNOWN
 from benchmarks.real.entries import FitOptions
-from benchmarks.real.study import CLAIMED, NAMING, Answer, answer_of, ask, fitted, misleads, right
+from benchmarks.real.study import (
+    CLAIMED,
+    CLAIMING,
+    NAMING,
+    Answer,
+    asked,
+    fitted,
+    misleads,
+    right,
+)
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings import load_recordings
@@ -56,22 +65,20 @@ class Judged:
 def find_cases(folder: Path) -> list[CaseFolder]:
     """All cases below a folder, in order of their names."""
     found = []
-    for file in sorted(folder.rglob("truth.json")):
+    for file in sorted((folder / "cases").glob("*/truth.json")):
         try:
             about = json.loads(file.read_text())
             truth, name = tuple(about["truth"]), str(about["robot"])
             hidden = tuple(str(each["effect"]) for each in about["hidden"])
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"{file}: not the truth of a case ({error!r})") from None
-        above = [parent for parent in file.parents[1:] if parent.is_relative_to(folder)]
-        homes = [*above, folder / name, folder / "robots" / name]
-        robot = next((home for home in homes if (home / "before").is_dir()), None)
-        if robot is None:
-            raise InputError(f"{file}: no folder 'before' of the robot '{name}' below {folder}")
+        robot = folder / "robots" / name
+        if not (robot / "before").is_dir():
+            raise InputError(f"{file}: robot '{name}', expected recordings in {robot / 'before'}")
         size = float(about.get("size", 0.0))
         found.append(CaseFolder(file.parent, robot, truth, hidden, size))
     if not found:
-        raise InputError(f"{folder}: no truth.json below this folder, expected folders of cases")
+        raise InputError(f"{folder}: no cases/*/truth.json in this folder, expected cases")
     return found
 
 
@@ -92,9 +99,7 @@ def judge(case: CaseFolder) -> Judged:
     model = load_model(case.robot / "model")
     before = load_recordings(case.robot / "before", lambda text: None)
     after = load_recordings(case.place / "after", lambda text: None)
-    begin = time.process_time()
-    found = ask(model, after, before)
-    return Judged(case, answer_of(model, found, time.process_time() - begin))
+    return Judged(case, asked(model, after, before))
 
 
 def run(cases: Sequence[CaseFolder], processes: int, report: Progress) -> list[Judged]:
@@ -129,7 +134,7 @@ def markdown(judged: Sequence[Judged]) -> str:
         ("named alone or in a set of two", _right(single), len(single), ".90"),
         ("two effects, both named", _right(pairs), len(pairs), ".85"),
         ("unknown called unknown", _right(strange), len(strange), ".80"),
-        ("named where nothing changed", _naming(clean), len(clean), ".02"),
+        ("named where nothing changed", _claiming(clean), len(clean), ".02"),
         (f"confidence >= {SURE} and right", _right(sure), len(sure), ".97"),
         (
             f"wrong name with confidence >= {CLAIMED}",
@@ -156,8 +161,8 @@ def _right(some: Sequence[Judged]) -> int:
     return sum(right(j.answer, j.case.truth) for j in some)
 
 
-def _naming(some: Sequence[Judged]) -> int:
-    return sum(j.answer.kind in NAMING for j in some)
+def _claiming(some: Sequence[Judged]) -> int:
+    return sum(j.answer.kind in CLAIMING for j in some)
 
 
 def to_json(judged: Sequence[Judged]) -> dict:

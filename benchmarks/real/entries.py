@@ -41,6 +41,10 @@ class Source:
 
     def checked(self, where: Where) -> "Source":
         """The table itself; raises InputError for a part that is empty."""
+        for number, file in enumerate(self.files):
+            if not file or Path(file).is_absolute():
+                place = where / "files" / number
+                raise place.error(f"got text '{file}'", "a path relative to the data folder")
         begin, end = self.part
         if not 0.0 <= begin < end <= 1.0:
             raise (where / "part").error(
@@ -157,11 +161,14 @@ def files_of(source: Source, data: Path) -> list[Path]:
     """The files of a source; raises InputError that names the first absent one."""
     found: list[Path] = []
     for pattern in source.files:
-        matches = sorted(data.glob(pattern))
+        try:
+            matches = sorted(data.glob(pattern))
+        except ValueError as error:
+            raise InputError(f"{pattern}: not a pattern of files ({error})") from None
         if not matches:
             raise InputError(f"{pattern}: no such file in {data}, expected the entry's recordings")
         found += matches
-    return found
+    return list(dict.fromkeys(found))
 
 
 def recordings_of(source: Source, data: Path, name: str) -> list[Recording]:

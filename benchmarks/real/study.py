@@ -22,6 +22,10 @@ from surgisoft.surrogate.model import ArmModel
 
 NAMING = ("identified", "several", "ambiguous")
 """Kinds of verdicts that name effects."""
+CLAIMING = (*NAMING, SETUP)
+"""Kinds of verdicts that claim to know what changed."""
+REFUSED = "refused"
+"""Kind of an answer where `diagnose` ended with an error; its line is the sentence."""
 CLAIMED = 0.8
 """Confidence from which a wrong name misleads (goal of the benchmark)."""
 MOST_NAMES = 2
@@ -93,10 +97,13 @@ def right(answer: Answer, truth: Sequence[str]) -> bool:
 
 
 def misleads(answer: Answer, truth: Sequence[str]) -> bool:
-    """Whether a wrong name stands first with a confidence that claims to be right."""
-    if answer.kind not in NAMING:
+    """Whether a wrong name stands first with a confidence that claims to be right.
+
+    A fault of the set-up is claimed as proven, without a confidence.
+    """
+    if answer.kind not in CLAIMING or answer.names[0] in truth:
         return False
-    return answer.names[0] not in truth and answer.confidence >= CLAIMED
+    return answer.kind == SETUP or answer.confidence >= CLAIMED
 
 
 def digest_of(recordings: Sequence[Recording], options: FitOptions, actuation: str) -> str:
@@ -145,8 +152,8 @@ Ask = Callable[[ArmModel, Sequence[Recording], Sequence[Recording] | None], Diag
 def ask(
     model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
 ) -> Diagnosis:
-    """The diagnosis of `surgisoft diagnose MODEL AFTER --reference BEFORE`."""
-    return diagnose(model, after, reference=before)
+    """The diagnosis of `surgisoft diagnose MODEL AFTER --before BEFORE`."""
+    return diagnose(model, after, before=before)
 
 
 def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
@@ -168,6 +175,20 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
     )
 
 
+def asked(
+    model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
+) -> Answer:
+    """The answer of a diagnosis, or why it was refused."""
+    begin = time.process_time()
+    try:
+        found = ask(model, after, before)
+    except InputError as error:
+        nan, seconds = float("nan"), time.process_time() - begin
+        known = model.validation.rmse_mm
+        return Answer(REFUSED, (), 0.0, (), str(error), nan, nan, nan, known, seconds)
+    return answer_of(model, found, time.process_time() - begin)
+
+
 def run_entry(entry: Entry, data: Path, cache: Cache, tell: Progress) -> Outcome:
     """Import, fit, diagnose and amend for one entry; skipped where its files are absent."""
     try:
@@ -177,9 +198,9 @@ def run_entry(entry: Entry, data: Path, cache: Cache, tell: Progress) -> Outcome
         return Outcome(entry, skipped=str(error))
     model = fitted(before, entry.fit, entry.actuation, cache, tell)
     tell(1, 1, "diagnose")
-    begin = time.process_time()
-    found = ask(model, after, before if entry.after else None)
-    answer = answer_of(model, found, time.process_time() - begin)
+    answer = asked(model, after, before if entry.after else None)
+    if answer.kind == REFUSED:
+        return Outcome(entry, answer=answer)
     tell(1, 1, "amend")
     catalogue = [name for name in entry.truth if name not in (UNKNOWN, SETUP)]
     named = answer.names if answer.kind in NAMING else ()

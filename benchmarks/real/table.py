@@ -1,8 +1,9 @@
 """Tables of the benchmark `real` as Markdown."""
 
+import math
 from collections.abc import Sequence
 
-from benchmarks.real.study import CLAIMED, MOST_NAMES, NAMING, Outcome
+from benchmarks.real.study import CLAIMED, CLAIMING, MOST_NAMES, NAMING, Outcome
 
 HEADER = (
     "| entry | change | truth | verdict | names | conf. | truth named | error mm | amended mm "
@@ -47,10 +48,10 @@ def row_of(outcome: Outcome) -> str:
         joint.join(answer.names) if answer.kind in NAMING else "",
         f"{answer.confidence:.2f}",
         "yes" if outcome.named else "no",
-        f"{answer.before_mm:.2f}",
+        _mm(answer.before_mm),
         _mm(outcome.amended_mm),
         _mm(outcome.oracle_mm),
-        f"{answer.best_mm:.2f}",
+        _mm(answer.best_mm),
         f"{answer.validated_mm:.2f}",
         f"{answer.seconds:.0f}",
     ]
@@ -58,7 +59,7 @@ def row_of(outcome: Outcome) -> str:
 
 
 def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:.2f}"
 
 
 def summary(ran: Sequence[Outcome]) -> list[str]:
@@ -78,10 +79,10 @@ def summary(ran: Sequence[Outcome]) -> list[str]:
         f"| wrong name with confidence >= {CLAIMED} | {sum(o.misled for o in ran)} of {len(ran)} "
         "| 0 |",
         f"| named where nothing changed | {sum(_names(o) for o in called)} of {len(clean)} | 0 |",
-        f"| called unknown or set-up where nothing changed | "
+        f"| called unknown where nothing changed | "
         f"{sum(not _names(o) for o in called)} of {len(clean)} | |",
     ]
 
 
 def _names(outcome: Outcome) -> bool:
-    return outcome.answer is not None and outcome.answer.kind in NAMING
+    return outcome.answer is not None and outcome.answer.kind in CLAIMING

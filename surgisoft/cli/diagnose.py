@@ -135,18 +135,9 @@ def diagnose(
         _next_after_setup(found.setup, model, data, apply)
     elif apply:
         print(f"nothing to mend: {apply} was not written")
-    if found.verdict.kind == "ambiguous":
-        between = " ".join(found.verdict.effects)
-        command = f"surgisoft next-experiment {model} {data} --between {between} -o SCHEDULE.csv"
-        print(f"next: {with_effect_files(command)}")
-    elif found.verdict.kind in ("identified", "several"):
-        effects = " ".join(found.verdict.effects)
-        command = f"surgisoft amend {model} --effect {effects} --data {data}"
-        if before:
-            command += f" --before {' '.join(map(str, before))}"
-        command += " -o NEW"
-        if found.refit is not None and found.refit.winner is not None:
-            command += " --refit always"
+    if found.next_command:
+        earlier = f" --before {' '.join(map(str, before))}" if before else ""
+        command = found.next_command.format(model=model, data=data, before=earlier)
         print(f"next: {with_effect_files(command)}")
 
 
@@ -195,6 +186,8 @@ def _show(found) -> None:
             f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "
             f"{100 * row.gain_unique:6.1f}% {row.heldout_rmse_mm:10.4f} [{low:.4f}, {high:.4f}] mm"
         )
+    for each in found.not_testable:
+        print(f"not testable: {each.effect}: {each.reason}")
     if found.refit is not None:
         _show_refit(found.refit)
     if found.next_experiment:

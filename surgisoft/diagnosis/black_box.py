@@ -18,13 +18,14 @@ from surgisoft.diagnosis.cross_validation import (
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import sign_flip_p_values
 
-SIZES = (0.3, 0.05)
-"""Sizes of the black box's features, beside those of the model discrepancy, that are tried."""
-FREE_SIZE = 1.0
-"""Size of the features of the free black box."""
-FREE_ROOMS = (1.0, 3.0)
-"""Factors on the size of the error, where that is larger than the validated one, that the free
-black box may reach: nothing holds it to the validated size."""
+FEATURE_SCALES = (0.3, 0.05)
+"""Scales of the black box's features relative to those of the model discrepancy (dimensionless),
+that are tried: a small scale is a strong ridge."""
+FREE_SCALE = 1.0
+"""Scale of the features of the free black box."""
+FREE_ERROR_FACTORS = (1.0, 3.0)
+"""Factors (dimensionless) on the size of the whole error that the free black box may reach, where
+the error is larger than the validated one: nothing holds it to the validated size."""
 MOST = 200
 """Most features of the black box beside those of the model discrepancy."""
 
@@ -38,6 +39,9 @@ class BlackBox:
     validated size as it is beside every effect: what effects are compared with."""
     free_losses: np.ndarray
     """(B,) the least held-out sum of squared distances, the learner held to no size."""
+    static_losses: np.ndarray
+    """(B,) the least that a function of actuation and direction leaves, held to no size: what the
+    free black box reaches without memory."""
     p_value: float
     """Probability of such a gain over the model discrepancy alone without a cause."""
 
@@ -54,23 +58,24 @@ def black_box(problem: Problem) -> BlackBox:
     wide = principal(np.concatenate([inputs, products], axis=1), MOST)
     static = static_features(problem.pressure, problem.direction)
     beyond = problem.rmse_mm / max(float(np.sqrt(np.mean(problem.discrepancy_mm**2))), 1e-12)
-    rooms = tuple(ROOM * room * max(1.0, beyond) for room in FREE_ROOMS)
+    rooms = tuple(ROOM * factor * max(1.0, beyond) for factor in FREE_ERROR_FACTORS)
     null = cross_validation_of(problem)
 
-    def learnt(size: float, rooms: tuple[float, ...]) -> list[np.ndarray]:
-        """Held-out losses (B,) with features of one size at each ridge."""
-        both = np.concatenate([static, size * wide], axis=1)
+    def learnt(scale: float, rooms: tuple[float, ...]) -> list[np.ndarray]:
+        """Held-out losses (B,) with features of one scale at each ridge; 0: static ones alone."""
+        both = np.concatenate([static, scale * wide], axis=1) if scale else static
         return list(cross_validation_of(problem, features=both, rooms=rooms).level_losses())
 
     tried = [null.losses()]
-    for size in SIZES:
-        tried += learnt(size, (ROOM,))
-    free = tried + learnt(FREE_SIZE, rooms)
+    for scale in FEATURE_SCALES:
+        tried += learnt(scale, (ROOM,))
+    memoryless = [tried[0], *learnt(0.0, rooms)]
+    free = [*tried, *memoryless, *learnt(FREE_SCALE, rooms)]
     best = min(tried, key=np.sum)
     floor = null.counts * problem.floor_mm**2
     gain = np.log((tried[0] + floor) / (best + floor))[None]
     chance = float(sign_flip_p_values(problem.by_motion(gain))[0]) if gain.any() else 1.0
-    return BlackBox(best, min(free, key=np.sum), chance)
+    return BlackBox(best, min(free, key=np.sum), min(memoryless, key=np.sum), chance)
 
 
 def principal(wide: np.ndarray, most: int) -> np.ndarray:

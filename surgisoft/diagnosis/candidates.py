@@ -143,7 +143,7 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
             fresh = hypothesis.further(facts, points)
         for effect in fresh:
             sensitivities = sensitivities_of(problem, signal, effect)
-            answer.append(Candidate(name, copy.deepcopy(effect), sensitivities))
+            answer.append(Candidate(name, effect, sensitivities))
     return [
         c
         for c in answer

@@ -29,10 +29,12 @@ from surgisoft.diagnosis.residuals import (
 from surgisoft.diagnosis.selection import BestAchievable, best_achievable, select
 from surgisoft.diagnosis.setup import find_setup_faults
 from surgisoft.diagnosis.statistics import block_interval, block_sums
+from surgisoft.diagnosis.testability import testable
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -255,7 +257,8 @@ def achievable(problem: Problem) -> BestAchievable | None:
         return None
     selected = None
     if not problem.model.remembers:
-        selected = select(problem, candidates(problem), lambda text: None)
+        some, _ = testable(problem, candidates(problem), list(known_effects()))
+        selected = select(problem, some, lambda text: None)
     return best_achievable(problem, black_box(problem), selected)
 
 

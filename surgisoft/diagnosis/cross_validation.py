@@ -174,6 +174,8 @@ class CrossValidation:
     """(L, folds, 1 + K, 1 + K) products of them over the fitted rows, static part out."""
     held_out: np.ndarray
     """(L, B, 1 + K, 1 + K) the same of what the static part leaves on each held-out block."""
+    turned: list[np.ndarray]
+    """For each fold (F, n, 3, 1 + K) products of the static part's basis and `fields`."""
     cache: dict = field(default_factory=dict)
     """Held-out sums of squares and amplitudes by sensitivities."""
 
@@ -186,21 +188,19 @@ class CrossValidation:
         turned = split.turned(both, known)
         grams, held_out = _products(split, both, turned, both, turned)
         grams[:, :, 0, 0] += np.square(known, dtype=float).sum()
-        return cls(split, both, grams, held_out)
+        return cls(split, both, grams, held_out, turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
         """The same with further sensitivities (rows, n, 3, K') behind those that it has."""
         more = _masked(self.split, sensitivities)
         both = np.concatenate([self.fields, more], axis=3)
         turned = self.split.turned(more)
-        known = self.split.residual[self.split.rows :]
-        old = self.split.turned(self.fields, known)
-        whole = [np.concatenate(pair, axis=3) for pair in zip(old, turned, strict=True)]
+        whole = [np.concatenate(pair, axis=3) for pair in zip(self.turned, turned, strict=True)]
         beside = _products(self.split, both, whole, more, turned)
         grams, held_out = (
             _bordered(*pair) for pair in zip((self.grams, self.held_out), beside, strict=True)
         )
-        return CrossValidation(self.split, both, grams, held_out, dict(self.cache))
+        return CrossValidation(self.split, both, grams, held_out, whole, dict(self.cache))
 
     def level_losses(self) -> np.ndarray:
         """(L, B) held-out sum of squared distances, mm^2, of the features alone at each ridge."""

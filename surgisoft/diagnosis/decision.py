@@ -1,20 +1,36 @@
-"""The decision of a diagnosis: evidence in, kind of result and confidence out.
+"""The decision of a diagnosis: evidence in, calibrated probabilities and a result out.
 
-`evidence_of` turns what model selection found into numbers (`Evidence`). `decide` turns these
-numbers alone into a `Decision`. Another decision, such as a fitted classifier, replaces `decide`
-and nothing else.
+Five logistic models, fitted together on cases of several sources (`benchmarks/decision`), give the
+probabilities:
+
+- `missing`: something is missing that acts on the arm, in the list of effects or not;
+- `known`: what is missing is in the list, given that something is;
+- `first`: which effect of the list it is, given that it is in the list: a conditional logit over
+  all effects (McFadden 1974), P(e) proportional to exp(w . x_e);
+- `two`: the two proposed effects are both missing, given that what is missing is in the list;
+- `network`: the network is off, undertrained or that of another arm, given that no effect of the
+  list is missing.
+
+So P(e) = P(missing) P(known) P(e | known). Every weight has a fixed sign: more evidence for a
+statement never makes it less probable. The result is the one whose worth to its reader, weighed
+with these probabilities, is largest (`criteria.Worth`; Savage 1954); "cannot tell" is worth 0.
+Weights, sources and hashes stand in `assets/decision/decision.json`.
 """
 
+import hashlib
+import json
 import math
-from dataclasses import asdict, dataclass
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from surgisoft.diagnosis.criteria import CRITERIA, Calibration, Criteria, DecisionCriteria
-from surgisoft.diagnosis.selection import Findings
-from surgisoft.diagnosis.statistics import studentised, win_shares
-from surgisoft.surrogate.effects import hypothesis_of, known_effects
+from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
+from surgisoft.diagnosis.evidence import EffectEvidence, Evidence
+from surgisoft.errors import InputError
 
 Kind = Literal[
     "identified",
@@ -23,88 +39,510 @@ Kind = Literal[
     "nothing_missing",
     "unknown_effect",
     "surrogate_undertrained",
+    "cannot_tell",
     "setup",
 ]
+Reason = Literal["network", "learned", "refit", "few_data", "schedule"]
+"""Why a diagnosis cannot tell: the network is not that of this arm; the network has learned part of
+what is missing; fitted together with the network no effect does better than the network alone;
+there are too few motions; the schedule does not tell effects apart."""
 
-MOST_RUNNER_UP = 1.2
-"""Largest gain of the runner-up, as a share of the first's, that the calibration was fitted to."""
+SCHEMA = 1
+"""Version of the asset's format and of the features."""
+ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
+"""The fitted decision that is in force."""
+FEW_MOTIONS = 24
+"""Fewer different motions than this, two minutes of five seconds each, are few data."""
+LEARNED = 0.1
+"""Share of what can be explained that memory must explain beyond any static function before the
+network is said to have learned part of what is missing."""
+LEAST_LEFT = 0.02
+"""Share of what can be explained that no proposal is taken to fall below: a fiftieth is within what
+the noise floor is known."""
+FORM_SHARE = 0.02
+"""Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
+changes differ by less are not told apart by how sure the blocks are."""
+MOSTLY_STATIC = 0.8
+"""Share of what a black box with memory explains that a static function must explain before the
+network alone is said to be off."""
+
+
+# Features -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """The numbers that a diagnosis is decided from.
+class Feature:
+    """One input of a fitted model: a number of order 1 with the sign of its weight."""
 
-    Gains are shares of the held-out squared error above the noise floor, log gains means over
-    blocks of log(error before / after), sizes errors above the noise floor in units of the model
-    discrepancy.
+    name: str
+    """Its name in the asset."""
+    sign: int
+    """+1: more of it makes the statement more probable; -1: less probable."""
+    of: Callable[..., float]
+    """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
+    meaning: str
+    """What it is."""
+
+
+def _between(value: float, low: float, high: float) -> float:
+    return float(min(max(value, low), high))
+
+
+def _log(value: float, low: float, high: float) -> float:
+    return _between(math.log(max(value, 1e-9)), low, high)
+
+
+def _z(value: float) -> float:
+    return _between(value, 0.0, 3.0) / 3.0
+
+
+def _best(evidence: Evidence) -> EffectEvidence | None:
+    return evidence.effects[0] if evidence.effects else None
+
+
+def _most(evidence: Evidence, name: str, start: float) -> float:
+    """Largest value of a number of the proposals."""
+    return max([start, *(float(getattr(each, name)) for each in evidence.proposals)])
+
+
+def _explained(evidence: Evidence) -> float:
+    """Share of what can be explained that the best proposal explains."""
+    return _between(_most(evidence, "gain", 0.0), 0.0, 1.0)
+
+
+def _unexplained(evidence: Evidence) -> float:
+    """-log of the share of what can be explained that the best proposal leaves, over 2."""
+    return -0.5 * math.log(1.0 - _explained(evidence) + LEAST_LEFT)
+
+
+def _left_size(evidence: Evidence) -> float:
+    """Error above the floor that the best proposal leaves, in units of the discrepancy."""
+    some = [each.left_size for each in evidence.proposals]
+    return min([evidence.size_beside_discrepancy, *some])
+
+
+def _box_better(evidence: Evidence) -> float:
+    """Log gain of the black box over the best proposal."""
+    some = [each.left_log_box for each in evidence.proposals]
+    return _between(min([evidence.box_log_gain, *some]), -1.0, 1.0)
+
+
+def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
+    """Geometric mean of gain and log gain of relaxed forms, each at most 1; 0 where either falls.
+
+    Few blocks that fall by much and many that fall by little both count.
     """
+    if gain is None or log_gain is None:
+        return 0.0
+    return math.sqrt(_between(gain, 0.0, 1.0) * _between(log_gain, 0.0, 1.0))
 
-    before_over_floor: float
-    """RMS error of the model over the noise floor."""
-    static_share: float
-    """Share of the squared error above the floor that the model discrepancy alone explains."""
-    static_size: float
-    """Most likely size of a static error, without any effect."""
-    static_size_after: float
-    """Most likely size of a static error, with the named effects."""
-    gain: float
-    """Gain of the first named effect; of the best one where none is named."""
-    log_gain: float
-    """Log gain of that effect."""
-    p_value: float
-    """Family-wise p-value of that effect."""
-    runner_gain: float
-    """Gain alone of the best other effect."""
-    margin: float
-    """Studentised mean difference of the log gains of the two."""
-    first_share: float
-    """Share of bootstrap samples in which the first beats the other."""
-    unique: float
-    """Gain that comes back when the first is left out of all effects together."""
-    explained_above_floor: float
-    """Gain of the named effects together."""
-    box_share: float
-    """Gain of the black box, the model discrepancy held to its validated size."""
-    box_p: float
-    """p-value of the black box over the model discrepancy."""
-    box_log_gain: float
-    """Log gain of the black box over the named effects."""
-    left_size: float
-    """Size of the error that the named effects leave."""
-    loose_share: float
-    """Gain of the relaxed forms beyond the named effects."""
-    loose_log_gain: float
-    """Log gain of the relaxed forms beyond the named effects."""
-    loose_p: float
-    """p-value of the relaxed forms."""
-    motions: int
-    """Number of different motions."""
-    named: int
-    """Number of named effects."""
-    rivals: int
-    """Number of competing effects."""
-    steps: tuple[tuple[str, float, float, float], ...]
-    """Effect, gain, log gain and p-value of each named effect and of the two next best."""
-    blocks: int
-    """Number of blocks of time."""
-    competing: tuple[str, ...] = ()
-    """The competing effects."""
-    form_wrong: bool = False
-    """Whether the relaxed forms show that the named effects only mimic what is missing."""
+
+def _most_lack_of_fit(evidence: Evidence) -> float:
+    some = [lack_of_fit(each.form_gain, each.form_log_gain) for each in evidence.proposals]
+    return max(some, default=0.0)
+
+
+def _exact_left(evidence: Evidence) -> float:
+    """Log size of what an effect of exact form leaves where it explains best; 0 for others."""
+    best = _best(evidence)
+    if best is None or not best.exact_form or not evidence.proposals:
+        return 0.0
+    return _log(_left_size(evidence), 0.0, 2.0)
+
+
+def _last(evidence: Evidence, name: str) -> float:
+    """A number of the proposal of two effects; 0 where there is none."""
+    pair = [each for each in evidence.proposals if len(each.effects) == 2]
+    return float(getattr(pair[0], name)) if pair else 0.0
+
+
+def _instead(evidence: Evidence, name: str) -> float:
+    """The least of a number of what would stand in the place of one of two effects."""
+    pair = [each for each in evidence.proposals if len(each.effects) == 2]
+    return min(getattr(pair[0], name), default=3.0) if pair else 0.0
+
+
+def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
+    """Log of what an effect leaves over what the best one leaves, over 2, as shares.
+
+    What the form of the right effect gets wrong is added to both.
+    """
+    own, best = (1.0 - min(one.gain, 1.0) + FORM_SHARE for one in (effect, evidence.effects[0]))
+    return _between(0.5 * math.log(own / best), -0.5, 2.0)
+
+
+def _margin(effect: EffectEvidence, evidence: Evidence) -> float:
+    """Margin of the best effect, in units of 3 standard errors.
+
+    No real effect has exactly the form of its model, so of two that do nearly the same the data
+    prefer one for what its form gets wrong, however sure the blocks are: the margin counts up to
+    the ratio of what the other effect cannot imitate to what the form gets wrong.
+    """
+    apart = math.sqrt(_between(1.0 - effect.collinear, 0.0, 1.0) / FORM_SHARE)
+    return _between(min(effect.margin, apart), -3.0, 6.0) / 3.0
+
+
+def _proposed(effect: EffectEvidence, evidence: Evidence) -> float:
+    """What the second of two effects explains, for either of them; 0 for others."""
+    own = any(effect.effect in each.effects for each in evidence.proposals[1:])
+    return own * _between(_last(evidence, "own_gain"), 0.0, 1.0)
+
+
+def _single_lack_of_fit(evidence: Evidence) -> float:
+    if not evidence.proposals:
+        return 0.0
+    one = evidence.proposals[0]
+    return lack_of_fit(one.form_gain, one.form_log_gain)
+
+
+MISSING = (
+    Feature(
+        "above_floor",
+        +1,
+        lambda e: _log(e.error_over_floor, 0.0, 2.0),
+        "log of the error over the noise floor",
+    ),
+    Feature(
+        "beside_discrepancy",
+        +1,
+        lambda e: _log(e.size_beside_discrepancy, -1.0, 2.0),
+        "log of the error that the model discrepancy leaves, over the validated error",
+    ),
+    Feature(
+        "effect_z",
+        +1,
+        lambda e: _z(e.effects[0].z) if e.effects else 0.0,
+        "normal quantile of the best effect's family-wise p-value",
+    ),
+    Feature(
+        "effect_log_gain",
+        +1,
+        lambda e: _between(e.effects[0].log_gain, 0.0, 1.0) if e.effects else 0.0,
+        "log gain of the best effect",
+    ),
+    Feature("explained", +1, _explained, "share of what can be explained by the best proposal"),
+    Feature(
+        "box_log_gain",
+        +1,
+        lambda e: _between(e.box_log_gain, 0.0, 1.0),
+        "log gain of the black box with memory over the model discrepancy",
+    ),
+    Feature("box_z", +1, lambda e: _z(e.box_z), "normal quantile of the black box's p-value"),
+    Feature(
+        "memory",
+        +1,
+        lambda e: _between(e.free_box - e.free_static, 0.0, 1.0),
+        "share that a black box with memory explains beyond any static function",
+    ),
+)
+KNOWN = (
+    Feature(
+        "explained",
+        +1,
+        _unexplained,
+        "-log of the share of what can be explained that the best proposal leaves",
+    ),
+    Feature(
+        "left_size",
+        -1,
+        lambda e: _log(_left_size(e), -1.0, 2.0),
+        "log of the error that the best proposal leaves, over the validated error",
+    ),
+    Feature("box_better", -1, _box_better, "log gain of the black box over the best proposal"),
+    Feature(
+        "lack_of_fit",
+        -1,
+        _most_lack_of_fit,
+        "what relaxed forms of a proposal explain besides (root of gain x log gain)",
+    ),
+    Feature(
+        "exact_left",
+        -1,
+        _exact_left,
+        "log size of what is left by an effect whose form is exact (frame, weight)",
+    ),
+    Feature(
+        "effect_z",
+        +1,
+        lambda e: _z(e.effects[0].z) if e.effects else 0.0,
+        "normal quantile of the best effect's family-wise p-value",
+    ),
+)
+FIRST = (
+    Feature(
+        "left",
+        -1,
+        _leaves_more,
+        "log of the share that the effect leaves over the share that the best one leaves",
+    ),
+    Feature(
+        "margin",
+        -1,
+        _margin,
+        "studentised difference of the log gains of the best effect and this one, at most what the "
+        "angle between their changes allows",
+    ),
+    Feature(
+        "gain", +1, lambda x, e: _between(x.gain, 0.0, 1.0), "share that the effect alone explains"
+    ),
+    Feature("z", +1, lambda x, e: _z(x.z), "normal quantile of its family-wise p-value"),
+    Feature(
+        "unique",
+        +1,
+        lambda x, e: _between(x.unique, 0.0, 1.0),
+        "share that returns when it is left out of all effects together",
+    ),
+    Feature(
+        "proposed",
+        +1,
+        _proposed,
+        "for one of the two proposed effects what the second explains beside the relaxed first",
+    ),
+    Feature(
+        "lack_of_fit",
+        -1,
+        lambda x, e: lack_of_fit(x.form_gain, x.form_log_gain),
+        "what its relaxed form explains besides",
+    ),
+    Feature(
+        "amplitudes",
+        -1,
+        lambda x, e: _log(x.amplitudes, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
+        "log of its number of amplitudes, where it explains about as much as the best",
+    ),
+    Feature(
+        "exact_left",
+        -1,
+        lambda x, e: (
+            _log(e.size_beside_discrepancy * math.exp(0.5 * x.left), 0.0, 2.0)
+            * _between(1.0 - x.gain, 0.0, 1.0)
+            * x.exact_form
+        ),
+        "size of what an effect of exact form leaves",
+    ),
+)
+TWO = (
+    Feature(
+        "better",
+        +1,
+        lambda e: _between(_last(e, "better"), 0.0, 2.0),
+        "log of what the best single effect leaves over what the two leave",
+    ),
+    Feature(
+        "last_z", +1, lambda e: _z(_last(e, "last_z")), "normal quantile of the second's p-value"
+    ),
+    Feature(
+        "last_log_gain",
+        +1,
+        lambda e: _between(_last(e, "last_log_gain"), 0.0, 1.0),
+        "log gain of the second on top of the first",
+    ),
+    Feature(
+        "own_gain",
+        +1,
+        lambda e: _between(_last(e, "own_gain"), 0.0, 1.0),
+        "share that the second explains beside the relaxed form of the first",
+    ),
+    Feature(
+        "own_z",
+        +1,
+        lambda e: _z(_last(e, "own_z")),
+        "normal quantile of the second's p-value there",
+    ),
+    Feature(
+        "own_log_gain",
+        +1,
+        lambda e: _between(_last(e, "own_log_gain"), 0.0, 1.0),
+        "log gain of the second there",
+    ),
+    Feature(
+        "instead_left",
+        +1,
+        lambda e: _between(_instead(e, "instead_left"), 0.0, 1.0),
+        "log of what is left with the best other effect in the place of one of the two",
+    ),
+    Feature(
+        "instead_margin",
+        +1,
+        lambda e: _between(_instead(e, "instead_margin"), 0.0, 6.0) / 3.0,
+        "studentised log gain of the two over it",
+    ),
+    Feature(
+        "explained",
+        +1,
+        lambda e: _between(_last(e, "gain"), 0.0, 1.0),
+        "share of what can be explained by the two",
+    ),
+    Feature(
+        "single_lack_of_fit",
+        +1,
+        _single_lack_of_fit,
+        "what the relaxed form of the best single effect explains besides",
+    ),
+)
+NETWORK = (
+    Feature(
+        "above_floor",
+        +1,
+        lambda e: _log(e.error_over_floor, 0.0, 3.0),
+        "log of the error over the noise floor",
+    ),
+    Feature(
+        "static",
+        +1,
+        lambda e: _between(e.free_static, 0.0, 1.0),
+        "share of what can be explained by any static function",
+    ),
+    Feature(
+        "over_validated",
+        +1,
+        lambda e: abs(_log(e.error_over_validated, -1.0, 2.0)),
+        "log of the error over the validated error, its absolute value",
+    ),
+    Feature(
+        "over_box",
+        +1,
+        lambda e: _log(e.error_over_box, 0.0, 3.0),
+        "log of the error over what a black box with memory reaches",
+    ),
+)
+FEATURES = {"missing": MISSING, "known": KNOWN, "first": FIRST, "two": TWO, "network": NETWORK}
+"""The features of each fitted model."""
+
+
+# Fitted models ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """A fitted logistic model, or conditional logit."""
+
+    weights: tuple[float, ...]
+    """One for each feature."""
+    constant: float = 0.0
+    """Log odds where all features are 0."""
+
+    def log_odds(self, features: np.ndarray) -> np.ndarray:
+        """(...) log odds of features (..., F)."""
+        return self.constant + np.asarray(features, float) @ np.asarray(self.weights)
+
+
+@dataclass(frozen=True)
+class DecisionModel:
+    """The fitted decision: a logistic model for each of `FEATURES`."""
+
+    models: dict[str, Logistic]
+    """The fitted models by name."""
+    about: dict[str, Any]
+    """Sources, hashes, command and date of the fit."""
+
+
+def content_hash(values: dict[str, Any]) -> str:
+    """SHA-256 of an asset's content but for its own hash."""
+    plain = {name: value for name, value in values.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def load_decision(path: Path = ASSET) -> DecisionModel:
+    """The fitted decision of a file; raises InputError for one that is damaged or of another
+    version."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as reason:
+        raise InputError(f"{path.name}: no fitted decision ({reason}); install again") from None
+    if not isinstance(values, dict) or values.get("schema") != SCHEMA:
+        found = values.get("schema") if isinstance(values, dict) else None
+        raise InputError(
+            f"{path.name}: a fitted decision of schema {found}, expected {SCHEMA}; fit it again"
+        )
+    if values.get("sha256") != content_hash(values):
+        raise InputError(f"{path.name}: the fitted decision does not match its hash; install again")
+    models = {}
+    for name, features in FEATURES.items():
+        one = values["models"].get(name, {})
+        expected = [feature.name for feature in features]
+        if list(one.get("weights", {})) != expected:
+            raise InputError(
+                f"{path.name}: model '{name}' has the features {', '.join(one.get('weights', {}))},"
+                f" expected {', '.join(expected)}; fit it again"
+            )
+        models[name] = Logistic(tuple(one["weights"].values()), one["constant"])
+    about = {key: value for key, value in values.items() if key != "models"}
+    return DecisionModel(models, about)
+
+
+@lru_cache(maxsize=1)
+def fitted_decision() -> DecisionModel:
+    """The decision in force, read once."""
+    return load_decision()
+
+
+def features_of(name: str, evidence: Evidence) -> np.ndarray:
+    """(F,) features of a model; (E, F) for `first`, one row for each effect."""
+    some = FEATURES[name]
+    if name == "first":
+        rows = [[feature.of(each, evidence) for feature in some] for each in evidence.effects]
+        return np.array(rows, float).reshape(len(rows), len(some))
+    return np.array([feature.of(evidence) for feature in some], float)
+
+
+# Probabilities and decision -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Probabilities:
+    """Calibrated probabilities of what is true."""
+
+    nothing: float
+    """Nothing is missing."""
+    network: float
+    """The network is off, undertrained or of another arm, and no effect of the list is missing."""
+    unknown: float
+    """Something outside the list is missing."""
+    effects: dict[str, float]
+    """Each effect is missing, alone or as one of two, the most probable first."""
+    pair: float
+    """The two proposed effects are both missing."""
+    two: tuple[str, ...]
+    """The two proposed effects; empty where there are none."""
 
     @property
-    def effects(self) -> tuple[str, ...]:
-        """The named effects, in order."""
-        return tuple(step[0] for step in self.steps[: self.named])
+    def known(self) -> float:
+        """Some effect of the list is missing."""
+        return sum(self.effects.values())
 
-    @property
-    def further_gain(self) -> float:
-        """Gain of the next best effect on top of the named ones; 0 where there is none."""
-        return self.steps[self.named][1] if len(self.steps) > self.named else 0.0
 
-    def to_json(self) -> dict:
-        """Plain values."""
-        return asdict(self)
+def _sigmoid(odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-_between(odds, -500.0, 500.0)))
+
+
+def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Probabilities:
+    """The probabilities of what is true, from the evidence."""
+    model = model or fitted_decision()
+
+    def chance(name: str) -> float:
+        return _sigmoid(float(model.models[name].log_odds(features_of(name, evidence))))
+
+    missing = chance("missing")
+    known = chance("known") if evidence.effects else 0.0
+    network = chance("network")
+    share = np.zeros(0)
+    if evidence.effects:
+        odds = model.models["first"].log_odds(features_of("first", evidence))
+        share = np.exp(odds - odds.max())
+        share /= share.sum()
+    each = {one.effect: float(p) for one, p in zip(evidence.effects, share, strict=True)}
+    pair = [one.effects for one in evidence.proposals if len(one.effects) == 2]
+    both = chance("two") if pair else 0.0
+    ordered = sorted(each.items(), key=lambda item: -item[1])
+    return Probabilities(
+        nothing=(1.0 - missing) * (1.0 - network),
+        network=(1.0 - missing * known) * network,
+        unknown=missing * (1.0 - known) * (1.0 - network),
+        effects={name: missing * known * p for name, p in ordered},
+        pair=missing * known * both,
+        two=pair[0] if pair else (),
+    )
 
 
 @dataclass(frozen=True)
@@ -112,132 +550,83 @@ class Decision:
     """What the evidence amounts to."""
 
     kind: Kind
+    """Kind of the result."""
     effects: tuple[str, ...]
     """The effects that are named; the competing ones where they cannot be told apart."""
     confidence: float
-    """Calibrated chance that the first effect is missing, 0 to 1."""
+    """Calibrated probability that the statement is right, 0 to 1."""
+    probabilities: Probabilities
+    """All probabilities."""
+    reason: Reason | None = None
+    """Why it cannot be told; None for another kind."""
 
 
-def evidence_of(found: Findings) -> Evidence:
-    """The numbers that the findings of a diagnosis amount to."""
-    selection, problem = found.selection, found.problem
-    floor = selection.floor.sum()
-    raw = float(np.nansum(np.square(problem.residual)))
-    null = selection.losses()
-    after = selection.losses(found.chosen)
-    best = found.named[0] if found.named else (found.first[0] if found.first else None)
-    others = [s for s in found.first if best is not None and s.effect != best.effect]
-    runner = others[0] if others else None
-    margin, share = 0.0, 1.0
-    if best is not None and runner is not None:
-        pair = problem.by_motion(np.stack([-best.log_gain, -runner.log_gain]))
-        margin = float(studentised(pair[1:] - pair[:1])[0])
-        share = float(win_shares(pair)[0])
-    relaxed = found.relaxed
-    return Evidence(
-        before_over_floor=float(np.sqrt(raw / floor)),
-        static_share=float((raw - null.sum()) / max(raw - floor, 1e-9 * raw)),
-        static_size=found.static.before,
-        static_size_after=found.static.after,
-        gain=float(best.gain) if best else 0.0,
-        log_gain=float(best.log_gain.mean()) if best else 0.0,
-        p_value=float(best.p_value) if best else 1.0,
-        runner_gain=float(runner.gain) if runner else 0.0,
-        margin=margin,
-        first_share=share,
-        unique=float(found.unique.get(best.effect, 0.0)) if best else 0.0,
-        explained_above_floor=float((null.sum() - after.sum()) / selection.excess(null)),
-        box_share=float((null.sum() - found.box.losses.sum()) / selection.excess(null)),
-        box_p=found.box.p_value,
-        box_log_gain=float(selection.log_ratio(after, found.box.losses).mean()),
-        left_size=selection.size(after),
-        loose_share=relaxed.share if relaxed else 0.0,
-        loose_log_gain=relaxed.log_gain if relaxed else 0.0,
-        loose_p=relaxed.p_value if relaxed else 1.0,
-        motions=int(problem.motion.max()) + 1,
-        named=len(found.named),
-        rivals=len(found.competing),
-        steps=tuple(
-            (s.effect, float(s.gain), float(s.log_gain.mean()), float(s.p_value))
-            for s in (*found.named, *found.following[:2])
-        ),
-        blocks=len(selection.validation.counts),
-        competing=tuple(found.competing),
-        form_wrong=bool(found.named) and relaxed is not None and relaxed.wrong,
+def claimable(evidence: Evidence, claim: Claim = CLAIM) -> bool:
+    """Whether "nothing is missing" may be claimed at all.
+
+    The error must be near the noise floor or near what a black box with memory reaches, and must
+    not exceed the validated error by much.
+    """
+    near = (
+        evidence.error_over_floor <= claim.near_floor or evidence.error_over_box <= claim.near_box
     )
+    return near and evidence.error_over_validated <= claim.most_over_validated
 
 
-def decide(evidence: Evidence, criteria: Criteria = CRITERIA) -> Decision:
-    """The kind of result, the effects that it names and the confidence in the first of them."""
-    asked, calibration = criteria.decision, criteria.calibration
-    sure = confidence(evidence, calibration)
-    kind, effects = _kind_of(evidence, asked)
-    if kind == "identified" and sure < calibration.untenable:
-        kind, effects = unnamed(evidence, asked), ()
-    if kind == "unknown_effect":
-        sure = min(sure, calibration.nearest)
-    return Decision(kind, effects, sure)
+def decide(
+    evidence: Evidence,
+    model: DecisionModel | None = None,
+    worth: Worth = WORTH,
+    claim: Claim = CLAIM,
+) -> Decision:
+    """The result that is worth most to its reader, weighed with the fitted probabilities."""
+    chances = probabilities(evidence, model)
+    names = list(chances.effects)
+    known, pair = chances.known, chances.pair
+    tried: list[tuple[float, Kind, tuple[str, ...], float]] = []
+    both = pair / known if known and names[0] in chances.two else 0.0
+    whole = 1.0 - both * (1.0 - worth.first_of_pair)
+    if names:
+        first = chances.effects[names[0]]
+        value = first * whole + (1.0 - first) * worth.wrong_name
+        tried.append((value, "identified", (names[0],), first))
+    if len(names) > 1:
+        either = chances.effects[names[0]] + chances.effects[names[1]]
+        value = either * whole * worth.right_set + (1.0 - either) * worth.wrong_name
+        tried.append((value, "ambiguous", (names[0], names[1]), either))
+    if chances.two:
+        half = max(known - pair, 0.0)
+        value = pair + half * worth.half_pair + (1.0 - known) * worth.wrong_name
+        tried.append((value, "several", chances.two, pair))
+    unknown = chances.unknown + (1.0 - chances.unknown) * worth.wrong_unknown
+    tried.append((unknown, "unknown_effect", (), chances.unknown))
+    quiet = chances.nothing + chances.network
+    if claimable(evidence, claim):
+        value = quiet + (1.0 - quiet) * worth.wrong_nothing
+        tried.append((value, "nothing_missing", (), quiet))
+    off = chances.network if claimable(evidence, claim) else quiet
+    if _mostly_static(evidence):
+        value = off + (1.0 - off) * worth.wrong_network
+        tried.append((value, "surrogate_undertrained", (), off))
+    value, kind, effects, sure = max(tried, key=lambda each: each[0])
+    if value <= 0.0:
+        return Decision("cannot_tell", (), max(sure, 0.0), chances, reason_of(evidence, chances))
+    beyond = evidence.error_over_validated > claim.most_over_validated
+    if kind == "surrogate_undertrained" and beyond:
+        return Decision("cannot_tell", (), sure, chances, "network")
+    return Decision(kind, effects, sure, chances)
 
 
-def _kind_of(evidence: Evidence, asked: DecisionCriteria) -> tuple[Kind, tuple[str, ...]]:
-    names = evidence.effects
-    if not names:
-        return unnamed(evidence, asked), ()
-    beyond = evidence.left_size >= asked.least_size
-    if evidence.form_wrong or (beyond and _mimicked(evidence, asked)):
-        return "unknown_effect", ()
-    if evidence.competing and len(names) == 1:
-        return "ambiguous", (names[0], *evidence.competing)
-    return ("several" if len(names) > 1 else "identified"), names
+def _mostly_static(evidence: Evidence) -> bool:
+    """Whether what can be explained is a static function for the most part."""
+    return evidence.free_static >= MOSTLY_STATIC * evidence.free_box
 
 
-def unnamed(evidence: Evidence, asked: DecisionCriteria = CRITERIA.decision) -> Kind:
-    """The kind of a result that names no effect."""
-    over, left = evidence.before_over_floor, evidence.left_size
-    if over >= asked.above_floor and left >= asked.far_size:
-        return "unknown_effect"
-    if over >= asked.undertrained_over_floor:
-        box = evidence.box_share >= asked.box_share and _box_counts(evidence, asked)
-        static = evidence.static_size >= asked.discrepancy_size
-        if left >= asked.least_size and (box or static):
-            return "unknown_effect"
-        if evidence.static_share >= asked.undertrained_share:
-            return "surrogate_undertrained"
-    return "nothing_missing"
-
-
-def _mimicked(evidence: Evidence, asked: DecisionCriteria) -> bool:
-    """Whether the named effects explain too little, or a black box far more."""
-    explained = evidence.explained_above_floor
-    together = explained + max(evidence.further_gain, 0.0) * (1.0 - explained)
-    missed = evidence.box_share - explained
-    counts = _box_counts(evidence, asked)
-    if evidence.left_size >= asked.far_size:
-        exact = all(hypothesis_of(known_effects()[name]).exact_form for name in evidence.effects)
-        if together < asked.explained or (exact and explained < asked.explained_exactly):
-            return True
-    if together < asked.explained_beside_box and counts and missed >= asked.missed_share:
-        return True
-    better = missed >= asked.box_gain and evidence.box_log_gain >= asked.box_log_gain
-    return counts and better
-
-
-def _box_counts(evidence: Evidence, asked: DecisionCriteria) -> bool:
-    """Whether what a black box explains is more than chance and seen in enough motions."""
-    return evidence.box_p <= asked.box_p_value and evidence.motions >= asked.least_motions
-
-
-def confidence(evidence: Evidence, calibration: Calibration = CRITERIA.calibration) -> float:
-    """Calibrated chance that the first named effect is missing, 0 to 1; 0 where none is named."""
-    if not evidence.named:
-        return 0.0
-    runner_up = evidence.runner_gain / max(evidence.gain, 1e-6)
-    relaxed = max(evidence.loose_share, 0.0) * max(evidence.loose_log_gain, 0.0)
-    odds = (
-        calibration.constant
-        + calibration.runner_up * min(max(runner_up, 0.0), MOST_RUNNER_UP)
-        + calibration.relaxed * relaxed
-        + hypothesis_of(known_effects()[evidence.effects[0]]).mimic_log_odds
-    )
-    chance = 1.0 / (1.0 + math.exp(-odds))
-    return min(chance, calibration.ambiguous) if evidence.rivals else chance
+def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
+    """Why a diagnosis cannot tell."""
+    if _mostly_static(evidence) and chances.network + chances.nothing >= chances.known:
+        return "network"
+    memory = evidence.free_box - evidence.free_static
+    if evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
+        return "learned"
+    return "few_data" if evidence.motions < FEW_MOTIONS else "schedule"

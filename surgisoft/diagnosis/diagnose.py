@@ -8,7 +8,8 @@ the diagnosis ends there. Else it is a system identification of a grey-box model
    the prediction to first order (`candidates`).
 3. Model selection: held-out errors of every effect, the model discrepancy always beside it; effects
    are named one by one while they are beyond chance and large enough (`selection`).
-4. Decision: what the evidence amounts to, and how sure that is (`decision`).
+4. Decision: calibrated probabilities from the evidence, and the result that is worth most with
+   them (`evidence`, `decision`).
 5. Refit: where the error is large and no larger than the validated one, candidates are fitted
    together with the network, and held-out data decide (`refit`).
 6. Experiment design, where effects cannot be told apart (`design`).
@@ -19,12 +20,13 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.criteria import CRITERIA
+from surgisoft.diagnosis.criteria import CLAIM, SEARCH
 from surgisoft.diagnosis.data_quality import data_quality_warnings
-from surgisoft.diagnosis.decision import Evidence, Kind, decide, evidence_of, unnamed
+from surgisoft.diagnosis.decision import Decision, Kind, Probabilities, Reason, decide
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
+from surgisoft.diagnosis.evidence import Evidence, evidence_of
 from surgisoft.diagnosis.inputs import (
     Model,
     Recordings,
@@ -43,6 +45,7 @@ from surgisoft.diagnosis.selection import (
     rmse_interval,
 )
 from surgisoft.diagnosis.setup import SetupResult, find_setup_faults
+from surgisoft.diagnosis.testability import NotTestable, testable
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
@@ -52,8 +55,30 @@ from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
-MOST_RIVALS = CRITERIA.selection.most_competing
+MOST_RIVALS = SEARCH.most_refined
 """Most competing effects that an experiment is sought for."""
+
+WORTH_TELLING = 0.2
+"""Least probability of an effect that a check mentions though the result does not name it."""
+AS_GOOD = 1.64
+"""Studentised log gain of two effects over another pair below which the other does as well (5 %,
+one-sided)."""
+FITTED_STAGES = ("line", "material")
+"""Stages of effects that a network can be fitted together with."""
+MOST_FITTED = 3
+"""Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
+REASONS = {
+    "network": "a function of the actuation alone explains most of the error, more than the "
+    "model's validated error allows: the network does not describe this arm as it is, fit it anew",
+    "learned": "the error is no larger than the model's validated error, and a black box with "
+    "memory explains part of it that no static function does: the network was fitted to what is "
+    "missing and has learned part of it, fit it together with effects",
+    "few_data": "the recordings show too few different motions",
+    "refit": "fitted together with the network, no effect that it may imitate leaves significantly "
+    "less than the network alone",
+    "schedule": "several causes explain these recordings about as well, and none well enough",
+}
+"""Why a diagnosis cannot tell, in words."""
 
 Progress = Callable[[str], None]
 """Called with what is being done."""
@@ -64,11 +89,16 @@ class Verdict:
     """The result of a diagnosis in short."""
 
     kind: Kind
-    """One of the seven kinds of result."""
+    """One of the kinds of result."""
     effects: tuple[str, ...]
     """The missing effects, the surest first; all competing ones where they cannot be told apart."""
     sentence: str
     """The result in words."""
+    confidence: float = 0.0
+    """Calibrated probability that the statement is right: that the named effect is missing, one of
+    the set, both of two, nothing, or something unknown."""
+    reason: Reason | None = None
+    """Why it cannot be told; None for another kind."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +123,10 @@ class Ranked:
     confidence: float
     """Calibrated chance that it is missing, 0 to 1."""
     gain_alone: float
-    """Share of the held-out squared error above the floor that this effect alone explains."""
+    """Share, 0 to 1, of what can be explained of the held-out squared error that this effect alone
+    explains."""
     gain_unique: float
-    """Share that comes back when it is left out of all effects together."""
+    """Share, 0 to 1, that comes back when it is left out of all effects together."""
     heldout_rmse_mm: float
     """Held-out error with this effect and the model discrepancy, mm."""
     ci95: tuple[float, float]
@@ -130,6 +161,13 @@ class Diagnosis:
     """Time that it took, s."""
     statistics: Evidence | None = None
     """The numbers that the decision was made from."""
+    not_testable: tuple[NotTestable, ...] = ()
+    """Effects that these recordings cannot show; they are not ranked."""
+    probabilities: Probabilities | None = None
+    """Calibrated probabilities of what is true."""
+    next_command: str = ""
+    """What to do, as a command with `{model}`, `{data}` and `{before}` (the option with recordings
+    from before, or nothing) in the place of the files; empty where nothing is to be done."""
     setup: SetupResult | None = None
     """What is wrong with the set-up of the recordings; None where no fault is proved."""
     change: Change | None = None
@@ -208,13 +246,14 @@ def diagnose(
             "a change since recordings from before is not one that a network was fitted to: "
             "expected --refit always without --before"
         )
-    found = findings_of(problem, report, without)
-    result = result_of(found)
+    found, not_testable = findings_of(problem, report, without)
+    result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
         result = since(result, both, found)
     elif reason:
+        cannot = [*without, *(each.effect for each in not_testable)]
         joint = fit_candidates_together(
-            problem, reason, without, progress=refit_progress, processes=processes
+            problem, reason, cannot, progress=refit_progress, processes=processes
         )
         result = with_refit(result, joint, problem)
     if result.verdict.kind == "unknown_effect":
@@ -222,15 +261,18 @@ def diagnose(
     return replace(result, notes=notes, seconds=time.perf_counter() - begin)
 
 
-def findings_of(problem: Problem, report: Progress, without: Collection[str]) -> Findings:
-    """What model selection finds on an identification problem."""
+def findings_of(
+    problem: Problem, report: Progress, without: Collection[str]
+) -> tuple[Findings, tuple[NotTestable, ...]]:
+    """What model selection finds on an identification problem, and which effects it cannot show."""
     report("sensitivities of the effects")
     names = known_effects()
     for name in without:
         if name not in names:
             raise unknown_name("effect", name, names)
-    tried = candidates(problem, [name for name in names if name not in without])
-    return find(problem, tried, report)
+    asked = [name for name in names if name not in without]
+    tried, not_testable = testable(problem, candidates(problem, asked), asked)
+    return find(problem, tried, report), not_testable
 
 
 def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
@@ -240,13 +282,24 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     network that was fitted too little, but something that has changed.
     """
     verdict, change = result.verdict, both.change
-    words = verdict.sentence
-    if both.used and verdict.kind == "surrogate_undertrained":
-        words = sentence_of("unknown_effect", (), result.error_mm, 0.0, 0.0, None)
-        verdict = replace(verdict, kind="unknown_effect")
-    text = f"since {both.names}: {words}; {change.sentence}"
-    track = both.track(found.problem, found.explained_mm) if both.used else None
+    chances = result.probabilities
+    if both.used and verdict.kind == "surrogate_undertrained" and chances is not None:
+        known = result.statistics is not None and within_repeatability(result.statistics)
+        sure = 1.0 - chances.known
+        kind: Kind = "nothing_missing" if known else "unknown_effect"
+        words = sentence_of(Decision(kind, (), sure, chances), result.error_mm, 0.0)
+        verdict = replace(verdict, kind=kind, sentence=words)
+        result = replace(result, next_command="")
+    text = f"since {both.names}: {verdict.sentence}; {change.sentence}"
+    track = None
+    if both.used:
+        track = both.track(found.problem, found.explained_mm(verdict.effects))
     return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def within_repeatability(evidence: Evidence) -> bool:
+    """Whether a paired difference is about as large as what BEFORE does not repeat."""
+    return evidence.error_over_validated <= CLAIM.most_over_validated
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:
@@ -271,120 +324,154 @@ def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
 def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
     """The diagnosis in which the refit decides about the effects that it tried.
 
-    A winner is named, alone or with what competes with it. Without one, effects that the residuals
-    name are not named any more if all of them were tried: the network alone does as well.
+    A winner is named, alone or with what competes with it. Without one it cannot be told what is
+    missing where the residuals name effects that were tried, because the network alone does as
+    well, or where they ask for a refit.
     """
     error = f"error {result.error_mm.before:.3g} mm, floor {result.error_mm.floor:.3g} mm"
-    verdict, ranking, plan, checks = result.verdict, result.ranking, None, result.checks
+    verdict = result.verdict
     tried = {candidate.effect for candidate in joint.candidates}
-    if joint.winner is not None:
-        sure = joint.confidence
-        kind: Kind = "ambiguous" if joint.ambiguous else "identified"
-        effects = joint.names if joint.ambiguous else (joint.winner,)
-        head = f"cannot tell {' from '.join(effects)} with these recordings"
-        if kind == "identified":
-            head = f"{joint.winner} is missing (confidence {sure:.2f})"
-        verdict = Verdict(kind, effects, f"{head}: {joint.sentence}; {error}")
-        order = sorted(ranking, key=lambda row: row.effect not in joint.names)
-        order.sort(key=lambda row: row.effect != joint.winner)
-        most = min(sure, 1.0 - sure)
-        ranking = tuple(
-            replace(row, confidence=round(sure if place == 0 else min(row.confidence, most), 4))
-            for place, row in enumerate(order)
+    if joint.winner is None:
+        idle = bool(verdict.effects) and tried.issuperset(verdict.effects)
+        if not idle and verdict.reason != "learned":
+            return replace(result, checks=(*result.checks, joint.sentence), refit=joint)
+        return replace(
+            result,
+            verdict=Verdict(
+                "cannot_tell",
+                (),
+                f"cannot tell what is missing, if anything: {joint.sentence}; {error}",
+                reason="refit",
+            ),
+            ranking=tuple(replace(row, confidence=0.0) for row in result.ranking),
+            ambiguous_with=(),
+            next_experiment=None,
+            next_command="surgisoft next-experiment {model} {data} -o SCHEDULE.csv",
+            refit=joint,
         )
-        if kind == "ambiguous":
-            plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+    sure = round(joint.confidence, 4)
+    if joint.ambiguous:
+        kind: Kind = "ambiguous"
+        effects = joint.names
+        head = f"cannot tell {' from '.join(effects)} with these recordings"
+        plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+        command = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(effects)}"
+        command += " -o SCHEDULE.csv"
     else:
-        checks = (*checks, joint.sentence)
-        if verdict.effects and tried.issuperset(verdict.effects) and result.statistics is not None:
-            without = unnamed(result.statistics)
-            left = result.error_mm.before
-            sentence = sentence_of(without, (), result.error_mm, left, 0.0, None)
-            verdict = Verdict(without, (), sentence)
-            ranking = tuple(replace(row, confidence=0.0) for row in ranking)
+        kind, effects, plan = "identified", (joint.winner,), None
+        head = f"{joint.winner} is missing (confidence {sure:.2f})"
+        command = f"surgisoft amend {{model}} --effect {joint.winner} --data {{data}} -o NEW"
+        command += " --refit always"
+    order = sorted(result.ranking, key=lambda row: row.effect not in joint.names)
+    order.sort(key=lambda row: row.effect != joint.winner)
+    least = round(min(sure, 1.0 - sure), 4)
     return replace(
         result,
-        verdict=verdict,
-        ranking=ranking,
-        ambiguous_with=joint.competing if joint.winner is not None else (),
+        verdict=Verdict(kind, effects, f"{head}: {joint.sentence}; {error}", sure),
+        ranking=tuple(
+            replace(row, confidence=sure if place == 0 else min(row.confidence, least))
+            for place, row in enumerate(order)
+        ),
+        ambiguous_with=joint.competing,
         next_experiment=plan,
-        checks=checks,
+        next_command=command,
         refit=joint,
     )
 
 
-def result_of(found: Findings) -> Diagnosis:
-    """The diagnosis that the findings amount to."""
-    problem, selection = found.problem, found.selection
+def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
+    """The diagnosis that the findings amount to.
+
+    decision: what was decided from other evidence; None: it is decided from the findings.
+    """
+    problem = found.problem
     best = best_achievable(problem, found.box, found)
-    reached = selection.rmse_mm(selection.losses(found.chosen))
     evidence = evidence_of(found)
-    decision = decide(evidence)
+    decision = decision or decide(evidence)
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm)
-    ranking = tuple(
-        _ranked(found, score, sure if place == 0 else min(sure, 1.0 - sure))
-        for place, score in enumerate(_order(found))
-    )
-    least = CRITERIA.decision.nearest_gain
-    near = [s.effect for s in found.first[:1] if s.gain >= least]
-    sentence = sentence_of(kind, effects, levels, reached, sure, near[0] if near else None)
-    if kind == "several" and found.competing:
-        others = " or ".join(found.competing)
-        sentence += f"; {others} would do as well in the place of one of them"
-    plan = None
-    if kind == "ambiguous":
-        plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+    ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
+    sentence = sentence_of(decision, levels, _reached(found, effects))
+    others = _instead(evidence) if kind == "several" else ()
+    if others:
+        sentence += f"; {' or '.join(others)} would do as well in the place of one of them"
+    plan = recommend(problem, effects).experiment if kind == "ambiguous" else None
     return Diagnosis(
-        verdict=Verdict(kind, effects, sentence),
+        verdict=Verdict(kind, effects, sentence, round(sure, 4), decision.reason),
         error_mm=levels,
         ranking=ranking,
-        ambiguous_with=tuple(found.competing) if kind in ("ambiguous", "several") else (),
+        ambiguous_with=effects[1:] if kind == "ambiguous" else others,
         next_experiment=plan,
-        checks=(*data_quality_warnings(problem), *within_the_discrepancy(found, kind)),
+        checks=(*data_quality_warnings(problem), *would_explain(found, decision)),
         statistics=evidence,
+        probabilities=decision.probabilities,
+        next_command=next_command(decision),
     )
 
 
-def within_the_discrepancy(found: Findings, kind: Kind) -> list[str]:
-    """What an effect would explain of an error that is no larger than the validated one."""
-    asked = CRITERIA.selection
-    if kind != "nothing_missing" or not found.first or found.selection.whole_size >= 1.0:
+def would_explain(found: Findings, decision: Decision) -> list[str]:
+    """What an effect would explain of an error that the fit had already."""
+    if decision.kind not in ("nothing_missing", "surrogate_undertrained", "cannot_tell"):
+        return []
+    if not found.first or found.selection.whole_size >= 1.0:
         return []
     best = found.first[0]
-    large = best.gain >= asked.first_gain and best.p_value <= asked.p_value
-    if not large or found.selection.in_fit(best.effect):
+    chance = decision.probabilities.effects.get(best.effect, 0.0)
+    if chance < WORTH_TELLING or found.selection.in_fit(best.effect):
         return []
-    least = asked.first_gain_within_discrepancy
     text = (
-        f"{best.effect} would explain {100 * best.gain:.0f} % of the error, but the error is no "
-        f"larger than the model's validated error, so that an error of the fit explains it as well "
-        f"(an effect is named there from {100 * least:.0f} % on)"
+        f"{best.effect} would explain {100 * best.gain:.0f} % of what can be explained of the "
+        f"error, but the error is no larger than the model's validated error, so that an error of "
+        f"the fit explains it as well"
     )
     if known_effects()[best.effect].stage in ("line", "material"):
         text += f"; fit the network together with it (fit --effects {best.effect}) and compare"
     return [text]
 
 
-def _order(found: Findings) -> list[Score]:
-    """All effects, the named ones first.
+def _instead(evidence: Evidence) -> tuple[str, ...]:
+    """Effects that would do about as well in the place of one of two."""
+    pair = next((each for each in evidence.proposals if len(each.effects) == 2), None)
+    if pair is None:
+        return ()
+    both = zip(pair.instead, pair.instead_margin, strict=True)
+    return tuple(dict.fromkeys(name for name, margin in both if margin < AS_GOOD))
+
+
+def _reached(found: Findings, effects: tuple[str, ...]) -> float:
+    """Held-out error with the named effects, or with the first of a set, mm."""
+    selection = found.selection
+    for proposal in found.proposals:
+        if set(proposal.effects) == set(effects):
+            return selection.rmse_mm(selection.losses(proposal.chosen))
+    first = next((score for score in found.first if score.effect in effects[:1]), None)
+    return selection.rmse_mm(selection.losses() if first is None else first.losses)
+
+
+def _order(found: Findings, decision: Decision) -> list[Score]:
+    """All effects, the named ones first, then the most probable.
 
     An effect that is plausible only on top of another has its score on top of that one.
     """
-    alone = {score.effect: score for score in found.first}
-    named = [alone.get(score.effect, score) for score in found.named]
-    names = [score.effect for score in named]
-    return named + [s for s in found.first if s.effect not in names]
+    scores = {s.effect: s for proposal in found.proposals for s in proposal.scores}
+    scores |= {score.effect: score for score in found.first}
+    chances = decision.probabilities.effects
+    names = list(decision.effects)
+    names += [name for name in chances if name not in names]
+    return [scores[name] for name in names if name in scores]
 
 
-def _ranked(found: Findings, score: Score, sure: float) -> Ranked:
+def _ranked(found: Findings, score: Score, decision: Decision) -> Ranked:
     """One row of the ranking."""
-    selection = found.selection
+    selection, chances = found.selection, decision.probabilities
+    sure = chances.effects.get(score.effect, 0.0)
+    if score.effect in chances.two:
+        sure = max(sure, chances.pair)
     return Ranked(
         effect=score.effect,
         confidence=round(float(sure), 4),
-        gain_alone=float(score.gain),
-        gain_unique=float(found.unique.get(score.effect, 0.0)),
+        gain_alone=_share(score.gain),
+        gain_unique=_share(found.unique.get(score.effect, 0.0)),
         heldout_rmse_mm=selection.rmse_mm(score.losses),
         ci95=rmse_interval(found.problem, score.losses, selection.validation.counts),
         p_value=float(score.p_value),
@@ -393,19 +480,13 @@ def _ranked(found: Findings, score: Score, sure: float) -> Ranked:
     )
 
 
-def sentence_of(
-    kind: Kind,
-    effects: tuple[str, ...],
-    levels: ErrorLevels,
-    reached: float,
-    sure: float,
-    nearest: str | None,
-) -> str:
-    """The verdict in words.
+def _share(value: float) -> float:
+    return float(min(max(value, 0.0), 1.0))
 
-    reached: held-out error with the named effects, mm; sure: confidence in the first of them;
-    nearest: effect that is nearest to an unknown one, None where none is near.
-    """
+
+def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
+    """The verdict in words. reached: held-out error with the named effects, mm."""
+    kind, effects, sure = decision.kind, decision.effects, decision.confidence
     error = f"error {levels.before:.3g} mm, floor {levels.floor:.3g} mm"
     if kind == "identified":
         return (
@@ -415,25 +496,54 @@ def sentence_of(
     if kind == "several":
         together = " and ".join(effects)
         return (
-            f"{together} are missing (confidence {sure:.2f} in the first): with them "
+            f"{together} are missing (confidence {sure:.2f} in both): with them "
             f"{reached:.3g} mm remain on held-out blocks; {error}"
         )
     if kind == "ambiguous":
         return (
-            f"cannot tell {' from '.join(effects)} with these recordings: each would leave about "
-            f"{reached:.3g} mm on held-out blocks; {error}"
+            f"cannot tell {' from '.join(effects)} with these recordings (confidence {sure:.2f} "
+            f"that it is one of them): each would leave about {reached:.3g} mm on held-out blocks; "
+            f"{error}"
         )
     if kind == "unknown_effect":
+        near = next(iter(decision.probabilities.effects), None)
         return (
-            f"something is missing and it is none of the known effects "
-            f"({f'{nearest} is nearest' if nearest else 'none is near'}); {error}"
+            f"something is missing and it is none of the known effects (confidence {sure:.2f}; "
+            f"{f'{near} is nearest' if near else 'none is near'}); {error}"
         )
     if kind == "surrogate_undertrained":
         return (
             f"the network itself is off (its validated error says so too): fit it longer or to "
             f"more data before looking for effects; {error}"
         )
+    if kind == "cannot_tell":
+        why = REASONS[decision.reason or "schedule"]
+        return f"cannot tell what is missing, if anything: {why}; {error}"
     return f"nothing is missing that these recordings could show; {error}"
+
+
+def next_command(decision: Decision) -> str:
+    """What to do after a result, with `{model}`, `{data}` and `{before}` for the files."""
+    kind, names = decision.kind, decision.effects
+    if kind in ("identified", "several"):
+        return (
+            f"surgisoft amend {{model}} --effect {' '.join(names)} --data {{data}}{{before}} -o NEW"
+        )
+    between = names or tuple(decision.probabilities.effects)[:2]
+    plan = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(between)}"
+    plan = f"{plan} -o SCHEDULE.csv"
+    if kind == "ambiguous":
+        return plan
+    if kind == "surrogate_undertrained" or decision.reason == "network":
+        return "surgisoft fit {data} -o NEW"
+    if decision.reason == "learned":
+        known = known_effects()
+        inside = [n for n in decision.probabilities.effects if known[n].stage in FITTED_STAGES]
+        effects = " ".join(inside[:MOST_FITTED])
+        return f"surgisoft fit {{data}} --inputs pressure --effects {effects} -o NEW"
+    if kind == "cannot_tell":
+        return plan if between else "surgisoft next-experiment {model} {data} -o SCHEDULE.csv"
+    return ""
 
 
 # Result of a recommended experiment -----------------------------------------------------------

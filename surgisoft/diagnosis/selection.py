@@ -1,13 +1,11 @@
 """Model selection: which effects explain what the model leaves, alone and together.
 
 Every effect is scored by the held-out error that remains with it, the model discrepancy always
-fitted beside it (`cross_validation`). Forward selection then names effects one by one: an effect
-must be beyond chance for the whole family of effects and large enough (`SelectionCriteria`), give
-way to one that does better beside the others, and still explain its share beside the relaxed forms
-of those before it.
+fitted beside it (`cross_validation`). Forward selection with exchanges then proposes the best
+single effect and the best two, generously: whether any of them is missing is left to the fitted
+decision (`decision`).
 """
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,20 +14,17 @@ import numpy as np
 
 from surgisoft.diagnosis.black_box import BlackBox, black_box
 from surgisoft.diagnosis.candidates import Candidate
-from surgisoft.diagnosis.criteria import CRITERIA
+from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.cross_validation import CrossValidation, split_of
-from surgisoft.diagnosis.discrepancy import SIZES, Prior
 from surgisoft.diagnosis.estimation.effects import refined
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.statistics import (
     block_interval,
     block_sums,
     sign_flip_p_values,
-    win_shares,
 )
+from surgisoft.diagnosis.testability import cubics
 from surgisoft.surrogate.effects import Effect, Quantity, hypothesis_of
-
-ASKED = CRITERIA.selection
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +54,12 @@ class Score:
     p_value: float
     """Family-wise p-value: chance of so large a gain in any of the effects without a cause."""
     gain: float
-    """Share of the base's squared error above the floor that goes."""
+    """Share of what can be explained of the base's squared error that goes; at most 1."""
 
     @property
     def score(self) -> float:
         """Mean log gain less the price of its amplitudes: what effects are ranked by."""
-        return ASKED.priced(self.log_gain.mean(), len(self.option.chosen))
+        return SEARCH.priced(self.log_gain.mean(), len(self.option.chosen))
 
 
 def chosen_by(scores: Sequence[Score]) -> tuple[int, ...]:
@@ -74,7 +69,7 @@ def chosen_by(scores: Sequence[Score]) -> tuple[int, ...]:
 
 def _near(quantity: Quantity) -> bool:
     """Whether a first estimate may turn out plausible: right in sign, at most twice too large."""
-    factor = ASKED.plausible_factor
+    factor = SEARCH.plausible_factor
     low = quantity.low * (factor if quantity.low < 0 else 1 / factor) - 0.01 * abs(quantity.high)
     high = quantity.high * (factor if quantity.high > 0 else 1 / factor)
     return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
@@ -157,6 +152,15 @@ class ModelSelection:
         """Squared error above the noise floor, mm^2."""
         return float(max(losses.sum() - self.floor.sum(), 0.02 * losses.sum(), 1e-30))
 
+    def explainable(self, before: np.ndarray, after: Sequence[np.ndarray]) -> float:
+        """Squared error that can be explained, mm^2, from the losses (B,) before and after.
+
+        What lies above the noise floor; where something leaves less than the floor, which may be
+        stated too large, what lies above that. So no share of it is above 1.
+        """
+        least = min((float(losses.sum()) for losses in after), default=np.inf)
+        return max(self.excess(before), float(before.sum()) - least)
+
     def size(self, losses: np.ndarray) -> float:
         """Error that is left above the noise floor, in units of the model discrepancy (of what the
         right effect may leave, `Problem.tolerance_mm`)."""
@@ -191,14 +195,15 @@ class ModelSelection:
         chances = sign_flip_p_values(
             self.problem.by_motion(gains), [option.effect for option in choices]
         )
+        explainable = self.explainable(before, after)
         best: dict[str, Score] = {}
         scores = [
-            ASKED.priced(g.mean(), len(w.chosen)) for g, w in zip(gains, choices, strict=True)
+            SEARCH.priced(g.mean(), len(w.chosen)) for g, w in zip(gains, choices, strict=True)
         ]
         for i in np.argsort(-np.array(scores), kind="stable"):
             option, losses = choices[i], after[i]
             if option.effect not in best and self.plausible(option, base):
-                gain = (before.sum() - losses.sum()) / self.excess(before)
+                gain = (before.sum() - losses.sum()) / explainable
                 best[option.effect] = Score(
                     option.effect, option, losses, gains[i], chances[i], gain
                 )
@@ -217,7 +222,7 @@ class ModelSelection:
         some = self.candidates[self.options[option.effect][0].candidate].effect
         return (
             not hypothesis_of(some).needs_reversals
-            or self._static_share(option, base) <= ASKED.most_static
+            or self._static_share(option, base) <= SEARCH.most_static
         )
 
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
@@ -233,9 +238,7 @@ class ModelSelection:
     @cached_property
     def _cubics(self) -> np.ndarray:
         """(S, F) orthonormal basis of the cubics of the actuation."""
-        x = self.problem.pressure
-        pairs = (x[:, :, None] * x[:, None, :])[:, *np.triu_indices(x.shape[1])]
-        return np.linalg.qr(np.hstack([np.ones((len(x), 1)), x, pairs, x**3]))[0]
+        return cubics(self.problem.pressure)
 
     def freest(self, score: Score) -> tuple[int, ...]:
         """An effect's sensitivities; beside a fitted one those of the grid that do best with it."""
@@ -274,8 +277,8 @@ class ModelSelection:
         What comes back when it is left out of the best forms of all effects together.
         """
         together = {s.effect: s.option.chosen for s in scores}
-        total = self.excess(self.losses())
         everything = self.losses(sum(together.values(), ()))
+        total = self.explainable(self.losses(), [everything, *(s.losses for s in scores)])
         answer = {}
         for name in together:
             rest = sum((chosen for other, chosen in together.items() if other != name), ())
@@ -320,38 +323,22 @@ class RelaxedFit:
     p_value: float
     """Chance of such a fall without a cause."""
 
-    @property
-    def worth(self) -> float:
-        """Share that goes times the mean fall of the log error; 0 where either rises."""
-        return max(self.share, 0.0) * max(self.log_gain, 0.0)
 
-    @property
-    def wrong(self) -> bool:
-        """Whether the forms are not those of what is missing."""
-        return (self.worth >= ASKED.relaxed_worth or self.share >= ASKED.relaxed_share) and (
-            self.p_value <= ASKED.relaxed_p_value
-        )
-
-
-def relaxed_fit(selection: ModelSelection, choices: Sequence[Sequence[Score]]) -> RelaxedFit:
-    """What the best of several sets of effects explains more in its relaxed form.
-
-    choices: sets of effects that explain the error about as well; one set where nothing competes.
-    """
+def relaxed_fit(selection: ModelSelection, named: Sequence[Score]) -> RelaxedFit:
+    """What effects explain more in their relaxed form: the better of the two."""
     tried = []
-    for named, scaled in itertools.product(choices, (_by_state, _by_time)):
+    for scaled in (_by_state, _by_time):
         sensitivities = _relaxed_sensitivities(selection, named, scaled)
         validation = CrossValidation.on(selection.validation.split, sensitivities)
         tried.append(validation.losses(range(sensitivities.shape[3])))
-    best = min(tried, key=np.sum)
-    beyond = [_beyond(selection, chosen_by(named), best) for named in choices]
-    return min(beyond, key=lambda one: one.worth)
+    return _beyond(selection, chosen_by(named), min(tried, key=np.sum))
 
 
 def _beyond(selection: ModelSelection, chosen: tuple[int, ...], after: np.ndarray) -> RelaxedFit:
     before = selection.losses(chosen)
     log_gain, chance = _fall(selection, before, after)
-    share = (before.sum() - after.sum()) / selection.excess(selection.losses())
+    start = selection.losses()
+    share = (before.sum() - after.sum()) / selection.explainable(start, [before, after])
     return RelaxedFit(after, float(share), float(log_gain.mean()), chance)
 
 
@@ -364,12 +351,10 @@ def _fall(
     return log_gain, float(sign_flip_p_values(gain)[0]) if log_gain.any() else 1.0
 
 
-def beside_relaxed(
-    selection: ModelSelection, named: list[Score], further: Score
-) -> tuple[float, Score]:
-    """(loss of the named effects' relaxed forms in mm^2, a further effect's score beside them).
+def beside_relaxed(selection: ModelSelection, named: Sequence[Score], further: Score) -> Score:
+    """A further effect's score beside the relaxed forms of the named ones.
 
-    The chance counts this one effect alone: the others have been corrected for before.
+    The p-value counts this one effect alone.
     """
     chosen = further.option.chosen
     sensitivities = [
@@ -380,9 +365,8 @@ def beside_relaxed(
     validation, total = CrossValidation.on(selection.validation.split, together), together.shape[3]
     before, after = (validation.losses(range(n)) for n in (total - len(chosen), total))
     log_gain, chance = _fall(selection, before, after)
-    gain = float((before.sum() - after.sum()) / selection.excess(before))
-    answer = Score(further.effect, further.option, after, log_gain, chance, gain)
-    return float(before.sum()), answer
+    gain = float((before.sum() - after.sum()) / selection.explainable(before, [after]))
+    return Score(further.effect, further.option, after, log_gain, chance, gain)
 
 
 def _relaxed_sensitivities(
@@ -411,90 +395,80 @@ def _by_state(selection: ModelSelection, part: np.ndarray) -> np.ndarray:
 
 def _by_time(selection: ModelSelection, part: np.ndarray) -> np.ndarray:
     """(S, n, 3, spans - 1) what an effect explains, in each part of the time but the first."""
-    spans = ASKED.relaxed_spans
+    spans = SEARCH.relaxed_spans
     span = spans * np.arange(len(part)) // len(part)
     return part[..., None] * (span[:, None] == np.arange(1, spans))[:, None, None, :]
 
 
-# Forward selection --------------------------------------------------------------------------
+# Proposals ----------------------------------------------------------------------------------
 
 
-def select_effects(
-    selection: ModelSelection, first: list[Score]
-) -> tuple[list[Score], list[Score]]:
-    """(the effects that passed, in order, each on top of those before; the others beside them).
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """One effect, or two that may be missing together."""
 
-    Forward selection takes the single effect that explains most, which beside a second one may be
-    the wrong one: after every step each named effect gives way to the one that does best beside the
-    others (stepwise exchange: Miller 2002, "Subset selection in regression", sec. 3.5), and to
-    nothing where the others explain its share.
+    scores: tuple[Score, ...]
+    """The effects, the one that would be missed most first, each on top of those before it."""
+    relaxed: RelaxedFit
+    """The lack of fit of these effects."""
+    beside: Score | None
+    """The last effect beside the relaxed forms of those before it; None for a single effect."""
+    instead: tuple[Score | None, ...]
+    """For each of two effects the best other one in its place; None where there is none."""
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(score.effect for score in self.scores)
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """Their sensitivities."""
+        return chosen_by(self.scores)
+
+
+def propose(selection: ModelSelection, first: list[Score]) -> tuple[Proposal, ...]:
+    """The best single effect and the best two; whether any is missing is left open.
+
+    Forward selection adds the effect that explains most, which beside a second one may be the wrong
+    one: after every step each effect gives way to the one that does best beside the others
+    (stepwise exchange: Miller 2002, "Subset selection in regression", sec. 3.5). It ends where the
+    best further effect is within chance or explains next to nothing.
     """
+    answer: list[Proposal] = []
     named: list[Score] = []
-    following = first
-    seen: dict[frozenset[str], list[Score]] = {}
-    while following and len(named) < ASKED.most_effects:
-        passed = next((s for s in following if _joins(selection, first, named, s)), None)
-        if passed is None:
+    following = [score for score in first if not selection.in_fit(score.effect)]
+    while following and len(named) < SEARCH.most_effects and _worth_a_look(following[0]):
+        found = exchanged(selection, [*named, following[0]])
+        before = frozenset(score.effect for score in named)
+        if answer and frozenset(score.effect for score in found) == before:
             break
-        named = _without_idle(selection, first, exchanged(selection, [*named, passed]))
-        names = frozenset(s.effect for s in named)
-        # Exchanges may lead back to where they came from: of such a circle the best is taken.
-        again = names in seen
-        if again:
-            circle = list(seen.values())[list(seen).index(names) :]
-            named = min(circle, key=lambda some: float(selection.losses(chosen_by(some)).sum()))
-        seen[names] = named
+        named = found
+        beside = beside_relaxed(selection, named[:-1], named[-1]) if len(named) > 1 else None
+        instead = _instead(selection, named) if len(named) > 1 else ()
+        answer.append(Proposal(tuple(named), relaxed_fit(selection, named), beside, instead))
         following = selection.scores(chosen_by(named), tuple(s.effect for s in named))
-        if again:
-            break
-    return named, following
+    return tuple(answer)
 
 
-def _joins(selection: ModelSelection, first: list[Score], named: list[Score], s: Score) -> bool:
-    """Whether one effect on top of the named ones is beyond chance, large enough, and its own."""
-    start = selection.excess(selection.losses())
-    if not passes(selection, first, named, s):
-        return False
-    if not named:
-        return True
-    left, own = beside_relaxed(selection, named, s)
-    share = (left - own.losses.sum()) / start
-    large = share >= ASKED.own_share and own.gain >= ASKED.own_gain
-    sure = own.p_value <= ASKED.p_value and own.log_gain.mean() >= ASKED.own_log_gain
-    if large and sure:
-        return True
-    still = ASKED.left_beside_relaxed * (left - selection.floor.sum())
-    return bool(selection.excess(s.losses) <= still)
+def _worth_a_look(score: Score) -> bool:
+    """Whether an effect can be anything but chance."""
+    return score.p_value <= SEARCH.p_value or score.gain >= SEARCH.large_gain
 
 
-def passes(selection: ModelSelection, first: list[Score], named: list[Score], s: Score) -> bool:
-    """Whether one effect on top of the named ones is beyond chance and large enough."""
-    start = selection.excess(selection.losses())
-    share = (selection.losses(chosen_by(named)).sum() - s.losses.sum()) / start
-    log_gain = s.log_gain.mean()
-    if not named:
-        if selection.in_fit(s.effect):
-            return False
-        within = selection.whole_size < 1.0
-        enough = ASKED.first_gain_within_discrepancy if within else ASKED.first_gain
-        if s.p_value <= ASKED.p_value and share >= enough and log_gain >= ASKED.log_gain:
-            return True
-        far = selection.size(selection.losses()) >= ASKED.far_size and share >= ASKED.far_gain
-        sure = far or s.p_value <= ASKED.large_p_value
-        return bool(sure and share >= ASKED.large_gain and log_gain >= ASKED.large_log_gain)
-    if s.p_value > ASKED.p_value or log_gain < ASKED.log_gain:
-        return False
-    alone = next((other.gain for other in first if other.effect == s.effect), 0.0)
-    beside = s.gain >= ASKED.beside_gain and log_gain >= ASKED.beside_log_gain
-    beside = beside and alone < ASKED.beside_overlap * named[0].gain
-    distinct = s.gain >= ASKED.distinct_gain and log_gain >= ASKED.distinct_log_gain
-    large = share >= ASKED.next_share or s.gain >= ASKED.nearly_all_gain
-    return bool(large or beside or distinct)
+def _instead(selection: ModelSelection, named: list[Score]) -> tuple[Score | None, ...]:
+    """For each effect the best other one beside those that stay."""
+    answer = []
+    for score in named:
+        others = [other for other in named if other is not score]
+        taken = tuple(other.effect for other in named)
+        answer.append(next(iter(selection.scores(chosen_by(others), taken)), None))
+    return tuple(answer)
 
 
 def exchanged(selection: ModelSelection, named: list[Score]) -> list[Score]:
-    """The named effects after exchanges, the one that would be missed most first."""
-    for _ in range(ASKED.exchanges):
+    """The effects after exchanges, the one that would be missed most first."""
+    for _ in range(SEARCH.exchanges):
         changed = False
         for place in range(len(named)):
             others = named[:place] + named[place + 1 :]
@@ -510,6 +484,8 @@ def exchanged(selection: ModelSelection, named: list[Score]) -> list[Score]:
 
 def _in_order(selection: ModelSelection, named: list[Score]) -> list[Score]:
     """The same effects, the one that would be missed most first, each on top of those before."""
+    if len(named) < 2:
+        return named
 
     def missed(score: Score) -> float:
         rest = [other for other in named if other is not score]
@@ -523,60 +499,6 @@ def _in_order(selection: ModelSelection, named: list[Score]) -> list[Score]:
     return answer
 
 
-def _without_idle(selection: ModelSelection, first: list[Score], named: list[Score]) -> list[Score]:
-    """The named effects without those whose share the others explain."""
-    while len(named) > 1:
-        for score in reversed(named):
-            others = [other for other in named if other is not score]
-            found = selection.scores(chosen_by(others), tuple(s.effect for s in others))
-            again = next((s for s in found if s.effect == score.effect), None)
-            if again is None or not passes(selection, first, others, again):
-                named = _in_order(selection, others)
-                break
-        else:
-            break
-    return named
-
-
-# Size of the discrepancy --------------------------------------------------------------------
-
-STATIC_ROWS = 500
-"""Most rows of the Gaussian process."""
-
-
-@dataclass(frozen=True)
-class StaticError:
-    """The most likely factor on the validated error, see `discrepancy`."""
-
-    before: float
-    """Without any effect."""
-    after: float
-    """With the named effects."""
-
-
-def static_error(
-    problem: Problem, selection: ModelSelection, chosen: tuple[int, ...]
-) -> StaticError:
-    """The factor before and after the effects whose sensitivities are chosen."""
-    whole = np.flatnonzero(np.isfinite(problem.residual).all((1, 2)))
-    if len(whole) < 50:
-        return StaticError(1.0, 1.0)
-    rows = whole[:: max(1, round(len(whole) / STATIC_ROWS))]
-    losses = selection.losses(chosen)
-    left = float(losses.sum() / selection.validation.counts.sum())
-    noise = np.sqrt(np.maximum(problem.noise_mm**2, left))
-    prior = Prior.of(problem.pressure[rows], problem.direction[rows], problem.discrepancy_mm, noise)
-    residual = problem.residual[rows]
-    sensitivities = selection.sensitivities[rows][..., list(chosen)]
-    amplitude = selection.validation.amplitudes(chosen)
-    return StaticError(_size(prior, residual), _size(prior, residual - sensitivities @ amplitude))
-
-
-def _size(prior: Prior, residual: np.ndarray) -> float:
-    field = prior.turned(residual)
-    return float(max(SIZES, key=lambda size: prior.log_evidence(field, size)))
-
-
 # Identification ------------------------------------------------------------------------------
 
 Progress = Callable[[str], None]
@@ -585,46 +507,37 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """The effects that model selection names on a problem."""
+    """The effects that model selection proposes on a problem."""
 
     selection: ModelSelection
     first: list[Score]
     """All effects on top of nothing, the best first."""
-    named: list[Score]
-    """The effects that passed, in order, each on top of those before it."""
-    following: list[Score]
-    """The effects that did not pass on top of those, the best first."""
+    proposals: tuple[Proposal, ...]
+    """The best single effect and the best two, as far as they are worth a look."""
 
     @property
     def problem(self) -> Problem:
         """The identification problem."""
         return self.selection.problem
 
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        """Sensitivities of the named effects."""
-        return chosen_by(self.named)
-
-    @property
-    def explained_mm(self) -> np.ndarray:
-        """(S, n, 3) what the named effects explain of the residual, mm; 0 where none is named."""
-        amplitudes = self.selection.validation.amplitudes(self.chosen)
-        return self.selection.sensitivities[..., list(self.chosen)] @ amplitudes
+    def explained_mm(self, effects: Sequence[str]) -> np.ndarray:
+        """(S, n, 3) what some effects explain of the residual together, mm; 0 for none."""
+        same = [p.chosen for p in self.proposals if set(p.effects) == set(effects)]
+        alone = [score.option.chosen for score in self.first if score.effect in effects[:1]]
+        chosen = next(iter(same + alone), ())
+        amplitudes = self.selection.validation.amplitudes(chosen)
+        return self.selection.sensitivities[..., list(chosen)] @ amplitudes
 
 
 @dataclass(frozen=True, eq=False)
 class Findings(Selected):
     """What model selection found on a problem, and the tests of it."""
 
-    competing: list[str]
-    """Effects that explain the data about as well as the first, or as one of several."""
+    forms: dict[str, RelaxedFit]
+    """Lack of fit of the best effect alone and of those that explain about as much."""
     unique: dict[str, float]
     """Gain of each effect that no other effect has."""
     box: BlackBox
-    static: StaticError
-    """The most likely size of a static error before and after the named effects."""
-    relaxed: RelaxedFit | None
-    """The lack of fit of the named effects, or of the one and those that compete with it."""
 
 
 @dataclass(frozen=True)
@@ -638,46 +551,45 @@ class BestAchievable:
 
 
 def select(problem: Problem, some: list[Candidate], report: Progress) -> Selected:
-    """Name effects by forward selection; close ones compete with refined nonlinear parameters."""
+    """Rank and propose effects; close ones compete with refined nonlinear parameters."""
     report("held-out errors")
     selection = ModelSelection.of(problem, some)
     first = selection.scores()
-    named, following = select_effects(selection, first)
-    close = _close(first, named)
-    if close:
+    close = close_to_best(first, SEARCH.refined_gain)
+    if len(close) > 1:
         report(f"nonlinear parameters of {' and '.join(score.effect for score in close)}")
         selection = selection.extended(refined(problem, selection.starts(close)))
         first = selection.scores()
-        named, following = select_effects(selection, first)
-    return Selected(selection, first, named, following)
+    return Selected(selection, first, propose(selection, first))
 
 
 def find(problem: Problem, some: list[Candidate], report: Progress) -> Findings:
-    """Select effects and test them."""
+    """Rank and propose effects, and test them."""
     selected = select(problem, some, report)
-    selection, first, named = selected.selection, selected.first, selected.named
-    rivals = competing(selection, first, named)
+    selection, first = selected.selection, selected.first
     report("black box")
+    forms = {p.effects[0]: p.relaxed for p in selected.proposals[:1]}
+    for score in close_to_best(first, SEARCH.competing_gain):
+        if score.effect not in forms:
+            forms[score.effect] = relaxed_fit(selection, [score])
     return Findings(
         selection=selection,
         first=first,
-        named=named,
-        following=selected.following,
-        competing=rivals,
+        proposals=selected.proposals,
+        forms=forms,
         unique=selection.unique_gains(first),
         box=black_box(problem),
-        static=static_error(problem, selection, selected.chosen),
-        relaxed=_lack_of_fit(selection, first, named, rivals),
     )
 
 
 def best_achievable(problem: Problem, box: BlackBox, selected: Selected | None) -> BestAchievable:
-    """The least of the errors of the model, a black box, each effect and the named effects."""
+    """The least of the errors of the model, a black box, each effect and the proposed effects."""
     seen = np.isfinite(problem.residual).all(2)
     square = np.where(seen, np.square(problem.residual).sum(2), 0.0)
     tried = [block_sums(square.sum(1), problem.block), box.losses, box.free_losses]
     if selected is not None:
-        tried += [selected.selection.losses(selected.chosen)]
+        tried += [selected.selection.losses()]
+        tried += [selected.selection.losses(p.chosen) for p in selected.proposals]
         tried += [score.losses for score in selected.first]
     losses = min(tried, key=np.sum)
     counts = block_sums(seen.sum(1).astype(float), problem.block)
@@ -692,48 +604,13 @@ def rmse_interval(problem: Problem, losses: np.ndarray, counts: np.ndarray) -> t
     return float(low), float(high)
 
 
-def _close(first: list[Score], named: list[Score]) -> list[Score]:
-    """The one effect that is named and those that explain about as much; none where none does."""
-    if len(named) != 1:
+def close_to_best(first: list[Score], share: float) -> list[Score]:
+    """The best effect and those that explain at least a share of what it explains.
+
+    Empty where even the best is within chance.
+    """
+    if not first or not _worth_a_look(first[0]):
         return []
-    best = named[0]
-    least = ASKED.refined_gain * best.gain
-    others = [s for s in first if s.effect != best.effect and s.gain >= least]
-    return [best, *others[: ASKED.most_competing]] if others else []
-
-
-def _lack_of_fit(
-    selection: ModelSelection, first: list[Score], named: list[Score], rivals: list[str]
-) -> RelaxedFit | None:
-    """The relaxed fit of the named effects, or of the one and those that compete with it."""
-    if not named:
-        return None
-    some = rivals[: ASKED.most_competing] if len(named) == 1 else []
-    others = [s for s in first if s.effect in some]
-    return relaxed_fit(selection, [named, *([s] for s in others)])
-
-
-def competing(selection: ModelSelection, first: list[Score], named: list[Score]) -> list[str]:
-    """Effects that would do about as well in the place of one that is named, beside the others."""
-    if len(named) == 1:
-        return _competing_with(selection, first, named[0])
-    answer = []
-    for one in named:
-        others = [other for other in named if other is not one]
-        found = selection.scores(chosen_by(others), tuple(other.effect for other in others))
-        own = next((score for score in found if score.effect == one.effect), None)
-        answer += [] if own is None else _competing_with(selection, found, own)
-    return list(dict.fromkeys(answer))
-
-
-def _competing_with(selection: ModelSelection, found: list[Score], best: Score) -> list[str]:
-    """Effects that explain about as much as one, all on top of the same base."""
-    tie = min(ASKED.tie_of_gain * best.gain, ASKED.tie_of_left * (1.0 - best.gain))
-    answer = []
-    for other in found:
-        if other.effect == best.effect or other.gain < ASKED.competing_gain * best.gain:
-            continue
-        pair = selection.problem.by_motion(np.stack([-best.log_gain, -other.log_gain]))
-        if best.gain - other.gain < tie or win_shares(pair)[0] < ASKED.win_share:
-            answer.append(other.effect)
-    return answer
+    best = first[0]
+    others = [s for s in first[1:] if s.gain >= share * best.gain]
+    return [best, *others[: SEARCH.most_refined]]

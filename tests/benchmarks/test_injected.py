@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from benchmarks.cache import Cache
 from benchmarks.injected.cases import (
     ROBOTS,
     SCALE_TOLERANCE,
@@ -29,7 +31,14 @@ from benchmarks.injected.rod import (
     key_points,
     turned,
 )
-from surgisoft.measurement.recordings import Recording, load_recording
+from benchmarks.injected.study import CaseFolder, Judged, find_cases, judge, model_of
+from benchmarks.injected.study import markdown as cases_table
+from benchmarks.real.entries import FitOptions
+from benchmarks.real.study import Answer, fitted
+from surgisoft.cli import run
+from surgisoft.measurement.recordings import Recording, load_recording, save_recording
+from surgisoft.progress import silent
+from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.surrogate.effects import EFFECTS
 
 LENGTH = 200.0
@@ -329,3 +338,71 @@ def test_the_clock_goes_on_through_runs(arm):
     recording = recorded(arm, 1)
     again = replace(recording, t_s=np.concatenate([arm.t_s[:300], arm.t_s[:300]]))
     assert running_time(again)[[0, 299, 300]] == pytest.approx([0.0, 11.96, 71.96])
+
+
+# Diagnoses of case folders ---------------------------------------------------------------------
+
+
+def written_cases(bench, folder) -> None:
+    """A robot of name `trunk` with two cases of a turned frame and one without a change."""
+    save_recording(bench.before[0], folder / "robots" / "trunk" / "before" / "before.parquet")
+    for number, effects in enumerate([("misalignment",), ("misalignment",), ()]):
+        case = Case("trunk", number, effects, 3.0)
+        assert make_case(case, bench, 1.0, 0.1, folder / "cases" / case.name, seed=1)
+
+
+def test_cases_are_found_with_their_robot_and_truth(bench, tmp_path):
+    written_cases(bench, tmp_path)
+    found = find_cases(tmp_path)
+    assert [case.truth for case in found] == [("misalignment",), ("misalignment",), ()]
+    assert {case.robot for case in found} == {tmp_path / "robots" / "trunk"}
+    assert [case.size for case in found] == [3.0, 3.0, 3.0]
+
+
+def test_bad_folders_of_cases_are_one_line(bench, tmp_path, capsys):
+    assert run(["benchmark", "cases", str(tmp_path)]) == 2
+    assert "no cases/*/truth.json in this folder" in capsys.readouterr().err
+    written_cases(bench, tmp_path)
+    assert run(["benchmark", "cases", str(tmp_path), "--only", "creep"]) == 2
+    assert "none of 3 cases has it" in capsys.readouterr().err
+    (tmp_path / "cases" / "trunk-002-clean" / "truth.json").write_text('{"robot": "other"}')
+    assert run(["benchmark", "cases", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "not the truth of a case" in error
+    assert error.count("\n") == 1
+
+
+def test_a_case_is_judged_by_its_robots_model(bench, tmp_path):
+    written_cases(bench, tmp_path)
+    quick = FitOptions(inputs="pressure", widths=(16, 16), epochs=60)
+    model = fitted(bench.before, quick, "measured", Cache(tmp_path / "fits"), silent)
+    robot = tmp_path / "robots" / "trunk"
+    save_model(model, robot / "model", {})
+    assert model_of(robot) == robot / "model"
+    turned = judge(find_cases(tmp_path)[0])
+    assert turned.answer.validated_mm == pytest.approx(model.validation.rmse_mm)
+    assert turned.answer.before_mm > 2.5  # 3 mm were injected, and the training rows hold them
+    assert turned.answer.ranking[0] == "misalignment"
+
+
+def test_counts_of_judged_cases():
+    def judged(truth: tuple[str, ...], kind: str, names: tuple[str, ...], confidence: float):
+        answer = Answer(kind, names, confidence, names, "", 2.0, 0.1, 1.0, 1.0, 0.1)
+        return Judged(CaseFolder(Path("c"), Path("r"), truth, truth, 1.0), answer)
+
+    table = cases_table(
+        [
+            judged(("creep",), "identified", ("creep",), 0.99),
+            judged(("creep",), "identified", ("drift",), 0.96),
+            judged(("creep", "payload"), "several", ("payload", "creep"), 0.9),
+            judged(("unknown",), "unknown_effect", ("unknown",), 0.0),
+            judged((), "identified", ("drift",), 0.5),
+            judged((), "nothing_missing", (), 0.0),
+        ]
+    )
+    assert "| right effect first in the ranking | 1 of 2 | .95 |" in table
+    assert "| two effects, both named | 1 of 1 | .85 |" in table
+    assert "| unknown called unknown | 1 of 1 | .80 |" in table
+    assert "| named where nothing changed | 1 of 2 | .02 |" in table
+    assert "| confidence >= 0.95 and right | 1 of 2 | .97 |" in table
+    assert "| wrong name with confidence >= 0.8 | 1 of 6 | 0 |" in table

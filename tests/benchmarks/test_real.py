@@ -9,6 +9,7 @@ from benchmarks.real.entries import FOLDER, Source, files_of, load_entries, part
 from benchmarks.real.study import Answer, Outcome
 from benchmarks.real.table import summary
 from surgisoft.cli import run
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, save_recording
 
 ENTRY = """
@@ -97,6 +98,7 @@ def test_a_complete_run(lab, tmp_path, capsys):
         ('["gain_mismatch"]', '["setup", "creep"]', "alone, or names of effects"),
         ("[after]", "[later]", "unknown field"),
         ('["after.parquet"]', "[]", "after.files: got a list []; expected at least one file"),
+        ('["after.parquet"]', '["/after.parquet"]', "relative to the data folder"),
         ('["after.parquet"]', '["after.parquet"]\nmap = "m.toml"', "no such file 'm.toml'"),
         ('["after.parquet"]', '["after.parquet"]\npart = [0.5, 0.5]', "two shares"),
         ('licence = "none"', "", "licence: missing"),
@@ -145,6 +147,9 @@ def test_files_match_as_in_a_shell(tmp_path):
         (tmp_path / name).write_text("")
     found = files_of(Source(("run_*.csv",)), tmp_path)
     assert [path.name for path in found] == ["run_1.csv", "run_2.csv"]
+    assert len(files_of(Source(("run_*.csv", "run_1.csv")), tmp_path)) == 2
+    with pytest.raises(InputError, match="not a pattern of files"):
+        files_of(Source(("run**.csv",)), tmp_path)
 
 
 def outcome(truth: tuple[str, ...], kind: str, names: tuple[str, ...], confidence: float):
@@ -164,12 +169,14 @@ def test_what_counts_as_named_and_as_misled():
     clean = outcome((), "nothing_missing", (), 0.0)
     false = outcome((), "identified", ("creep",), 0.6)
     strange = outcome((), "unknown_effect", ("unknown",), 0.1)
-    some = [alone, pair, three, wrong, unsure, clean, false, strange]
-    assert [each.named for each in some] == [True, True, False, False, False, True, False, False]
-    assert [each.misled for each in some] == [False, True, False, True] + 4 * [False]
+    turned = outcome((), "setup", ("setup",), 0.0)
+    some = [alone, pair, three, wrong, unsure, clean, false, strange, turned]
+    named = [True, True, False, False, False, True, False, False, False]
+    assert [each.named for each in some] == named
+    assert [each.misled for each in some] == [False, True, False, True] + 4 * [False] + [True]
     rows = summary(some)
     assert "| known change named, alone or in a set of 2 | 2 of 5 | 90% |" in rows
     assert "| ... alone | 1 of 5 | |" in rows
-    assert "| wrong name with confidence >= 0.8 | 2 of 8 | 0 |" in rows
-    assert "| named where nothing changed | 1 of 3 | 0 |" in rows
-    assert "| called unknown or set-up where nothing changed | 1 of 3 | |" in rows
+    assert "| wrong name with confidence >= 0.8 | 3 of 9 | 0 |" in rows
+    assert "| named where nothing changed | 2 of 4 | 0 |" in rows
+    assert "| called unknown where nothing changed | 1 of 4 | |" in rows

@@ -1,125 +1,258 @@
-"""The decision of a diagnosis, from evidence written down by hand."""
+"""The decision of a diagnosis, from evidence and fitted weights written down by hand."""
 
+import json
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from surgisoft.diagnosis.criteria import CRITERIA
-from surgisoft.diagnosis.decision import Evidence, confidence, decide, unnamed
+from surgisoft.diagnosis.criteria import CLAIM, Worth
+from surgisoft.diagnosis.decision import (
+    ASSET,
+    FEATURES,
+    DecisionModel,
+    Logistic,
+    claimable,
+    content_hash,
+    decide,
+    features_of,
+    load_decision,
+    probabilities,
+)
+from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
+from surgisoft.errors import InputError
 
+CREEP = EffectEvidence("creep", 0.95, 1.2, 3.2, 0.0, 0.0, 0.4, 1.0, 1, False, 0.0, 0.0, 0.0)
+"""An effect that explains nearly all."""
+LAG = replace(CREEP, effect="line_lag", gain=0.5, log_gain=0.4, left=1.4, margin=6.0, unique=0.0)
+"""An effect that explains half."""
+ALONE = ProposalEvidence(
+    effects=("creep",),
+    gain=0.95,
+    left_size=0.5,
+    left_log_box=-0.5,
+    form_gain=0.0,
+    form_log_gain=0.0,
+    form_z=0.0,
+    last_gain=0.95,
+    last_log_gain=1.2,
+    last_z=3.2,
+    last_alone=1.0,
+    better=2.0,
+)
 GOOD = Evidence(
-    before_over_floor=5.0,
-    static_share=0.1,
-    static_size=1.0,
-    static_size_after=1.0,
-    gain=0.9,
-    log_gain=1.0,
-    p_value=0.001,
-    runner_gain=0.0,
-    margin=5.0,
-    first_share=1.0,
-    unique=0.5,
-    explained_above_floor=0.9,
-    box_share=0.8,
-    box_p=0.001,
-    box_log_gain=0.0,
-    left_size=0.8,
-    loose_share=0.0,
-    loose_log_gain=0.0,
-    loose_p=1.0,
+    error_over_floor=5.0,
+    error_over_validated=3.0,
+    size=3.0,
+    size_beside_discrepancy=2.5,
+    held_static=0.1,
+    free_static=0.3,
+    free_box=0.9,
+    error_over_box=3.0,
+    box_gain=0.8,
+    box_log_gain=0.8,
+    box_z=3.2,
+    blocks=48,
     motions=40,
-    named=0,
-    rivals=0,
-    steps=(),
-    blocks=40,
+    effects=(CREEP, LAG),
+    proposals=(ALONE,),
 )
 """An effect is missing, and explains nearly all."""
 
 
-def evidence(names, rivals=(), further=0.0, wrong=False, **numbers):
-    steps = [*((name, 0.5, 0.5, 0.001) for name in names), ("other", further, 0.1, 0.5)]
-    return replace(
-        GOOD,
-        named=len(names),
-        steps=tuple(steps),
-        rivals=len(rivals),
-        competing=tuple(rivals),
-        form_wrong=wrong,
-        **numbers,
-    )
+def given_odds(missing=9.0, known=9.0, two=-9.0, network=-9.0, first=()):
+    """A decision whose probabilities do not depend on the evidence but for the first effect."""
+    constants = {"missing": missing, "known": known, "two": two, "network": network, "first": 0.0}
+    models = {
+        name: Logistic((0.0,) * len(features), constants[name])
+        for name, features in FEATURES.items()
+    }
+    weights = [dict(first).get(feature.name, 0.0) for feature in FEATURES["first"]]
+    models["first"] = Logistic(tuple(weights))
+    return DecisionModel(models, {})
 
 
-def said(names, rivals=(), further=0.0, wrong=False, **numbers):
-    decision = decide(evidence(names, rivals, further, wrong, **numbers))
-    return decision.kind, decision.effects
-
-
-def test_what_passed_and_explains_nearly_all_is_named():
-    assert said(("creep",)) == ("identified", ("creep",))
-    assert said(("creep", "payload")) == ("several", ("creep", "payload"))
-    assert said(("creep",), ["drift"]) == ("ambiguous", ("creep", "drift"))
-    assert said(("creep",), wrong=True) == ("unknown_effect", ())
+CLEAR = (("left", -9.0),)
+"""The effect that leaves least is the one."""
+PAIR = replace(ALONE, effects=("creep", "payload"))
+QUIET = replace(GOOD, error_over_floor=1.1, error_over_validated=0.9, error_over_box=1.1)
+STATIC = replace(QUIET, error_over_floor=2.0, error_over_box=1.6, free_static=0.85)
 
 
 @pytest.mark.parametrize(
-    ("name", "left", "explained", "kind"),
+    ("evidence", "model", "kind", "effects"),
     [
-        ("misalignment", 1.6, 0.71, "unknown_effect"),
-        ("misalignment", 1.4, 0.71, "identified"),
-        ("misalignment", 1.6, 0.97, "identified"),
-        ("softening", 1.6, 0.71, "identified"),
-        ("softening", 1.6, 0.60, "unknown_effect"),
+        (GOOD, given_odds(first=CLEAR), "identified", ("creep",)),
+        (GOOD, given_odds(), "ambiguous", ("creep", "line_lag")),
+        (
+            replace(GOOD, proposals=(ALONE, PAIR)),
+            given_odds(two=9.0, first=CLEAR),
+            "several",
+            ("creep", "payload"),
+        ),
+        (GOOD, given_odds(known=-3.0), "unknown_effect", ()),
+        (QUIET, given_odds(missing=-9.0), "nothing_missing", ()),
+        (STATIC, given_odds(missing=-9.0, network=3.0), "surrogate_undertrained", ()),
+        (GOOD, given_odds(missing=0.0, known=0.0, first=CLEAR), "cannot_tell", ()),
     ],
 )
-def test_a_frame_or_a_weight_leaves_less_than_what_rubber_does(name, left, explained, kind):
-    numbers = {"left_size": left, "explained_above_floor": explained}
-    assert said((name,), **numbers)[0] == kind
-    if name != "softening":
-        assert said((name, "softening"), **numbers)[0] == "several"
+def test_every_kind_of_result(evidence, model, kind, effects):
+    found = decide(evidence, model)
+    assert (found.kind, found.effects) == (kind, effects)
+    assert 0.0 <= found.confidence <= 1.0
+    assert (found.reason is not None) == (kind == "cannot_tell")
 
 
-def test_the_next_effect_counts_for_what_rubber_does():
-    numbers = {"left_size": 1.6, "explained_above_floor": 0.6}
-    assert said(("softening",), further=0.3, **numbers)[0] == "identified"
-    assert said(("misalignment",), further=0.3, **numbers)[0] == "unknown_effect"
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"free_static": 0.85}, "network"),
+        ({"error_over_validated": 1.0}, "learned"),
+        ({"motions": 12}, "few_data"),
+        ({}, "schedule"),
+    ],
+)
+def test_why_it_cannot_be_told(changes, reason):
+    quiet = given_odds(missing=0.0, known=-1.0)
+    found = decide(replace(GOOD, **changes), quiet, Worth(wrong_network=-4.0))
+    assert (found.kind, found.reason) == ("cannot_tell", reason)
 
 
-def test_a_black_box_that_does_far_better_makes_it_unknown_only_where_it_is_sure():
-    better = {"left_size": 1.1, "box_share": 0.97, "box_log_gain": 0.4}
-    assert said(("creep",), **better)[0] == "unknown_effect"
-    assert said(("creep",), **better, motions=5)[0] == "identified"
-    assert said(("creep",), **(better | {"left_size": 0.9}))[0] == "identified"
+@pytest.mark.parametrize("over", [1.6, 3.0, 9.0])
+def test_an_error_far_above_the_validated_one_is_never_nothing(over):
+    sure_of_nothing = given_odds(missing=-20.0)
+    found = decide(replace(QUIET, error_over_validated=over), sure_of_nothing)
+    assert found.kind != "nothing_missing"
+    assert decide(QUIET, sure_of_nothing).kind == "nothing_missing"
 
 
-def test_nothing_named_is_nothing_missing_too_far_off_or_badly_trained():
-    quiet = replace(GOOD, box_share=0.1, before_over_floor=2.5)
-    assert unnamed(quiet) == "nothing_missing"
-    assert unnamed(replace(quiet, left_size=1.6)) == "unknown_effect"
-    assert unnamed(replace(quiet, left_size=1.6, before_over_floor=1.2)) == "nothing_missing"
-    assert unnamed(replace(quiet, left_size=1.2, box_share=0.4)) == "unknown_effect"
-    assert unnamed(replace(quiet, static_share=0.6)) == "surrogate_undertrained"
+def test_nothing_is_claimed_near_the_floor_or_near_the_black_box_alone():
+    assert claimable(replace(QUIET, error_over_box=3.0))
+    assert claimable(replace(QUIET, error_over_floor=5.0))
+    far = replace(QUIET, error_over_floor=5.8, error_over_box=1.8)
+    assert not claimable(far)
+    assert decide(far, given_odds(missing=-9.0)).kind == "cannot_tell"
+    assert claimable(far, replace(CLAIM, near_box=2.0))
 
 
-def test_confidence_falls_with_the_runner_up_and_with_the_lack_of_fit():
-    """Against the logistic curve by hand: 5.38 log odds alone, 1.47 less beside an equal effect."""
-    alone = confidence(evidence(("creep",), gain=0.9))
-    assert alone == pytest.approx(1 / (1 + 2.718281828**-5.38))
-    beside = confidence(evidence(("creep",), gain=0.9, runner_gain=0.9))
-    assert beside == pytest.approx(1 / (1 + 2.718281828 ** -(5.38 - 1.47)))
-    loose = confidence(evidence(("creep",), loose_share=0.1, loose_log_gain=0.4))
-    assert loose == pytest.approx(1 / (1 + 2.718281828 ** -(5.38 - 128 * 0.04)))
-    assert confidence(evidence(("coupling",))) < alone
-    assert confidence(evidence(())) == 0.0
+def test_probabilities_by_hand():
+    """The rival leaves 0.52 of what the best one leaves 0.07, so log(0.52 / 0.07) / 2, weight 2."""
+    found = probabilities(GOOD, given_odds(1.0, 2.0, network=-1.0, first=(("left", -2.0),)))
+
+    def chance(odds):
+        return 1.0 / (1.0 + math.exp(-odds))
+
+    first = chance(1.0) * chance(2.0) * chance(math.log(0.52 / 0.07))
+    assert found.effects["creep"] == pytest.approx(first)
+    assert found.effects["line_lag"] == pytest.approx(
+        chance(1.0) * chance(2.0) * chance(-math.log(0.52 / 0.07))
+    )
+    assert found.unknown == pytest.approx(chance(1.0) * chance(-2.0) * chance(1.0))
+    assert found.nothing == pytest.approx(chance(-1.0) * chance(1.0))
+    assert found.network == pytest.approx((1.0 - chance(1.0) * chance(2.0)) * chance(-1.0))
+    total = found.nothing + found.network + found.unknown + found.known
+    assert total == pytest.approx(1.0)
 
 
-def test_what_is_hardly_likely_is_not_named():
-    unlikely = evidence(("creep",), loose_share=0.5, loose_log_gain=0.5)
-    assert decide(unlikely).kind != "identified"
-    assert decide(unlikely).effects == ()
+def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():
+    twins = replace(GOOD, effects=(CREEP, replace(CREEP, effect="gain_mismatch")))
+    found = decide(twins, given_odds(first=CLEAR))
+    assert found.kind == "ambiguous"
+    assert set(found.effects) == {"creep", "gain_mismatch"}
+    assert found.probabilities.effects["creep"] == pytest.approx(0.5, abs=0.01)
 
 
-def test_other_criteria_give_another_decision():
-    asked = replace(CRITERIA, decision=replace(CRITERIA.decision, explained=0.5))
-    poor = evidence(("softening",), left_size=1.6, explained_above_floor=0.6)
-    assert decide(poor).kind == "unknown_effect"
-    assert decide(poor, asked).kind == "identified"
+weights = st.lists(st.floats(0.0, 5.0), min_size=12, max_size=12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(weights, st.floats(-4.0, 4.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_more_that_is_explained_makes_nothing_less_probable(values, constant, low, high):
+    """For any weights of the right signs the probability that something is missing rises with the
+    share that is explained, and that of something unknown falls."""
+    models = {
+        name: Logistic(tuple(f.sign * w for f, w in zip(features, values, strict=False)), constant)
+        for name, features in FEATURES.items()
+    }
+    model = DecisionModel(models, {})
+    low, high = sorted((low, high))
+    less, more = (replace(GOOD, proposals=(replace(ALONE, gain=gain),)) for gain in (low, high))
+    quiet, loud = probabilities(less, model), probabilities(more, model)
+    assert loud.nothing + loud.network <= quiet.nothing + quiet.network + 1e-12
+    known = [one.known / max(1.0 - one.nothing - one.network, 1e-12) for one in (quiet, loud)]
+    assert known[1] >= known[0] - 1e-9
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(["gain", "margin", "collinear"]), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_an_effect_is_less_probable_the_less_it_does(name, a, b):
+    """With the weights in force: that explains less, or that the best one beats by more."""
+    worse, better = sorted((a, b), reverse=name == "margin")
+    chances = [
+        probabilities(replace(GOOD, effects=(CREEP, replace(LAG, **{name: value})))).effects
+        for value in (worse, better)
+    ]
+    assert chances[0]["line_lag"] <= chances[1]["line_lag"] + 1e-12
+
+
+def test_how_sure_the_blocks_are_does_not_tell_two_apart_that_do_the_same():
+    """At an angle of 0.1 the margin counts up to sqrt(0.01 / 0.02) standard errors."""
+    twin = replace(LAG, gain=CREEP.gain, collinear=0.99)
+    place = [feature.name for feature in FEATURES["first"]].index("margin")
+    for margin in (2.0, 20.0):
+        rows = features_of("first", replace(GOOD, effects=(CREEP, replace(twin, margin=margin))))
+        assert rows[1, place] == pytest.approx(math.sqrt(0.5) / 3.0)
+
+
+def test_the_weights_in_force_have_the_signs_of_their_features():
+    model = load_decision()
+    for name, features in FEATURES.items():
+        for feature, weight in zip(features, model.models[name].weights, strict=True):
+            assert weight * feature.sign >= 0.0, (name, feature.name)
+
+
+def test_features_are_finite_of_order_one():
+    for evidence in (GOOD, QUIET, replace(GOOD, effects=(), proposals=())):
+        for name in FEATURES:
+            values = features_of(name, evidence)
+            assert np.isfinite(values).all()
+            assert (np.abs(values) <= 4.0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda v: v["models"]["missing"]["weights"].update(above_floor=99.0), "hash"),
+        (lambda v: v.update(schema=99), "schema 99"),
+        (lambda v: v["models"]["missing"]["weights"].pop("above_floor"), "hash"),
+    ],
+)
+def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
+    values = json.loads(ASSET.read_text())
+    change(values)
+    bad = tmp_path / "decision.json"
+    bad.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=told) as caught:
+        load_decision(bad)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_asset_of_other_features_is_refused(tmp_path):
+    values = json.loads(ASSET.read_text())
+    values["models"]["missing"]["weights"] = {"other": 1.0}
+    values["sha256"] = content_hash(values)
+    bad = tmp_path / "decision.json"
+    bad.write_text(json.dumps(values))
+    with pytest.raises(InputError, match="expected above_floor"):
+        load_decision(bad)
+    bad.write_text("no json")
+    with pytest.raises(InputError, match="no fitted decision"):
+        load_decision(bad)
+
+
+def test_evidence_survives_json():
+    full = replace(GOOD, proposals=(ALONE, replace(PAIR, instead=("drift",), instead_left=(0.1,))))
+    assert Evidence.from_json(json.loads(json.dumps(full.to_json()))) == full

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.diagnosis.diagnose import diagnose, within_the_discrepancy
+from surgisoft.diagnosis.diagnose import diagnose, would_explain
 from surgisoft.diagnosis.residuals import Floor, held_out_rows, residual_table
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
@@ -128,9 +128,10 @@ def test_too_little_data_is_told(tmp_path, capsys):
     assert len(error.strip().splitlines()) == 1
 
 
-def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
-    """Named second, absent from the effects alone: it stands as it does on top of the first."""
+def test_an_effect_that_is_plausible_only_beside_another_is_ranked():
+    """Named second, absent from the effects alone: its row has its score on top of the first."""
     from surgisoft.diagnosis.candidates import candidates
+    from surgisoft.diagnosis.decision import Decision, Probabilities
     from surgisoft.diagnosis.diagnose import result_of
     from surgisoft.diagnosis.residuals import problem_of
     from surgisoft.diagnosis.selection import find
@@ -139,8 +140,13 @@ def test_an_effect_that_is_plausible_only_beside_another_is_ranked(monkeypatch):
     found = find(problem, candidates(problem, ["creep", "misalignment"]), lambda text: None)
     second = next(s for s in found.first if s.effect == "misalignment")
     first = [s for s in found.first if s.effect != "misalignment"]
-    both = replace(found, first=first, named=[*found.named, second])
-    assert [row.effect for row in result_of(both).ranking] == ["creep", "misalignment"]
+    pair = replace(found.proposals[0], scores=(first[0], second))
+    both = replace(found, first=first, proposals=(*found.proposals[:1], pair))
+    two = ("creep", "misalignment")
+    chances = Probabilities(0.0, 0.0, 0.1, {"creep": 0.9}, 0.85, two)
+    result = result_of(both, Decision("several", two, 0.85, chances))
+    assert [row.effect for row in result.ranking] == ["creep", "misalignment"]
+    assert [row.confidence for row in result.ranking] == [0.9, 0.85]
 
 
 def test_what_was_taken_off_the_bench_is_not_named(tmp_path, capsys):
@@ -170,49 +176,49 @@ def test_what_is_weak_about_the_data_is_told(found):
     assert "shakes the arm" in data_quality_warnings(shaken)[0]
 
 
-def test_rivals_of_one_of_several_are_told():
-    """Beside b a third effect does as well as a does; beside a none does as well as b."""
-    from types import SimpleNamespace
-
-    from surgisoft.diagnosis.selection import Option, Score, competing
-
-    def standing(effect, number, gain):
-        log_gain = gain + 0.05 * np.random.default_rng(number).normal(size=40)
-        return Score(effect, Option(effect, (number,), 0), log_gain, log_gain, 0.001, gain)
-
-    a, b, c, d = (
-        standing(n, k, g)
-        for k, (n, g) in enumerate(zip("abcd", (0.6, 0.5, 0.595, 0.3), strict=True))
-    )
-    beside = {(1,): [a, c, d], (0,): [b, d]}
-    race = SimpleNamespace(
-        scores=lambda base, without: beside[base],
-        problem=SimpleNamespace(by_motion=lambda values: values),
-    )
-    assert competing(race, [], [a, b]) == ["c"]
-    assert competing(race, [a, c, d], [a]) == ["c"]
-    assert competing(race, [], []) == []
-
-
 @pytest.mark.parametrize(
-    ("effect", "gain", "chance", "size", "told"),
+    ("effect", "kind", "chance", "size", "told"),
     [
-        ("creep", 0.44, 0.001, 0.9, "fit --effects creep"),
-        ("payload", 0.44, 0.001, 0.9, "payload would explain 44 %"),
-        ("creep", 0.20, 0.001, 0.9, None),
-        ("creep", 0.44, 0.100, 0.9, None),
-        ("creep", 0.44, 0.001, 1.1, None),
+        ("creep", "nothing_missing", 0.4, 0.9, "fit --effects creep"),
+        ("payload", "cannot_tell", 0.4, 0.9, "payload would explain 44 %"),
+        ("creep", "nothing_missing", 0.1, 0.9, None),
+        ("creep", "identified", 0.4, 0.9, None),
+        ("creep", "nothing_missing", 0.4, 1.1, None),
     ],
 )
-def test_what_would_explain_an_errorwithin_the_fit_s_own_is_told(effect, gain, chance, size, told):
-    best = SimpleNamespace(effect=effect, gain=gain, p_value=chance)
+def test_what_would_explain_an_error_of_the_fit_is_told(effect, kind, chance, size, told):
+    best = SimpleNamespace(effect=effect, gain=0.44)
     race = SimpleNamespace(whole_size=size, in_fit=lambda name: False)
     found = SimpleNamespace(first=[best], selection=race)
-    checks = within_the_discrepancy(found, "nothing_missing")
+    decision = SimpleNamespace(kind=kind, probabilities=SimpleNamespace(effects={effect: chance}))
+    checks = would_explain(found, decision)
     assert len(checks) == (told is not None)
     assert told is None or told in checks[0]
     assert told is None or ("fit --effects" in checks[0]) == (effect == "creep")
-    assert within_the_discrepancy(found, "identified") == []
+
+
+def test_steady_state_samples_rank_no_rates(tmp_path, capsys):
+    """Lag, viscosity and inertia are over when a sample is taken: not ranked, and said to be so."""
+    rig = VirtualRig(0, take=4, hidden=[("payload", 1.5)])
+    settled = rig.record(make_protocol("grid", rig.limits, 400, seed=4))[0]
+    result = diagnose(default_arm(), [settled])
+    absent = {each.effect: each.cause for each in result.not_testable}
+    for name in ("line_lag", "rate_dependence", "inertia"):
+        assert absent[name] == "no_motion"
+        assert name not in [row.effect for row in result.ranking]
+    assert "payload" in [row.effect for row in result.ranking]
+    moving = diagnose(default_arm(), [recorded(points=2400)])
+    assert not {"line_lag", "rate_dependence"} & {each.effect for each in moving.not_testable}
+    save_recording(settled, tmp_path / "x.parquet")
+    assert run(["diagnose", "default", str(tmp_path / "x.parquet")]) == 0
+    assert "not testable: line_lag" in capsys.readouterr().out
+
+
+def test_all_shares_of_a_diagnosis_are_between_0_and_1(found):
+    for result in found.values():
+        for row in result.ranking:
+            for value in (row.gain_alone, row.gain_unique, row.confidence):
+                assert 0.0 <= value <= 1.0
 
 
 def test_held_out_rows_change_nothing(found):

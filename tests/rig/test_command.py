@@ -89,3 +89,13 @@ def test_refuses_to_overwrite_and_unknown_suffixes_before_working(tmp_path, caps
     assert out.read_text() == "mine"
     assert run(["collect", "grid", "-o", str(tmp_path / "r.xlsx")]) == 2
     assert "expected .csv or .parquet" in capsys.readouterr().err
+
+
+def test_the_elastica_rig_without_pyelastica_says_what_to_install(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    out = tmp_path / "r.parquet"
+    assert run(["collect", "mixed", "--rig", "elastica", "-o", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "PyElastica, which is not installed: pip install 'surgisoft[elastica]'" in error
+    assert error.count("\n") == 1
+    assert not out.exists()

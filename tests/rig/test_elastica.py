@@ -28,6 +28,7 @@ from surgisoft.rig.elastica.rod import (
     straight_body,
 )
 from surgisoft.rig.elastica.wall import Wall, new_memory, strain_wall
+from surgisoft.rig.interface import Rig, SimulatedRig
 
 PLAIN = Wall(np.zeros(2), np.ones(2), np.zeros(3), 0.0, 0.0, 0.0)
 """A linear wall."""
@@ -216,7 +217,7 @@ def test_flow_is_that_of_iso_6358(high, low):
 def test_a_narrow_tube_fills_its_chamber_in_the_time_of_the_integral():
     """t = int V dp / (C p_1 phi(p / p_1)), from the room to 40 kPa with the tube held at 50 kPa."""
     gas = Gas(
-        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 0.0
+        300e3, 50e3, 1e-3, 1e2, np.array([1e-4]), np.array([3e-7]), np.zeros(1), 1e9, 0.0
     )  # a tube of a litre's tenth holds its pressure
     air = Air(np.array([50e3]), np.array([50e3]), np.zeros(1), np.array([2e-6]))
     one = AMBIENT_PA + 50e3
@@ -300,6 +301,10 @@ def brief(rig, seconds=2.0):
 
 
 def test_it_is_a_rig_that_collect_drives(rig):
+    members = {name for name in dir(SimulatedRig) if not name.startswith("_")}
+    assert {"command", "read", "read_beside_truth", "gravity"} <= members
+    for name in members | set(Rig.__annotations__):
+        assert hasattr(rig, name), name
     recording = collect(rig, brief(rig))
     assert recording.samples == round(2.0 / rig.period_s)
     assert recording.key_points == rig.key_planes

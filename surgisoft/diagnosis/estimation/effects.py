@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.candidates import Candidate, candidates, with_effect
-from surgisoft.diagnosis.criteria import CRITERIA
+from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.cross_validation import cross_validation_of
 from surgisoft.diagnosis.estimation.intervals import Parameter, intervals
 from surgisoft.diagnosis.estimation.least_squares import (
@@ -146,7 +146,7 @@ def _added(problem: Problem, name: str) -> ArmModel:
         else:
             misfit = fit_all(model, problem, [name], FIRST_ITERATIONS).misfit
         values = sum(p.numel() for p in effect.amplitudes().values())
-        tried.append((misfit * (1.0 + CRITERIA.selection.amplitude_price) ** values, model))
+        tried.append((misfit * (1.0 + SEARCH.amplitude_price) ** values, model))
     return min(tried, key=lambda one: one[0])[1]
 
 
@@ -168,7 +168,7 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
     picks = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
     before = validation.losses().sum()
     gains = [np.log(before / validation.losses(pick).sum()) for pick in picks]
-    selection = CRITERIA.selection
+    selection = SEARCH
     scores = [selection.priced(gain, len(pick)) for gain, pick in zip(gains, picks, strict=True)]
     models = []
     for best in np.argsort(scores)[::-1][:number]:

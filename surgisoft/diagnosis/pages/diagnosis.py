@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
@@ -15,13 +16,13 @@ HOW = (
     "order in its amplitudes, beside a flexible function of actuation and direction that stands "
     "for the model discrepancy and has the size of the model's validated error. Effects are "
     "compared by the error on held-out blocks of time.\n\n"
-    "Alone: the share of the held-out squared error above the noise floor that this effect removes "
-    "by itself. Unique: the share that returns when it is left out of all effects together. Of "
-    "collinear effects, which predict nearly the same change, the first is large and the second "
-    "small.\n\n"
+    "Alone: the share of what can be explained of the held-out squared error (what lies above the "
+    "noise floor) that this effect removes by itself. Unique: the share that returns when it is "
+    "left out of all effects together. Of collinear effects, which predict nearly the same change, "
+    "the first is large and the second small.\n\n"
     "P-value: how often random signs of the blocks' gains give so large a gain in any of the "
-    "effects (family-wise). Confidence: how often such a result was right on virtual robots whose "
-    "missing effect was known; see the benchmark.\n\n"
+    "effects (family-wise). Confidence: the calibrated probability that the effect is missing, "
+    "fitted to robots whose missing effect was known; see the benchmark.\n\n"
     "Best achievable error: the least error on held-out blocks that the model, a black box or any "
     "effect reached.\n\n"
     "The diagnosis did not see the last quarter of each recording: `surgisoft amend` validates its "
@@ -66,6 +67,15 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         parts.append(_setup(found.setup))
     else:
         parts.append(Section("Effects", [_chart(found), _ranking(found)]))
+        if found.not_testable:
+            rows = [(each.effect, each.reason) for each in found.not_testable]
+            note = Text("These recordings cannot show these effects, so they are not ranked.")
+            parts.append(Section("Not testable", [note, Table(["effect", "reason"], rows)]))
+        if found.probabilities:
+            parts.append(_probabilities(found.probabilities))
+        if found.next_command:
+            command = found.next_command.format(model="MODEL", data="RECORDINGS", before="")
+            parts.append(Section("What to do", [Text(f"`{command}`")]))
     if found.change:
         parts.append(_change(found))
     if found.refit is not None:
@@ -251,6 +261,19 @@ def _refit(refit: Refit) -> Section:
     return Section(
         "Fitted together", [Text(text), Table(header, rows), Text(f"Not tried: {left}.")]
     )
+
+
+def _probabilities(chances: Probabilities) -> Section:
+    """What may be true, with the calibrated probabilities."""
+    rows = [
+        ("nothing is missing", f"{chances.nothing:.2f}"),
+        ("nothing but a better network", f"{chances.network:.2f}"),
+        ("an effect of the list", f"{chances.known:.2f}"),
+        ("something outside the list", f"{chances.unknown:.2f}"),
+    ]
+    if chances.two:
+        rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))
+    return Section("Probabilities", [Table(["what may be true", "probability"], rows)])
 
 
 def _parameters(found: Diagnosis) -> Section:

@@ -43,7 +43,9 @@ class Gas(NamedTuple):
     line: np.ndarray
     """(m,) conductance of each tube [m^3/s]."""
     leak: np.ndarray
-    """(m,) conductance of a hole in each chamber to the room [m^3/s]."""
+    """(m,) conductance of a crack in each chamber to the room, at twice `opens` [m^3/s]."""
+    opens: float
+    """Pressure above which a crack opens, the wider the higher the pressure [Pa gauge]."""
     bulge: float
     """Volume that a chamber gains with pressure, per its volume [1/Pa]."""
 
@@ -97,7 +99,10 @@ def fill_chambers(gas: Gas, air: Air, step: float, volumes: np.ndarray) -> None:
         even = (line - chamber) * gas.tube[i] * room / (gas.tube[i] + room)
         if abs(passed) > abs(even):
             passed = even
-        lost = step * flow(gas.leak[i], chamber, AMBIENT_PA) if gas.leak[i] > 0.0 else 0.0
+        lost = 0.0
+        if gas.leak[i] > 0.0 and air.chamber[i] > gas.opens:
+            wide = gas.leak[i] * (air.chamber[i] / gas.opens - 1.0)
+            lost = step * flow(wide, chamber, AMBIENT_PA)
         held = chamber * air.volume[i] + passed - lost
         air.line[i] = line + (fed - passed) / gas.tube[i] - AMBIENT_PA
         air.chamber[i] = held / room - AMBIENT_PA

@@ -130,6 +130,11 @@ def _coupling(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     _set(setup, stolen=stolen)
 
 
+def _inertia(setup: Setup, strength: float, rng: np.random.Generator) -> None:
+    """A damper that holds less: the rod's own inertia lets the arm swing after a step."""
+    _set(setup, keep=setup.plant.keep ** math.exp(-1.2 * strength))
+
+
 def _payload(setup: Setup, strength: float, rng: np.random.Generator) -> None:
     setup.body.mass[-1] += 0.03 * strength * setup.body.mass.sum()
 
@@ -203,10 +208,11 @@ def _stick_slip(setup: Setup, strength: float, rng: np.random.Generator) -> None
 
 
 def _leak(setup: Setup, strength: float, rng: np.random.Generator) -> None:
-    """A hole in one chamber: the flow along the tube takes pressure away."""
+    """A crack in one chamber that opens at high pressure: the flow along the tube takes pressure
+    away. (A hole that is always open takes a share of the pressure, which is another gain.)"""
     leak = np.zeros(len(setup.plant.areas))
     chamber = int(rng.integers(len(leak)))
-    leak[chamber] = 0.12 * strength * setup.plant.gas.line[chamber]
+    leak[chamber] = 0.3 * strength * setup.plant.gas.line[chamber]
     _set_gas(setup, leak=leak)
 
 
@@ -220,6 +226,7 @@ HIDDEN: dict[str, Hidden] = {
     "dead_zone": Hidden("material", "folded membranes that have to unfold", _dead_zone),
     "gain_mismatch": Hidden("material", "one chamber of another area", _gain_mismatch),
     "coupling": Hidden("material", "chambers bulge into their neighbours", _coupling),
+    "inertia": Hidden("material", "less damping: the arm swings", _inertia),
     "payload": Hidden("body", "unweighed mass at the tip", _payload),
     "contact": Hidden("body", "a stiff wall beside the arm", _contact),
     "misalignment": Hidden("sensor", "camera frame turned and shifted", _misalignment),
@@ -228,7 +235,7 @@ HIDDEN: dict[str, Hidden] = {
     "twist": Hidden("body", "fibres at an angle: pressure twists the arm", _twist),
     "breathing": Hidden("body", "the base moves with a breathing body", _breathing),
     "stick_slip": Hidden("body", "a bracket with dry friction that yields in jerks", _stick_slip),
-    "leak": Hidden("line", "a hole in one chamber", _leak),
+    "leak": Hidden("line", "a crack in one chamber that opens at high pressure", _leak),
     "knock": Hidden("body", "the bracket is knocked aside at one moment", _knock),
 }
 

@@ -78,6 +78,7 @@ def make_robot(
         tube=volumes.mean() * rng.uniform(0.4, 0.8, m),
         line=volumes.mean() / rng.uniform(0.15, 0.4) * np.ones(m),
         leak=np.zeros(m),
+        opens=0.4 * high,
         bulge=rng.uniform(0.0, 0.3) / high,
     )
     tilt = np.radians(rng.normal(0.0, 0.6, 2))

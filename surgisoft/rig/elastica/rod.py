@@ -3,8 +3,10 @@
 The mechanics are PyElastica's own (Gazzola, Dudte, McCormick & Mahadevan 2018): its kernels compute
 internal forces and torques, accelerations, rotations, gravity and contact with a plane, in the
 order of its position Verlet integrator, with its analytical linear damper and its clamped end. Only
-the loop around the kernels is new, because PyElastica's loop spends over nine tenths of its time in
-the interpreter on a rod of a dozen elements. A test holds that both loops give the same motion.
+the loop around the kernels is new: wall, chambers and air are stepped with the rod, and
+PyElastica's loop takes over twice the time of its kernels on a rod of a dozen elements (17 against
+7 us a step).
+A test holds that both loops give the same motion.
 
 What an arm has beyond PyElastica's linear rod (pressurised chambers, friction, viscosity) enters by
 the rod's rest strains: PyElastica's internal couple is B (kappa - rest_kappa) and its internal

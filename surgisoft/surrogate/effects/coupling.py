@@ -114,4 +114,4 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 # A chamber loses push in one way; products both ways round the ring would be a twist.
-HYPOTHESIS = Hypothesis(Coupling, _grid, combinations=no_combinations, mimic_log_odds=-2.35)
+HYPOTHESIS = Hypothesis(Coupling, _grid, combinations=no_combinations)

@@ -43,9 +43,9 @@ class Hypothesis:
     exact_form: bool = False
     """Whether real arms have exactly this formula, as with a rotated frame or a weight. Then the
     effect must explain more before it is named, because nothing but noise may be left of it."""
-    mimic_log_odds: float = 0.0
-    """Log odds of a diagnosis that names the effect. Below 0 for an effect that causes outside the
-    known effects look like; fitted together with `diagnosis.criteria.Calibration`."""
+    needs_motion: bool = False
+    """Whether the effect shows only while the actuation moves or shortly after, as a lag does:
+    steady-state samples cannot show it."""
     absent_in: str = ""
     """Experimental setup (`diagnosis.design.schedules.SETUPS`) in which the effect cannot act;
     empty: there is none."""

@@ -219,4 +219,4 @@ def _further(facts: ArmFacts, points: Tensor) -> list[Effect]:
     return [Hysteresis(facts, FEW_RADII, True, False, others) for others in some]
 
 
-HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True, mimic_log_odds=-1.85)
+HYPOTHESIS = Hypothesis(Hysteresis, _grid, _further, needs_reversals=True)

@@ -126,4 +126,4 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     return [Inertia(facts, *mode) for mode in GRID]
 
 
-HYPOTHESIS = Hypothesis(Inertia, _grid)
+HYPOTHESIS = Hypothesis(Inertia, _grid, needs_motion=True)

@@ -195,4 +195,10 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 # A chamber has one line; lags of both signs together would be a lead.
-HYPOTHESIS = Hypothesis(LineLag, _grid, combinations=no_combinations, absent_in="short_tube")
+HYPOTHESIS = Hypothesis(
+    LineLag,
+    _grid,
+    combinations=no_combinations,
+    needs_motion=True,
+    absent_in="short_tube",
+)

@@ -128,4 +128,4 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 
 # A wall has one fluid; several of both signs together would be a lead.
-HYPOTHESIS = Hypothesis(RateDependence, _grid, combinations=no_combinations)
+HYPOTHESIS = Hypothesis(RateDependence, _grid, combinations=no_combinations, needs_motion=True)

@@ -1,0 +1,210 @@
+"""Fit of the decision to stored evidence: five logistic models with weights of fixed sign.
+
+Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
+sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, however many cases
+it has. The penalty of each model is chosen by leaving out one robot after another within the cases
+that the model is fitted to, so nothing of a source that is left out enters.
+"""
+
+import datetime
+import hashlib
+import json
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import optimize
+
+from benchmarks.decision.evidence_log import Labelled
+from surgisoft.diagnosis.decision import (
+    FEATURES,
+    SCHEMA,
+    DecisionModel,
+    Logistic,
+    content_hash,
+    features_of,
+)
+
+PENALTIES = (0.1, 0.3, 1.0, 3.0)
+"""Ridge penalties on the weights that are tried: inverse variances of a normal prior around 0, for
+features of order 1."""
+CONSTANT_PENALTY = 0.01
+"""Ridge penalty on the constant."""
+WEAK = 0.5
+"""Change by what is missing, over the validated error, below which "nothing" is right too: such
+cases take no part in the fit of `missing`."""
+ROBOT_FOLDS = 5
+"""Groups of robots that are left out in turn for the choice of a penalty."""
+
+
+def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
+    """(features, right, case) of the cases that a model is fitted to.
+
+    `right` is 0 or 1; for `first` (E,) whether each effect is missing.
+    """
+    answer = []
+    for case in cases:
+        if case.label == "setup" or not case.evidence.effects:
+            continue
+        missing = case.label in ("known", "unknown")
+        if name == "missing":
+            if (missing and case.size < WEAK) or case.label == "other_robot":
+                continue
+            right = np.array(float(missing))
+        elif name == "known":
+            other = case.label == "other_robot"
+            if not other and (not missing or case.size < WEAK):
+                continue
+            right = np.array(float(case.label == "known"))
+        elif name == "network":
+            if case.label == "known":
+                continue
+            right = np.array(float(case.label in ("network", "other_robot")))
+        elif name == "two":
+            pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
+            if case.label != "known" or not pair or case.size < WEAK:
+                continue
+            right = np.array(float(len(case.truth) == 2 and set(pair[0]) == set(case.truth)))
+        else:
+            names = [one.effect for one in case.evidence.effects]
+            right = np.array([float(one in case.truth) for one in names])
+            if case.label != "known" or not right.any() or case.size < WEAK:
+                continue
+        answer.append((features_of(name, case.evidence), right, case))
+    return answer
+
+
+def source_weights(cases: Sequence[Labelled]) -> np.ndarray:
+    """(N,) weights of cases of mean 1, so that every source has the same sum."""
+    names = [case.source for case in cases]
+    number = {name: names.count(name) for name in names}
+    return np.array([len(names) / len(number) / number[name] for name in names])
+
+
+def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
+    """(N,) negative log likelihood of each case."""
+    answer = []
+    for features, right, _ in some:
+        odds = model.log_odds(features)
+        if name == "first":
+            odds = odds - odds.max()
+            answer.append(np.log(np.exp(odds).sum()) - np.log(np.exp(odds) @ right))
+        else:
+            answer.append(np.logaddexp(0.0, odds) - right * odds)
+    return np.array(answer, float)
+
+
+def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
+    """One logistic model of given penalty."""
+    features = FEATURES[name]
+    signs = np.array([feature.sign for feature in features], float)
+    if not some:
+        return Logistic(tuple(0.0 for _ in features))
+    weights = source_weights([case for _, _, case in some])
+    joint = name == "first"
+    if joint:
+        x = [rows for rows, _, _ in some]
+        y = [right for _, right, _ in some]
+    else:
+        x, y = np.array([row for row, _, _ in some]), np.array([right for _, right, _ in some])
+
+    def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
+        w, constant = values[:-1], values[-1]
+        prior = 0.5 * penalty * w @ w + 0.5 * CONSTANT_PENALTY * constant**2
+        slope = np.append(penalty * w, CONSTANT_PENALTY * constant)
+        total = prior
+        if joint:
+            for weight, rows, right in zip(weights, x, y, strict=True):
+                odds = rows @ w
+                share = np.exp(odds - odds.max())
+                share /= share.sum()
+                hit = share @ right
+                total -= weight * np.log(max(hit, 1e-300))
+                slope[:-1] += weight * (share @ rows - (share * right / hit) @ rows)
+            return float(total), slope
+        odds = x @ w + constant
+        total += float(weights @ (np.logaddexp(0.0, odds) - y * odds))
+        off = weights * (1.0 / (1.0 + np.exp(-np.clip(odds, -500, 500))) - y)
+        slope[:-1] += off @ x
+        slope[-1] += off.sum()
+        return float(total), slope
+
+    bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in signs]
+    bounds.append((0.0, 0.0) if joint else (None, None))
+    start = np.append(0.1 * signs, 0.0)
+    found = optimize.minimize(
+        loss,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"ftol": 1e-13, "gtol": 1e-8, "maxiter": 2000},
+    )
+    return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
+
+
+def _robot_folds(some: Sequence) -> np.ndarray:
+    """(N,) fold of each case: whole robots together."""
+    robots = [f"{case.source}/{case.robot}" for _, _, case in some]
+    names = sorted(set(robots))
+    return np.array([names.index(robot) % ROBOT_FOLDS for robot in robots])
+
+
+def penalty_of(name: str, some: Sequence) -> float:
+    """The penalty with the least held-out loss, one group of robots left out in turn."""
+    fold = _robot_folds(some) if some else np.zeros(0)
+    if len(np.unique(fold)) < 2:
+        return PENALTIES[-1]
+    weights = source_weights([case for _, _, case in some])
+    totals = []
+    for penalty in PENALTIES:
+        total = 0.0
+        for number in np.unique(fold):
+            train = [one for one, f in zip(some, fold, strict=True) if f != number]
+            left = [one for one, f in zip(some, fold, strict=True) if f == number]
+            model = fit_one(name, train, penalty)
+            total += float(weights[fold == number] @ log_losses(name, model, left))
+        totals.append(total)
+    return PENALTIES[int(np.argmin(totals))]
+
+
+def fit(cases: Sequence[Labelled], command: str = "") -> dict:
+    """The asset's values: a decision fitted to cases."""
+    models = {}
+    for name, features in FEATURES.items():
+        some = sample(name, cases)
+        penalty = penalty_of(name, some)
+        model = fit_one(name, some, penalty)
+        models[name] = {
+            "constant": round(model.constant, 6),
+            "weights": {
+                feature.name: round(weight, 6)
+                for feature, weight in zip(features, model.weights, strict=True)
+            },
+            "penalty": penalty,
+            "cases": len(some),
+        }
+    values = {
+        "schema": SCHEMA,
+        "date": datetime.date.today().isoformat(),
+        "command": command,
+        "sources": {name: _about(name, cases) for name in sorted({c.source for c in cases})},
+        "models": models,
+    }
+    return values | {"sha256": content_hash(values)}
+
+
+def _about(source: str, cases: Sequence[Labelled]) -> dict:
+    """Number of cases and robots of a source, and the hash of its evidence."""
+    own = [case for case in cases if case.source == source]
+    lines = sorted(json.dumps(case.to_json(), sort_keys=True) for case in own)
+    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()
+    return {"cases": len(own), "robots": len({c.robot for c in own}), "evidence_sha256": digest}
+
+
+def model_of(values: dict) -> DecisionModel:
+    """The decision of an asset's values."""
+    models = {
+        name: Logistic(tuple(one["weights"].values()), one["constant"])
+        for name, one in values["models"].items()
+    }
+    return DecisionModel(models, {key: v for key, v in values.items() if key != "models"})

@@ -1,0 +1,43 @@
+"""Collect the evidence of all sources and fit the decision to it."""
+
+from pathlib import Path
+
+from benchmarks.decision import folders, own_rig
+from benchmarks.decision.evidence_log import Labelled, read
+from benchmarks.decision.fit import fit
+from surgisoft.errors import InputError
+from surgisoft.progress import Progress
+
+
+def run(
+    plan: own_rig.Plan,
+    count: int,
+    seed: int,
+    sources: list[str],
+    work: Path,
+    processes: int,
+    report: Progress,
+) -> tuple[list[Labelled], dict]:
+    """(all cases, the values of the asset that is fitted to them).
+
+    sources: `NAME=FOLDER`; the evidence of each is stored in `work/evidence/NAME.jsonl`.
+    """
+    logs = work / "evidence"
+    command = "surgisoft benchmark decision"
+    own = logs / f"{own_rig.SOURCE}.jsonl"
+    if count:
+        robots, poor = (",".join(map(str, some)) for some in (plan.robots, plan.undertrained))
+        command += f" --robots {robots} --undertrained {poor} --count {count} --seed {seed}"
+        some = own_rig.run(plan, count, seed, work / "models", own, processes, report)
+    else:
+        some = read(own)
+    for given in sources:
+        name, _, folder = given.partition("=")
+        if not folder or not Path(folder).is_dir():
+            raise InputError(f"--cases {given}: expected NAME=FOLDER with an existing folder")
+        log = logs / f"{name}.jsonl"
+        some += folders.run(name, Path(folder), work / "models", log, processes, report)
+        command += f" --cases {name}={Path(folder).name}"
+    if not some:
+        raise InputError(f"{logs}: no stored cases; give --count or --cases")
+    return some, fit(some, command)

@@ -1,0 +1,282 @@
+"""Report of the decision: each source judged with the whole source left out of the fit."""
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.decision.evidence_log import Labelled
+from benchmarks.decision.fit import WEAK, fit, model_of
+from surgisoft.diagnosis.criteria import WORTH, Worth
+from surgisoft.diagnosis.decision import Decision, DecisionModel, decide
+
+BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
+"""Bins of the reliability table."""
+SURE = 0.95
+"""Least confidence of a statement that counts as sure."""
+SERIOUS = 0.8
+"""Least confidence from which a wrong name is serious."""
+NAMING = ("identified", "several", "ambiguous")
+"""Kinds of result that name an effect."""
+QUIET = ("nothing_missing", "surrogate_undertrained")
+"""Kinds of result that say that nothing is missing from the list."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A case and what was decided of it."""
+
+    case: Labelled
+    decision: Decision
+
+    @property
+    def right(self) -> bool:
+        """Whether the statement is right: the named effect is missing, one of the set, both of two;
+        something unknown; nothing, or too little to be seen."""
+        kind, effects, case = self.decision.kind, self.decision.effects, self.case
+        if kind in NAMING:
+            hit = [name in case.truth for name in effects]
+            return case.label == "known" and (all(hit) if kind == "several" else any(hit))
+        if kind == "unknown_effect":
+            return case.label == "unknown"
+        return case.label not in ("known", "unknown") or case.size < WEAK
+
+    @property
+    def first(self) -> str | None:
+        """The most probable effect."""
+        return next(iter(self.decision.probabilities.effects), None)
+
+    @property
+    def names_truth(self) -> bool:
+        """Whether the result names the missing effect, alone, as one of two, or in a set of two."""
+        return bool(set(self.decision.effects) & set(self.case.truth))
+
+
+def judged(cases: Sequence[Labelled], model: DecisionModel, worth: Worth = WORTH) -> list[Judged]:
+    """What a fitted decision says of cases."""
+    return [Judged(case, decide(case.evidence, model, worth)) for case in cases]
+
+
+def left_out(cases: Sequence[Labelled]) -> dict[str, list[Judged]]:
+    """For each source what a decision that was fitted to the others says of it."""
+    answer = {}
+    for source in sorted({case.source for case in cases}):
+        others = [case for case in cases if case.source != source]
+        if others:
+            own = [case for case in cases if case.source == source]
+            answer[source] = judged(own, model_of(fit(others)))
+    return answer
+
+
+def robots_left_out(cases: Sequence[Labelled]) -> list[Judged]:
+    """Each robot judged by a decision that was fitted to all other robots of all sources."""
+    answer = []
+    for source, robot in sorted({(case.source, case.robot) for case in cases}):
+        own = [case for case in cases if (case.source, case.robot) == (source, robot)]
+        others = [case for case in cases if (case.source, case.robot) != (source, robot)]
+        answer += judged(own, model_of(fit(others)))
+    return answer
+
+
+def rate(hits: Sequence[bool]) -> str:
+    """Share with number and 95 % interval (Wilson 1927), as a table's cell."""
+    if not hits:
+        return "-"
+    found = stats.binomtest(int(sum(hits)), len(hits)).proportion_ci(method="wilson")
+    share = 100 * sum(hits) / len(hits)
+    return (
+        f"{share:.0f} % ({sum(hits)} of {len(hits)}; {100 * found.low:.0f}-{100 * found.high:.0f})"
+    )
+
+
+def calibration_error(confidence: np.ndarray, right: np.ndarray) -> float:
+    """Expected calibration error over BINS (Naeini et al. 2015)."""
+    if not len(confidence):
+        return 0.0
+    total = 0.0
+    for low, high in itertools.pairwise(BINS):
+        rows = (confidence >= low) & ((confidence < high) | (high == 1.0))
+        if rows.any():
+            total += rows.mean() * abs(confidence[rows].mean() - right[rows].mean())
+    return float(total)
+
+
+Test = Callable[[Judged], bool]
+
+ROWS: tuple[tuple[str, str, Test, Test], ...] = (
+    (
+        "right effect first, memory",
+        "97 %",
+        lambda j: _single(j) and j.case.memory,
+        lambda j: j.first in j.case.truth,
+    ),
+    (
+        "right effect first, static",
+        "95 %",
+        lambda j: _single(j) and not j.case.memory,
+        lambda j: j.first in j.case.truth,
+    ),
+    ("named, alone or in a set of two", "90 %", lambda j: _single(j), lambda j: j.names_truth),
+    (
+        "named alone",
+        "",
+        lambda j: _single(j),
+        lambda j: j.decision.kind == "identified" and j.names_truth,
+    ),
+    (
+        "statements with confidence >= 0.95 right",
+        "97 %",
+        lambda j: j.decision.kind in NAMING and j.decision.confidence >= SURE,
+        lambda j: j.right,
+    ),
+    (
+        "a wrong name with confidence >= 0.8, of all cases",
+        "0",
+        lambda j: True,
+        lambda j: j.decision.kind in NAMING and j.decision.confidence >= SERIOUS and not j.right,
+    ),
+    (
+        "unknown called unknown",
+        "80 %",
+        lambda j: j.case.label == "unknown",
+        lambda j: j.decision.kind == "unknown_effect",
+    ),
+    (
+        "the same, as large as the validated error",
+        "",
+        lambda j: j.case.label == "unknown" and j.case.size >= 1.0,
+        lambda j: j.decision.kind == "unknown_effect",
+    ),
+    (
+        "known or nothing called unknown",
+        "5 %",
+        lambda j: j.case.label in ("known", "clean"),
+        lambda j: j.decision.kind == "unknown_effect",
+    ),
+    (
+        "an effect named on a clean robot",
+        "2 %",
+        lambda j: j.case.label == "clean",
+        lambda j: j.decision.kind in NAMING,
+    ),
+    (
+        "an effect named where the network is off",
+        "",
+        lambda j: j.case.label in ("network", "other_robot"),
+        lambda j: j.decision.kind in NAMING,
+    ),
+    (
+        "two effects, both named",
+        "85 %",
+        lambda j: j.case.label == "known" and len(j.case.truth) == 2,
+        lambda j: set(j.case.truth) <= set(j.decision.effects) and j.decision.kind == "several",
+    ),
+    (
+        "`nothing_missing` though something as large as the validated error is",
+        "0",
+        lambda j: j.case.label in ("known", "unknown") and j.case.size >= 1.0,
+        lambda j: j.decision.kind == "nothing_missing",
+    ),
+    ("`cannot_tell`", "", lambda j: True, lambda j: j.decision.kind == "cannot_tell"),
+)
+"""(what is counted, goal, of which cases, which of them)."""
+
+
+def _single(one: Judged) -> bool:
+    """One effect of the list is missing, at least as large as the validated error."""
+    return one.case.label == "known" and len(one.case.truth) == 1 and one.case.size >= 1.0
+
+
+def goals(columns: dict[str, list[Judged]]) -> str:
+    """Table of the goals, one column for each group of cases."""
+    head = "| measure | goal | " + " | ".join(columns) + " |"
+    lines = [head, "|---|---|" + "---|" * len(columns)]
+    for what, goal, of, hit in ROWS:
+        cells = [rate([hit(one) for one in some if of(one)]) for some in columns.values()]
+        lines.append(f"| {what} | {goal} | {' | '.join(cells)} |")
+    errors, seconds = [], []
+    for some in columns.values():
+        named = [one for one in some if one.decision.kind in NAMING]
+        sure = np.array([one.decision.confidence for one in named])
+        errors.append(f"{calibration_error(sure, np.array([one.right for one in named])):.3f}")
+        seconds.append(f"{np.median([one.case.seconds for one in some]):.1f} s")
+    lines.append(f"| calibration error of the confidence in a name | 0.05 | {' | '.join(errors)} |")
+    lines.append(f"| processor time of a diagnosis, median | 5 s | {' | '.join(seconds)} |")
+    return "\n".join(lines)
+
+
+def reliability(some: Sequence[Judged]) -> str:
+    """How often statements of each confidence were right."""
+    lines = ["| confidence | statements | mean confidence | right |", "|---|---|---|---|"]
+    stated = [one for one in some if one.decision.kind in NAMING]
+    for low, high in itertools.pairwise(BINS):
+        rows = [
+            one
+            for one in stated
+            if low <= one.decision.confidence < high or (high == 1.0 == one.decision.confidence)
+        ]
+        if rows:
+            mean = np.mean([one.decision.confidence for one in rows])
+            right = rate([one.right for one in rows])
+            lines.append(f"| {low:g} to {high:g} | {len(rows)} | {mean:.2f} | {right} |")
+    return "\n".join(lines)
+
+
+def kinds(some: Sequence[Judged]) -> str:
+    """What is true by what was said."""
+    table: dict[str, Counter] = {}
+    for one in some:
+        label = one.case.label
+        if label == "known":
+            label = "two effects" if len(one.case.truth) == 2 else "one effect"
+        said = one.decision.kind
+        if said in NAMING:
+            said += "" if one.right else " (wrong)"
+        table.setdefault(label, Counter())[said] += 1
+    lines = ["| true | said (times) |", "|---|---|"]
+    for label in sorted(table):
+        said = ", ".join(f"{name} {count}" for name, count in table[label].most_common())
+        lines.append(f"| {label.replace('_', ' ')} | {said} |")
+    return "\n".join(lines)
+
+
+def weights(values: dict) -> str:
+    """The fitted weights of an asset's values."""
+    lines = ["| model | cases | ridge | constant and weights |", "|---|---|---|---|"]
+    for name, one in values["models"].items():
+        text = ", ".join(f"{key} {value:+.2f}" for key, value in one["weights"].items())
+        lines.append(
+            f"| {name} | {one['cases']} | {one['penalty']:g} | {one['constant']:+.2f}; {text} |"
+        )
+    return "\n".join(lines)
+
+
+def sources(cases: Sequence[Labelled]) -> str:
+    """Number of cases of each source by what is true."""
+    lines = ["| source | robots | cases | of them |", "|---|---|---|---|"]
+    for source in sorted({case.source for case in cases}):
+        own = [case for case in cases if case.source == source]
+        count = Counter(case.label.replace("_", " ") for case in own)
+        text = ", ".join(f"{label} {number}" for label, number in count.most_common())
+        lines.append(f"| {source} | {len({c.robot for c in own})} | {len(own)} | {text} |")
+    return "\n".join(lines)
+
+
+def markdown(cases: Sequence[Labelled], values: dict) -> str:
+    """The whole report."""
+    by_source = left_out(cases)
+    together = [one for some in by_source.values() for one in some]
+    columns = by_source | ({"together": together} if len(by_source) > 1 else {})
+    parts = ["## Cases", sources(cases)]
+    if columns:
+        parts += ["## Each source left out of the fit", goals(columns)]
+        parts += ["### What was said", kinds(together)]
+        parts += ["### Reliability", reliability(together)]
+    inside = robots_left_out(cases)
+    parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
+    parts += ["### What was said, robots left out", kinds(inside)]
+    parts += ["## The fitted weights", weights(values)]
+    return "\n\n".join(parts) + "\n"

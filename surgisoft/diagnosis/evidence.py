@@ -1,0 +1,274 @@
+"""The evidence of a diagnosis: everything that is decided from, as dimensionless numbers.
+
+`evidence_of` turns what model selection found into an `Evidence`. The fitted decision
+(`decision`) sees nothing else, so it can be fitted again to stored evidence in seconds.
+"""
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
+from surgisoft.diagnosis.statistics import block_sums, studentised
+from surgisoft.surrogate.effects import hypothesis_of, known_effects
+
+VERSION = 1
+"""Version of the evidence, raised when a number gets another meaning: stored evidence of another
+version is collected again."""
+COLLINEAR_RIDGE = 1e-6
+"""Ridge, as a share of the mean power of the sensitivities, of the regression for collinearity."""
+
+
+@dataclass(frozen=True)
+class EffectEvidence:
+    """One effect alone, and compared with the best one."""
+
+    effect: str
+    """Its name."""
+    gain: float
+    """Share of what can be explained that it explains, at most 1."""
+    log_gain: float
+    """Mean over blocks of log(error before / after), the noise added to both."""
+    z: float
+    """Normal quantile of its family-wise p-value: 0 at 0.5, 2.3 at 0.01."""
+    left: float
+    """Log of what it leaves over what the best effect leaves, the noise added to both."""
+    margin: float
+    """Studentised mean over motions of the best effect's log gain less this one's; 0 for the best
+    one itself."""
+    unique: float
+    """Gain that comes back when it is left out of all effects together."""
+    collinear: float
+    """Share of the change that the best effect explains which this effect's sensitivities can
+    imitate, 0 to 1; 1 for the best one itself."""
+    amplitudes: int
+    """Number of its amplitudes."""
+    exact_form: bool
+    """Whether real arms have exactly its formula (a rotated frame, a weight)."""
+    form_gain: float | None = None
+    """Additional gain of its relaxed form; None where it was not tested."""
+    form_log_gain: float | None = None
+    """Log gain of its relaxed form."""
+    form_z: float | None = None
+    """Normal quantile of the p-value of its relaxed form."""
+
+
+@dataclass(frozen=True)
+class ProposalEvidence:
+    """One effect, or two that are proposed together."""
+
+    effects: tuple[str, ...]
+    """Their names, the one that would be missed most first."""
+    gain: float
+    """Share of what can be explained that they explain together."""
+    left_size: float
+    """Error that they leave above the floor, in units of the model discrepancy."""
+    left_log_box: float
+    """Mean over blocks of log(error with them / error of the black box), the noise in both."""
+    form_gain: float
+    """Additional gain of their relaxed forms."""
+    form_log_gain: float
+    """Log gain of their relaxed forms."""
+    form_z: float
+    """Normal quantile of the p-value of their relaxed forms."""
+    last_gain: float
+    """Share of what those before the last one left that the last one explains."""
+    last_log_gain: float
+    """Log gain of the last one on top of those before it."""
+    last_z: float
+    """Normal quantile of the last one's family-wise p-value on top of those before it."""
+    last_alone: float
+    """Gain of the last one alone over that of the first alone."""
+    own_gain: float = 0.0
+    """Gain of the last one beside the relaxed forms of those before it."""
+    own_log_gain: float = 0.0
+    """Log gain of the last one beside the relaxed forms of those before it."""
+    own_z: float = 0.0
+    """Normal quantile of its p-value there."""
+    better: float = 0.0
+    """Log of what the proposal with one effect less leaves over what this one leaves, the noise
+    added to both."""
+    instead: tuple[str, ...] = ()
+    """The best other effects in the place of the first and of the second of two."""
+    instead_left: tuple[float, ...] = ()
+    """Log of what is left with it over what the two leave, the noise added to both."""
+    instead_margin: tuple[float, ...] = ()
+    """Studentised mean over motions of the log of block errors with it over those with the two."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The numbers that a diagnosis is decided from."""
+
+    error_over_floor: float
+    """RMS error of the model over the noise floor."""
+    error_over_validated: float
+    """RMS error of the model over its validated error, both with their noise."""
+    size: float
+    """Error above the noise floor, in units of the model discrepancy."""
+    size_beside_discrepancy: float
+    """Error above the floor that the model discrepancy leaves on held-out blocks, in its units."""
+    held_static: float
+    """Share of the error above the floor that the model discrepancy of its validated size
+    explains."""
+    free_static: float
+    """Share of what can be explained that any function of actuation and direction explains."""
+    free_box: float
+    """Share of what can be explained that a black box with memory explains, held to no size."""
+    error_over_box: float
+    """RMS error of the model over that of the free black box with memory, at least 1."""
+    box_gain: float
+    """Gain of the black box over the model discrepancy of its validated size."""
+    box_log_gain: float
+    """Log gain of it."""
+    box_z: float
+    """Normal quantile of its p-value."""
+    blocks: int
+    """Number of blocks of time."""
+    motions: int
+    """Number of different motions."""
+    effects: tuple[EffectEvidence, ...]
+    """All effects alone, the best first."""
+    proposals: tuple[ProposalEvidence, ...]
+    """The best effect and the best two, as far as they are worth a look."""
+
+    def to_json(self) -> dict:
+        """Plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Evidence":
+        """The evidence that `to_json` wrote."""
+        names = {field.name for field in fields(cls)}
+        plain = {name: value for name, value in values.items() if name in names}
+        plain["effects"] = tuple(EffectEvidence(**each) for each in plain["effects"])
+        plain["proposals"] = tuple(
+            ProposalEvidence(
+                **{key: tuple(v) if isinstance(v, list) else v for key, v in each.items()}
+            )
+            for each in plain["proposals"]
+        )
+        return cls(**plain)
+
+
+def normal_quantile(p_value: float) -> float:
+    """Standard normal quantile of 1 - p, finite for every p-value from random draws."""
+    return float(stats.norm.isf(min(max(p_value, 1e-6), 1.0 - 1e-6)))
+
+
+def evidence_of(found: Findings) -> Evidence:
+    """The numbers that the findings of a diagnosis amount to."""
+    selection, problem, box = found.selection, found.problem, found.box
+    floor, null = float(selection.floor.sum()), selection.losses()
+    seen = np.isfinite(problem.residual).all(2)
+    square = np.where(seen, np.nansum(np.square(problem.residual), axis=2), 0.0)
+    raw = block_sums(square.sum(1), problem.block)
+    free = min(box.free_losses, raw, null, key=np.sum)
+    above = selection.explainable(raw, [free])
+    beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
+    stated = problem.discrepancy_mm**2 + problem.noise_mm**2
+    validated = float((seen.sum(0) * stated).sum())
+    best = found.first[0] if found.first else None
+    return Evidence(
+        error_over_floor=math.sqrt(raw.sum() / floor),
+        error_over_validated=math.sqrt(raw.sum() / validated),
+        size=selection.size(raw),
+        size_beside_discrepancy=selection.size(null),
+        held_static=_share(raw.sum() - null.sum(), above),
+        free_static=_share(raw.sum() - box.static_losses.sum(), above),
+        free_box=_share(raw.sum() - free.sum(), above),
+        error_over_box=math.sqrt(max(raw.sum() / free.sum(), 1.0)),
+        box_gain=_share(null.sum() - box.losses.sum(), beside),
+        box_log_gain=float(selection.log_ratio(null, box.losses).mean()),
+        box_z=normal_quantile(box.p_value),
+        blocks=len(selection.validation.counts),
+        motions=int(problem.motion.max()) + 1,
+        effects=tuple(_effect(found, best, score) for score in found.first),
+        proposals=tuple(_proposal(found, place) for place in range(len(found.proposals))),
+    )
+
+
+def _share(part: float, whole: float) -> float:
+    return float(min(max(part / whole, 0.0), 1.0))
+
+
+def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
+    """One effect alone against the best one."""
+    selection, floor = found.selection, float(found.selection.floor.sum())
+    margin = 0.0
+    if score is not best:
+        gap = found.problem.by_motion((best.log_gain - score.log_gain)[None])
+        margin = float(studentised(gap)[0]) if gap.any() else 0.0
+    form = found.forms.get(score.effect)
+    return EffectEvidence(
+        effect=score.effect,
+        gain=float(score.gain),
+        log_gain=float(score.log_gain.mean()),
+        z=normal_quantile(score.p_value),
+        left=math.log((score.losses.sum() + floor) / (best.losses.sum() + floor)),
+        margin=margin,
+        unique=float(found.unique.get(score.effect, 0.0)),
+        collinear=1.0 if score is best else collinearity(selection, best, score),
+        amplitudes=len(score.option.chosen),
+        exact_form=hypothesis_of(known_effects()[score.effect]).exact_form,
+        form_gain=form and form.share,
+        form_log_gain=form and form.log_gain,
+        form_z=form and normal_quantile(form.p_value),
+    )
+
+
+def collinearity(selection: ModelSelection, best: Score, other: Score) -> float:
+    """Share of the change by one effect that another one's sensitivities can imitate, 0 to 1.
+
+    R^2 of the regression of the best effect's change at its fitted amplitudes, over all rows and
+    key points, on the other effect's sensitivities. What the model discrepancy could imitate of
+    both counts too: a large value means that the two are hard to tell apart, no more.
+    """
+    seen = np.isfinite(selection.problem.residual)
+    own = list(best.option.chosen)
+    change = selection.sensitivities[..., own] @ selection.validation.amplitudes(own)
+    design = selection.sensitivities[..., list(other.option.chosen)][seen]
+    target = change[seen]
+    gram = design.T @ design
+    ridge = COLLINEAR_RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+    moment = design.T @ target
+    return _share(moment @ np.linalg.solve(gram + ridge, moment), max(target @ target, 1e-30))
+
+
+def _proposal(found: Findings, place: int) -> ProposalEvidence:
+    """One proposal against those with fewer effects, and against the black box."""
+    selection, proposal = found.selection, found.proposals[place]
+    null, after = selection.losses(), selection.losses(proposal.chosen)
+    floor, last, form = float(selection.floor.sum()), proposal.scores[-1], proposal.relaxed
+    fewer = selection.losses(found.proposals[place - 1].chosen) if place else null
+    tried = [after, found.box.losses, *(score.losses for score in found.first)]
+    alone = {score.effect: float(score.gain) for score in found.first}
+    first = max(alone.get(proposal.effects[0], 0.0), 1e-3)
+    own = proposal.beside
+    others = [score for score in proposal.instead if score is not None]
+    gaps = [found.problem.by_motion(selection.log_ratio(s.losses, after)[None]) for s in others]
+    return ProposalEvidence(
+        effects=proposal.effects,
+        gain=_share(null.sum() - after.sum(), selection.explainable(null, tried)),
+        left_size=selection.size(after),
+        left_log_box=float(selection.log_ratio(after, found.box.losses).mean()),
+        form_gain=form.share,
+        form_log_gain=form.log_gain,
+        form_z=normal_quantile(form.p_value),
+        last_gain=float(last.gain),
+        last_log_gain=float(last.log_gain.mean()),
+        last_z=normal_quantile(last.p_value),
+        last_alone=min(max(alone.get(last.effect, 0.0) / first, 0.0), 2.0),
+        own_gain=float(own.gain) if own else 0.0,
+        own_log_gain=float(own.log_gain.mean()) if own else 0.0,
+        own_z=normal_quantile(own.p_value) if own else 0.0,
+        better=math.log((fewer.sum() + floor) / (after.sum() + floor)),
+        instead=tuple(score.effect for score in others),
+        instead_left=tuple(
+            math.log((score.losses.sum() + floor) / (after.sum() + floor)) for score in others
+        ),
+        instead_margin=tuple(float(studentised(gap)[0]) if gap.any() else 0.0 for gap in gaps),
+    )

@@ -1,0 +1,212 @@
+"""The fit and the report of the decision, against independent formulas and by hand."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.decision.evidence_log import Labelled, append, read
+from benchmarks.decision.fit import (
+    fit,
+    fit_one,
+    log_losses,
+    model_of,
+    sample,
+    source_weights,
+)
+from benchmarks.decision.own_rig import ROUND, Plan, draw
+from benchmarks.decision.table import (
+    BINS,
+    Judged,
+    calibration_error,
+    goals,
+    left_out,
+    markdown,
+    rate,
+)
+from surgisoft.diagnosis.decision import (
+    FEATURES,
+    Decision,
+    Logistic,
+    Probabilities,
+    content_hash,
+    features_of,
+)
+from tests.diagnosis.test_decision import ALONE, CREEP, GOOD, LAG
+
+NOTHING = replace(GOOD, effects=(replace(CREEP, gain=0.02, log_gain=0.01, z=0.0),), proposals=())
+
+
+def case(number, source="a", label="known", truth=("creep",), evidence=GOOD, size=2.0, robot="1"):
+    return Labelled(source, robot, str(number), label, truth, True, size, 1.0, 5.0, evidence, 3.0)
+
+
+def some_cases(source="a", count=40, seed=0):
+    """Cases of which an effect explains a random share; the more, the more often it is missing."""
+    rng = np.random.default_rng(seed)
+    answer = []
+    for number in range(count):
+        gain = float(rng.uniform())
+        missing = rng.uniform() < gain
+        best = replace(CREEP, gain=gain, log_gain=gain)
+        evidence = replace(
+            GOOD, effects=(best, LAG), proposals=(replace(ALONE, gain=gain, last_gain=gain),)
+        )
+        label = "known" if missing else "clean"
+        truth = ("creep",) if missing else ()
+        one = case(number, source, label, truth, evidence, 2.0 if missing else 0.0)
+        answer.append(replace(one, robot=str(number % 4)))
+    return answer
+
+
+def test_calibration_error_by_hand():
+    """Three bins: 2 x |0.55 - 0.5|, 1 x |0.85 - 1|, 1 x |0.97 - 0|, over 4."""
+    sure, right = np.array([0.5, 0.6, 0.85, 0.97]), np.array([1.0, 0.0, 1.0, 0.0])
+    expected = (2 * 0.05 + 0.15 + 0.97) / 4
+    assert calibration_error(sure, right) == pytest.approx(expected)
+    assert calibration_error(np.ones(3), np.ones(3)) == 0.0
+    assert BINS[-1] == 1.0
+
+
+def test_a_wilson_interval_by_its_formula():
+    n, hits, z = 40, 37, 1.959964
+    p = hits / n
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    text = rate([True] * hits + [False] * (n - hits))
+    assert text == f"92 % (37 of 40; {100 * (middle - half):.0f}-{100 * (middle + half):.0f})"
+
+
+def test_signs_hold_whatever_the_cases_say():
+    """Where what explains less is missing more often, the weight is 0 and not negative."""
+    cases = some_cases()
+    turned = []
+    for one in cases:
+        missing = one.label == "clean"
+        label, truth = ("known", ("creep",)) if missing else ("clean", ())
+        turned.append(replace(one, label=label, truth=truth, effect_mm=2.0 * missing))
+    model = fit_one("missing", sample("missing", turned), 0.1)
+    place = [feature.name for feature in FEATURES["missing"]].index("explained")
+    assert model.weights[place] == pytest.approx(0.0, abs=1e-9)
+    assert fit_one("missing", sample("missing", cases), 0.1).weights[place] > 0.1
+
+
+def test_the_fit_is_at_the_least_penalised_loss():
+    """No small change of any free weight lowers the loss, computed from the losses of each case."""
+    some = sample("missing", some_cases(count=60))
+    model = fit_one("missing", some, 1.0)
+    weights = source_weights([one for _, _, one in some])
+
+    def loss(values):
+        losses = log_losses("missing", Logistic(tuple(values[:-1]), values[-1]), some)
+        return weights @ losses + 0.5 * values[:-1] @ values[:-1] + 0.005 * values[-1] ** 2
+
+    best = np.array([*model.weights, model.constant])
+    for place in range(len(best)):
+        for step in (1e-2, -1e-2):
+            moved = best.copy()
+            moved[place] += step
+            if place == len(best) - 1 or moved[place] >= 0.0:
+                assert loss(moved) >= loss(best) - 1e-6
+
+
+def test_the_conditional_logit_is_a_softmax():
+    some = sample("first", some_cases())
+    model = fit_one("first", some, 0.3)
+    rows = features_of("first", GOOD)
+    odds = rows @ np.array(model.weights)
+    share = np.exp(odds) / np.exp(odds).sum()
+    one = [(rows, np.array([1.0, 0.0]), case(0))]
+    assert log_losses("first", model, one)[0] == pytest.approx(-np.log(share[0]))
+    assert share[0] > 0.8
+
+
+def test_every_source_counts_alike():
+    cases = [case(n, "a") for n in range(30)] + [case(n, "b") for n in range(10)]
+    weights = source_weights(cases)
+    assert weights[:30].sum() == pytest.approx(weights[30:].sum())
+    assert weights.mean() == pytest.approx(1.0)
+
+
+def test_a_source_is_judged_without_its_own_cases(monkeypatch):
+    from benchmarks.decision import table
+
+    seen = []
+    monkeypatch.setattr(
+        table, "fit", lambda some: seen.append({c.source for c in some}) or fit(some)
+    )
+    found = left_out([*some_cases("a"), *some_cases("b", seed=1), *some_cases("c", seed=2)])
+    assert list(found) == ["a", "b", "c"]
+    assert seen == [{"b", "c"}, {"a", "c"}, {"a", "b"}]
+    assert all({one.case.source for one in some} == {name} for name, some in found.items())
+
+
+def said(kind, effects, sure=0.9, **about):
+    chances = Probabilities(0.0, 0.0, 0.0, dict.fromkeys(effects, sure), 0.0, ())
+    return Judged(case(0, **about), Decision(kind, effects, sure, chances))
+
+
+@pytest.mark.parametrize(
+    ("one", "right"),
+    [
+        (said("identified", ("creep",)), True),
+        (said("identified", ("drift",)), False),
+        (said("ambiguous", ("drift", "creep")), True),
+        (said("several", ("drift", "creep")), False),
+        (said("several", ("payload", "creep"), truth=("creep", "payload")), True),
+        (said("identified", ("drift",), label="unknown", truth=("leak",)), False),
+        (said("unknown_effect", (), label="unknown", truth=("leak",)), True),
+        (said("unknown_effect", ()), False),
+        (said("nothing_missing", (), label="clean", truth=()), True),
+        (said("nothing_missing", ()), False),
+        (said("nothing_missing", (), size=0.3), True),
+    ],
+)
+def test_what_a_right_statement_is(one, right):
+    assert one.right is right
+
+
+def test_the_table_counts_by_hand():
+    some = [
+        said("identified", ("creep",), 0.97),
+        said("identified", ("drift",), 0.97),
+        said("ambiguous", ("creep", "drift"), 0.9),
+        said("cannot_tell", (), 0.3),
+    ]
+    lines = {line.split("|")[1].strip(): line for line in goals({"all": some}).splitlines()}
+    assert "50 % (2 of 4" in lines["named, alone or in a set of two"]
+    assert "50 % (1 of 2" in lines["statements with confidence >= 0.95 right"]
+    assert "25 % (1 of 4" in lines["`cannot_tell`"]
+    assert "25 % (1 of 4" in lines["a wrong name with confidence >= 0.8, of all cases"]
+
+
+def test_a_log_survives_a_broken_line_and_another_version(tmp_path):
+    log = tmp_path / "a.jsonl"
+    append(log, case(1))
+    append(log, replace(case(2), version=99))
+    with log.open("a") as file:
+        file.write('{"source": "a", "rob')
+    assert read(log) == [case(1)]
+
+
+def test_the_asset_names_its_cases():
+    cases = [*some_cases("a"), *some_cases("b", 20, seed=1)]
+    values = fit(cases, "command")
+    assert values["sources"]["a"]["cases"] == 40
+    assert values["sha256"] == content_hash(values)
+    other = fit([replace(cases[0], effect_mm=3.0), *cases[1:]], "command")
+    assert other["sources"]["a"]["evidence_sha256"] != values["sources"]["a"]["evidence_sha256"]
+    assert other["sources"]["b"] == values["sources"]["b"]
+    assert model_of(json.loads(json.dumps(values))).models["missing"].weights
+    assert "| a | 4 | 40 |" in markdown(cases, values)
+
+
+def test_rounds_of_cases_have_the_shares_that_are_stated():
+    drawn = draw(Plan([1, 2, 3], [1]), 4 * len(ROUND), 5)
+    kinds = [len(case.hidden) for case, _ in drawn]
+    assert kinds.count(2) == 4 * ROUND.count("pair")
+    assert sum(case.undertrained for case, _ in drawn) == 4
+    assert sum(asked != case.robot for case, asked in drawn) == 4
+    assert len({case.take for case, _ in drawn}) == len(drawn)
+    assert draw(Plan([1, 2, 3], [1]), 7, 5) == drawn[:7]

@@ -10,6 +10,7 @@ of the model (`--paired never`).
 """
 
 import argparse
+import datetime
 import itertools
 import time
 from collections.abc import Iterable
@@ -127,12 +128,12 @@ def record(robot: int, hidden, take: int, late_s: float = 0.0) -> Recording:
     return recording
 
 
-def changes(robots: Iterable[int]) -> list[Change]:
-    """Every known effect at amplitude 1, the unknown ones, and nothing at all."""
-    hidden = [((name, 1.0),) for name in KNOWN] + [((name, 2.0),) for name in UNKNOWN] + [()]
+def changes(robots: Iterable[int], names: Iterable[str]) -> list[Change]:
+    """Nothing at all, and each of some effects: those of the list at amplitude 1, others at 2."""
+    hidden = [(), *(((name, 1.0 if name in KNOWN else 2.0),) for name in names)]
     answer = []
     for number, (robot, some) in enumerate(itertools.product(robots, hidden)):
-        for poor, paired in itertools.product((False, True), ("auto", "never")):
+        for poor, paired in itertools.product((True, False), ("auto", "never")):
             answer.append(Change(robot, some, poor, 1 + number % 2, paired))
     return answer
 
@@ -165,10 +166,10 @@ def after_start() -> float:
     return CUT / 20.0
 
 
-def run(robots: Iterable[int], folder: Path, report=print) -> list[Outcome]:
-    """Diagnose every change of every robot; base models are kept in the folder."""
+def run(plan: Iterable[Change], folder: Path, report=print) -> list[Outcome]:
+    """Diagnose every change; base models are kept in the folder."""
     outcomes = []
-    for robot, some in itertools.groupby(changes(robots), key=lambda change: change.robot):
+    for robot, some in itertools.groupby(plan, key=lambda change: change.robot):
         fitted = base_model(robot, folder)
         models = {False: fitted, True: bent(fitted, robot, POOR_MM, robot)}
         before = [record(robot, (), take, LATE_S) for take in (BEFORE_TAKE, AGAIN_TAKE)]
@@ -219,6 +220,49 @@ def table(outcomes: list[Outcome]) -> str:
     return "\n".join([header, *rows])
 
 
+def cases(outcomes: list[Outcome]) -> str:
+    """Every change with its four results, as Markdown."""
+    keys = [(True, "auto"), (True, "never"), (False, "auto"), (False, "never")]
+    lines = [
+        "| robot | changed | change | deformed, paired | deformed, model | fitted, paired | "
+        "fitted, model |\n|---|---|---|---|---|---|---|"
+    ]
+    for (robot, hidden), some in itertools.groupby(
+        outcomes, key=lambda o: (o.change.robot, o.change.hidden)
+    ):
+        found = {(o.change.poor, o.change.paired): o for o in some}
+        size = min(o.change_mm for o in found.values())
+        names = ", ".join(name for name, _ in hidden) or "nothing"
+        cells = [
+            f"{found[key].kind}: {', '.join(found[key].effects) or '-'}"
+            + (f" ({found[key].confidence:.2f})" if found[key].effects else "")
+            for key in keys
+        ]
+        lines.append(f"| {robot} | {names} | {size:.2f} mm | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def page(outcomes: list[Outcome], arguments: str) -> str:
+    """The page of results."""
+    pairs = [o for o in outcomes if o.change.paired == "auto"]
+    delay = max(abs(o.delay_error_s) for o in pairs)
+    rows = min(o.paired_share for o in pairs)
+    return (
+        "# Before and after\n\n"
+        f"Printed by `python -m benchmarks.before_after {arguments}` on "
+        f"{datetime.date.today().isoformat()}.\n\n"
+        "Virtual robots were recorded with the same protocol (three minutes, `mixed`) before and "
+        "after one effect was switched on, with other noise; in BEFORE the protocol began "
+        f"{LATE_S} s late, and of AFTER the first {CUT / 20:g} s are missing. The deformed network "
+        "is the fitted one with noise on its weights. Paired: `--before BEFORE`; model: the same "
+        "with `--paired never`.\n\n"
+        f"{table(outcomes)}\n\n"
+        f"At least {100 * rows:.0f} % of the rows were paired; delays were off by at most "
+        f"{1e3 * delay:.1f} ms, at a sampling time of 50 ms.\n\n"
+        f"{cases(outcomes)}\n"
+    )
+
+
 def share(truths: Iterable[bool]) -> str:
     """How many of how many."""
     truths = list(truths)
@@ -229,13 +273,18 @@ def main() -> None:
     """Print the table; write it to a file where one is named."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", default="201", help="seeds of the robots, with commas")
+    parser.add_argument(
+        "--effects", default=",".join([*KNOWN, *UNKNOWN]), help="hidden effects, with commas"
+    )
     parser.add_argument("--work", type=Path, default=Path("runs/benchmark-before-after"))
     parser.add_argument("-o", "--output", type=Path)
     given = parser.parse_args()
-    outcomes = run([int(seed) for seed in given.robots.split(",")], given.work)
-    print(table(outcomes))
+    robots = [int(seed) for seed in given.robots.split(",")]
+    outcomes = run(changes(robots, given.effects.split(",")), given.work)
+    text = page(outcomes, f"--robots {given.robots} --effects {given.effects}")
+    print(text)
     if given.output:
-        given.output.write_text(table(outcomes))
+        given.output.write_text(text)
 
 
 if __name__ == "__main__":

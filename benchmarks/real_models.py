@@ -3,9 +3,9 @@
     python -m benchmarks.real_models RECORDING.parquet [--actuation commanded] [--folds 5]
 
 Runs, or blocks of time of a single run, are dealt into folds. Each fold is left out once; on the
-others a model is fitted as `surgisoft fit --effects auto --members 5` does, and three black boxes
-are too. None of them sees the left-out fold before it is judged there; what each of them chooses
-by held-out data, it chooses inside the other folds.
+others a model is fitted as `surgisoft fit --prior arcs --effects auto --members 5` does, and three
+black boxes are too. None of them sees the left-out fold before it is judged there; what each of
+them chooses by held-out data, it chooses inside the other folds.
 
 Black boxes: the recurrent network of `fit --network recurrent`; ridge regression on the actuation
 and its low passes, with all products of two; and kernel ridge regression (Gaussian kernel, Nystroem
@@ -173,9 +173,11 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--actuation", choices=("measured", "commanded"), default="measured")
     parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--judged", type=int, default=None, help="folds left out; default: all")
     parser.add_argument("--members", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=200)
     parser.add_argument("--effects", default="auto")
+    parser.add_argument("--prior", default="arcs")
     options = parser.parse_args()
     torch.set_num_threads(1)
     with warnings.catch_warnings():
@@ -187,6 +189,7 @@ def main() -> None:
     )
     config = FitConfig(
         effects=tuple(name for name in options.effects.split(",") if name),
+        prior=options.prior,
         members=options.members,
         epochs=options.epochs,
     )
@@ -195,7 +198,7 @@ def main() -> None:
     names = group[history.valid].unique()
     order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
     every: dict[str, list[Fold]] = {}
-    for number in range(options.folds):
+    for number in range(options.judged or options.folds):
         left_out = torch.isin(group, order[number :: options.folds]) & history.valid
         for fold in judge(history, spec, left_out, config):
             every.setdefault(fold.name, []).append(fold)

@@ -76,6 +76,14 @@ class Outcome:
     """What was found, in words."""
 
 
+UNITS = {
+    "kPa": (6.894757293168361, 100.0, 1e-3, 1e3),
+    "psi": (1 / 6.894757293168361, 100 / 6.894757293168361),
+    "deg": (57.29577951308232,),
+}
+"""Unit of a model -> how many of it are one of another: psi, bar, Pa, MPa; kPa, bar; rad."""
+
+
 # Faults ---------------------------------------------------------------------------------------
 
 
@@ -102,8 +110,7 @@ def _length(recording: Recording, rng: np.random.Generator) -> Recording:
 
 def _pressure(recording: Recording, rng: np.random.Generator) -> Recording:
     """Actuation in another unit than the model's."""
-    other = {"kPa": [6.894757293168361, 100.0, 1e-3, 1e3], "deg": [57.29577951308232]}
-    factor = rng.choice(other[recording.unit])
+    factor = rng.choice(UNITS[recording.unit])
     return _with_actuation(recording, lambda values: values / factor)
 
 
@@ -350,7 +357,7 @@ def run(
         for name in dict.fromkeys(source.name for source in sources):
             same = [source for source in sources if source.name == name]
             unit = load_recording(same[0].clean[0], on_warning=lambda text: None).unit
-            without = () if unit in ("kPa", "deg") else ("actuation unit",)
+            without = () if unit in UNITS else ("actuation unit",)
             for i, truth in enumerate(drawn(count, seed, without)):
                 source = same[i % len(same)]
                 path = source.clean[(i // len(same)) % len(source.clean)]

@@ -54,6 +54,9 @@ class Labelled:
     """The evidence of the diagnosis."""
     seconds: float
     """Processor time of the diagnosis, s."""
+    complete: bool = True
+    """Whether `truth` is all that the model lacks. Not so on a real arm, whose model lacks more
+    than what was injected: its residual there is no less without an injection."""
     version: int = VERSION
     """Version of the evidence."""
 

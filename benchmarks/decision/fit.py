@@ -1,9 +1,9 @@
 """Fit of the decision to stored evidence: five logistic models with weights of fixed sign.
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
-sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, however many cases
-it has. The penalty of each model is chosen by leaving out one robot after another within the cases
-that the model is fitted to, so nothing of a source that is left out enters.
+sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
+cases. The penalty of each model is chosen by leaving out one group of robots after another within
+the cases that it is fitted to, so nothing of a source that is judged enters.
 """
 
 import datetime
@@ -24,7 +24,7 @@ from surgisoft.diagnosis.decision import (
     features_of,
 )
 
-PENALTIES = (0.1, 0.3, 1.0, 3.0)
+PENALTIES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Ridge penalties on the weights that are tried: inverse variances of a normal prior around 0, for
 features of order 1."""
 CONSTANT_PENALTY = 0.01
@@ -32,6 +32,10 @@ CONSTANT_PENALTY = 0.01
 WEAK = 0.5
 """Change by what is missing, over the validated error, below which "nothing" is right too: such
 cases take no part in the fit of `missing`."""
+MOST_WEIGHT = 3.0
+"""Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
+WHOLE_TRUTH = ("missing", "known", "network")
+"""Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
 """Groups of robots that are left out in turn for the choice of a penalty."""
 
@@ -46,6 +50,8 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
         if case.label == "setup" or not case.evidence.effects:
             continue
         missing = case.label in ("known", "unknown")
+        if not case.complete and name in WHOLE_TRUTH:
+            continue
         if name == "missing":
             if (missing and case.size < WEAK) or case.label == "other_robot":
                 continue
@@ -74,10 +80,12 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
 
 
 def source_weights(cases: Sequence[Labelled]) -> np.ndarray:
-    """(N,) weights of cases of mean 1, so that every source has the same sum."""
+    """(N,) weights of cases of mean 1: every source has the same sum, unless it has few cases."""
     names = [case.source for case in cases]
     number = {name: names.count(name) for name in names}
-    return np.array([len(names) / len(number) / number[name] for name in names])
+    weights = np.array([len(names) / len(number) / number[name] for name in names])
+    weights = np.minimum(weights, MOST_WEIGHT)
+    return weights / weights.mean()
 
 
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
@@ -142,16 +150,16 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
 
 
-def _robot_folds(some: Sequence) -> np.ndarray:
+def _folds(some: Sequence) -> np.ndarray:
     """(N,) fold of each case: whole robots together."""
-    robots = [f"{case.source}/{case.robot}" for _, _, case in some]
-    names = sorted(set(robots))
-    return np.array([names.index(robot) % ROBOT_FOLDS for robot in robots])
+    names = [f"{case.source}/{case.robot}" for _, _, case in some]
+    robots = sorted(set(names))
+    return np.array([robots.index(name) % ROBOT_FOLDS for name in names])
 
 
 def penalty_of(name: str, some: Sequence) -> float:
     """The penalty with the least held-out loss, one group of robots left out in turn."""
-    fold = _robot_folds(some) if some else np.zeros(0)
+    fold = _folds(some) if some else np.zeros(0)
     if len(np.unique(fold)) < 2:
         return PENALTIES[-1]
     weights = source_weights([case for _, _, case in some])

@@ -1,10 +1,12 @@
 """Cases in folders: robots with recordings before a change, and recordings after it.
 
 A folder of a source holds, for each case, `after/*.parquet` and `truth.json` (robot, hidden
-effects, the names that a diagnosis should give, RMS change of the key points in mm), and for each
-robot `before/*.parquet` and optionally `model/`, in `ROBOT` or `robots/ROBOT`. One model is fitted
-for each robot to its recordings before the change, unless it is there already. The question is what
-has changed since: the recordings before the change are given to the diagnosis too.
+effects, the names that a diagnosis should give, RMS change of the key points in mm; on a real arm
+`same_rows`: whether the same rows are in `before`, so that the paired difference shows the change
+alone), and for each robot `before/*.parquet` and optionally `model/`, in `ROBOT` or
+`robots/ROBOT`. One model is fitted for each robot to its recordings before the change, unless it is
+there already. The question is what has changed since: the recordings before the change are given to
+the diagnosis too.
 """
 
 import json
@@ -86,6 +88,7 @@ def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelle
         minutes=minutes,
         evidence=evidence,
         seconds=seconds,
+        complete=bool(truth.get("same_rows", True)),
     )
 
 

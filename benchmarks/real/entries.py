@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from surgisoft.config import Rule, Where, at_least, from_table, one_of, read_toml
+from surgisoft.diagnosis.setup.search import KINDS
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import ACTUATIONS
 from surgisoft.measurement.importing import import_files, load_map
@@ -22,6 +23,8 @@ UNKNOWN = "unknown"
 """Truth of a change that no effect of the catalogue describes."""
 SETUP = "setup"
 """Truth of a change of the cameras' frame, the units, the order of the chambers or the clock."""
+FAULTS = (*KINDS, "dead_chamber", "dead_key_point")
+"""Kinds of faults of the set-up."""
 READY = (".csv", ".parquet")
 """Suffixes of recordings that need no map."""
 
@@ -98,6 +101,8 @@ class Entry:
     """Which actuation is the model's input."""
     fit: FitOptions = field(default_factory=FitOptions)
     """How the model is fitted."""
+    faults: tuple[Annotated[str, one_of(FAULTS)], ...] = ()
+    """For the truth `setup`: the kinds of faults, all of which and no other are to be found."""
     note: str = ""
     """What else is known: how sure the truth is, and what else differs."""
     name: str = ""
@@ -113,6 +118,11 @@ class Entry:
         if {UNKNOWN, SETUP}.intersection(self.truth) and len(self.truth) > 1:
             raise (where / "truth").error(
                 f"got {list(self.truth)}", f"'{UNKNOWN}' or '{SETUP}' alone, or names of effects"
+            )
+        if bool(self.faults) != (self.truth == (SETUP,)):
+            raise (where / "faults").error(
+                f"got {list(self.faults)} for the truth {list(self.truth)}",
+                f"kinds of faults where the truth is '{SETUP}', and none elsewhere",
             )
         return replace(self, name=where.path.stem)
 

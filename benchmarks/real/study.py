@@ -41,7 +41,7 @@ class Answer:
     names: tuple[str, ...]
     """Effects that the verdict names; `setup` and `unknown` for verdicts of these kinds."""
     confidence: float
-    """Confidence in the first of them; without names that of the first effect of the ranking."""
+    """Calibrated probability that the statement is right; 0 for a fault of the set-up."""
     ranking: tuple[str, ...]
     """All effects, the most likely first."""
     sentence: str
@@ -56,6 +56,8 @@ class Answer:
     """Validated error of the model, mm."""
     seconds: float
     """Duration of the diagnosis, s."""
+    faults: tuple[str, ...] = ()
+    """Kinds of the faults of the set-up that were found."""
 
 
 @dataclass(frozen=True)
@@ -78,32 +80,42 @@ class Outcome:
     @property
     def named(self) -> bool:
         """Whether the diagnosis is right (`right`)."""
-        return self.answer is not None and right(self.answer, self.entry.truth)
+        return self.answer is not None and right(self.answer, self.entry.truth, self.entry.faults)
 
     @property
     def misled(self) -> bool:
         """Whether the diagnosis claims a wrong name (`misleads`)."""
-        return self.answer is not None and misleads(self.answer, self.entry.truth)
+        return self.answer is not None and misleads(
+            self.answer, self.entry.truth, self.entry.faults
+        )
 
 
-def right(answer: Answer, truth: Sequence[str]) -> bool:
+def right(answer: Answer, truth: Sequence[str], faults: Sequence[str] = ()) -> bool:
     """Whether the truth is named, alone or in a set of at most two (or as many as there are).
 
-    Where nothing changed: whether nothing was named.
+    Where nothing changed: whether nothing was named. faults: those of the set-up, which have to be
+    found exactly where the truth is `setup`.
     """
     if not truth:
         return not answer.names
-    return set(truth) <= set(answer.names) and len(answer.names) <= max(MOST_NAMES, len(truth))
-
-
-def misleads(answer: Answer, truth: Sequence[str]) -> bool:
-    """Whether a wrong name stands first with a confidence that claims to be right.
-
-    A fault of the set-up is claimed as proven, without a confidence.
-    """
-    if answer.kind not in CLAIMING or answer.names[0] in truth:
+    if not set(truth) <= set(answer.names) or len(answer.names) > max(MOST_NAMES, len(truth)):
         return False
-    return answer.kind == SETUP or answer.confidence >= CLAIMED
+    return not faults or set(answer.faults) == set(faults)
+
+
+def misleads(answer: Answer, truth: Sequence[str], faults: Sequence[str] = ()) -> bool:
+    """Whether a wrong name is claimed with a confidence that promises to be right.
+
+    A set of competing effects claims that one of its names is true, any other verdict that all of
+    them are; a fault of the set-up is claimed as proven, without a confidence.
+    """
+    if answer.kind not in CLAIMING:
+        return False
+    if answer.kind == SETUP:
+        return SETUP not in truth or (bool(faults) and not set(answer.faults) <= set(faults))
+    names = set(answer.names)
+    wrong = names.isdisjoint(truth) if answer.kind == "ambiguous" else not names <= set(truth)
+    return wrong and answer.confidence >= CLAIMED
 
 
 def digest_of(recordings: Sequence[Recording], options: FitOptions, actuation: str) -> str:
@@ -164,7 +176,7 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
     return Answer(
         kind=verdict.kind,
         names=tuple(names),
-        confidence=float(found.ranking[0].confidence) if found.ranking else 0.0,
+        confidence=verdict.confidence,
         ranking=tuple(row.effect for row in found.ranking),
         sentence=verdict.sentence,
         before_mm=found.error_mm.before,
@@ -172,6 +184,7 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
         best_mm=found.error_mm.ceiling,
         validated_mm=model.validation.rmse_mm,
         seconds=seconds,
+        faults=found.setup.kinds if found.setup else (),
     )
 
 
@@ -259,6 +272,7 @@ def to_json(outcomes: Sequence[Outcome]) -> dict:
         row["verdict"] = {
             "kind": answer.kind,
             "names": list(answer.names),
+            "faults": list(answer.faults),
             "confidence": answer.confidence,
             "sentence": answer.sentence,
         }

@@ -35,17 +35,18 @@ def row_of(outcome: Outcome) -> str:
     """One entry as a row."""
     entry, answer = outcome.entry, outcome.answer
     truth = " + ".join(entry.truth) or "nothing changed"
+    truth += f": {' + '.join(entry.faults)}" if entry.faults else ""
     if answer is None:
         return (
             f"| {entry.name} | {entry.change} | {truth} | skipped: {outcome.skipped} |" + 9 * " |"
         )
-    joint = " + " if answer.kind == "several" else " or "
+    joint = " or " if answer.kind == "ambiguous" else " + "
     cells = [
         entry.name,
         entry.change,
         truth,
         answer.kind,
-        joint.join(answer.names) if answer.kind in NAMING else "",
+        joint.join(answer.names if answer.kind in NAMING else answer.faults),
         f"{answer.confidence:.2f}",
         "yes" if outcome.named else "no",
         _mm(answer.before_mm),

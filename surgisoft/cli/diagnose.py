@@ -136,8 +136,8 @@ def diagnose(
     elif apply:
         print(f"nothing to mend: {apply} was not written")
     if found.next_command:
-        earlier = f" --before {' '.join(map(str, before))}" if before else ""
-        command = found.next_command.format(model=model, data=data, before=earlier)
+        option = f" --before {' '.join(map(str, before))}" if before else ""
+        command = found.next_command.format(model=model, data=data, before=option)
         print(f"next: {with_effect_files(command)}")
 
 

@@ -43,6 +43,13 @@ def fit(
         Literal["haw_nn", "constant_curvature", "recurrent"],
         typer.Option(help="HAW-NN, or one of two baselines."),
     ] = "haw_nn",
+    prior: Annotated[
+        Literal["none", "arcs"],
+        typer.Option(
+            help="Prior mean: a chain of arcs, fitted first; the network learns what is left. For "
+            "few data, and for motions that were only recorded one by one.",
+        ),
+    ] = "none",
     members: Annotated[
         int,
         typer.Option(
@@ -98,6 +105,7 @@ def fit(
             inputs=inputs,
             effects=[name for item in effects or [] for name in item.split(",")],
             hidden=parse_widths(widths),
+            prior=prior,
             members=members,
             epochs=epochs,
             seed=seed,

@@ -42,10 +42,9 @@ Kind = Literal[
     "cannot_tell",
     "setup",
 ]
-Reason = Literal["network", "learned", "refit", "few_data", "schedule"]
+Reason = Literal["network", "learned", "few_data", "schedule"]
 """Why a diagnosis cannot tell: the network is not that of this arm; the network has learned part of
-what is missing; fitted together with the network no effect does better than the network alone;
-there are too few motions; the schedule does not tell effects apart."""
+what is missing; there are too few motions; the schedule does not tell effects apart."""
 
 SCHEMA = 1
 """Version of the asset's format and of the features."""

@@ -22,7 +22,14 @@ from dataclasses import asdict, dataclass, replace
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CLAIM, SEARCH
 from surgisoft.diagnosis.data_quality import data_quality_warnings
-from surgisoft.diagnosis.decision import Decision, Kind, Probabilities, Reason, decide
+from surgisoft.diagnosis.decision import (
+    Decision,
+    Kind,
+    Probabilities,
+    Reason,
+    claimable,
+    decide,
+)
 from surgisoft.diagnosis.design.next_experiment import Experiment, Recommendation, recommend
 from surgisoft.diagnosis.design.schedules import SETUPS
 from surgisoft.diagnosis.error_axes import shares
@@ -74,8 +81,6 @@ REASONS = {
     "memory explains part of it that no static function does: the network was fitted to what is "
     "missing and has learned part of it, fit it together with effects",
     "few_data": "the recordings show too few different motions",
-    "refit": "fitted together with the network, no effect that it may imitate leaves significantly "
-    "less than the network alone",
     "schedule": "several causes explain these recordings about as well, and none well enough",
 }
 """Why a diagnosis cannot tell, in words."""
@@ -324,58 +329,57 @@ def with_axis(result: Diagnosis, problem: Problem) -> Diagnosis:
 def with_refit(result: Diagnosis, joint: Refit, problem: Problem) -> Diagnosis:
     """The diagnosis in which the refit decides about the effects that it tried.
 
-    A winner is named, alone or with what competes with it. Without one it cannot be told what is
-    missing where the residuals name effects that were tried, because the network alone does as
-    well, or where they ask for a refit.
+    A winner is named, alone or with what competes with it. Without one, effects that the residuals
+    name are not named any more if all of them were tried: the network alone does as well.
     """
     error = f"error {result.error_mm.before:.3g} mm, floor {result.error_mm.floor:.3g} mm"
-    verdict = result.verdict
+    verdict, ranking, checks = result.verdict, result.ranking, result.checks
+    plan, competing = result.next_experiment, result.ambiguous_with
+    evidence, chances = result.statistics, result.probabilities
+    command = result.next_command
     tried = {candidate.effect for candidate in joint.candidates}
-    if joint.winner is None:
-        idle = bool(verdict.effects) and tried.issuperset(verdict.effects)
-        if not idle and verdict.reason != "learned":
-            return replace(result, checks=(*result.checks, joint.sentence), refit=joint)
-        return replace(
-            result,
-            verdict=Verdict(
-                "cannot_tell",
-                (),
-                f"cannot tell what is missing, if anything: {joint.sentence}; {error}",
-                reason="refit",
-            ),
-            ranking=tuple(replace(row, confidence=0.0) for row in result.ranking),
-            ambiguous_with=(),
-            next_experiment=None,
-            next_command="surgisoft next-experiment {model} {data} -o SCHEDULE.csv",
-            refit=joint,
-        )
-    sure = round(joint.confidence, 4)
-    if joint.ambiguous:
-        kind: Kind = "ambiguous"
-        effects = joint.names
+    if joint.winner is not None:
+        sure = joint.confidence
+        kind: Kind = "ambiguous" if joint.ambiguous else "identified"
+        effects = joint.names if joint.ambiguous else (joint.winner,)
         head = f"cannot tell {' from '.join(effects)} with these recordings"
-        plan = recommend(problem, effects[:MOST_RIVALS]).experiment
-        command = f"surgisoft next-experiment {{model}} {{data}} --between {' '.join(effects)}"
-        command += " -o SCHEDULE.csv"
+        if kind == "identified":
+            head = f"{joint.winner} is missing (confidence {sure:.2f})"
+        verdict = Verdict(kind, effects, f"{head}: {joint.sentence}; {error}", round(sure, 4))
+        order = sorted(ranking, key=lambda row: row.effect not in joint.names)
+        order.sort(key=lambda row: row.effect != joint.winner)
+        most = min(sure, 1.0 - sure)
+        ranking = tuple(
+            replace(row, confidence=round(sure if place == 0 else min(row.confidence, most), 4))
+            for place, row in enumerate(order)
+        )
+        competing, plan = joint.competing, None
+        if kind == "ambiguous":
+            plan = recommend(problem, effects[:MOST_RIVALS]).experiment
+        if chances is not None:
+            command = next_command(Decision(kind, effects, sure, chances))
+            command += " --refit always" if kind == "identified" else ""
     else:
-        kind, effects, plan = "identified", (joint.winner,), None
-        head = f"{joint.winner} is missing (confidence {sure:.2f})"
-        command = f"surgisoft amend {{model}} --effect {joint.winner} --data {{data}} -o NEW"
-        command += " --refit always"
-    order = sorted(result.ranking, key=lambda row: row.effect not in joint.names)
-    order.sort(key=lambda row: row.effect != joint.winner)
-    least = round(min(sure, 1.0 - sure), 4)
+        checks = (*checks, joint.sentence)
+        if evidence is not None and chances is not None and tried.issuperset(verdict.effects):
+            quiet = chances.nothing + chances.network
+            none = Decision("cannot_tell", (), quiet, chances, "schedule")
+            if claimable(evidence):
+                none = Decision("nothing_missing", (), quiet, chances)
+            if verdict.effects or verdict.reason == "learned":
+                sentence = sentence_of(none, result.error_mm, result.error_mm.before)
+                verdict = Verdict(none.kind, (), sentence, round(quiet, 4), none.reason)
+                ranking = tuple(replace(row, confidence=0.0) for row in ranking)
+                command, competing, plan = next_command(none), (), None
     return replace(
         result,
-        verdict=Verdict(kind, effects, f"{head}: {joint.sentence}; {error}", sure),
-        ranking=tuple(
-            replace(row, confidence=sure if place == 0 else min(row.confidence, least))
-            for place, row in enumerate(order)
-        ),
-        ambiguous_with=joint.competing,
+        verdict=verdict,
+        ranking=ranking,
+        ambiguous_with=competing,
         next_experiment=plan,
-        next_command=command,
+        checks=checks,
         refit=joint,
+        next_command=command,
     )
 
 

@@ -22,7 +22,6 @@ place of a correlation, because the level of an actuation counts.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -327,6 +326,39 @@ def matches(
     return sorted(answer, key=lambda match: -int(match.inside.sum()))
 
 
+def all_matches(
+    after: list[RunSignal], before: list[RunSignal], alike: np.ndarray, itself: bool = False
+) -> list[Match]:
+    """What the runs of AFTER repeat of the runs of BEFORE.
+
+    A run at rest fits at every delay: it is paired at the delays at which other runs of the same
+    two recordings repeat each other. itself: both are the same runs, which are not their own
+    partners.
+    """
+    found: list[Match] = []
+    both = [(one, other) for one in after for other in before if one.timed == other.timed]
+    if itself:
+        both = [(one, other) for one, other in both if one.number <= other.number]
+    for one, other in both:
+        apart = APART_S if itself and one.number == other.number else 0.0
+        found += matches(one, other, alike, apart)
+    delays: dict[tuple[str, str], list[float]] = {}
+    for match in sorted(found, key=lambda match: -int(match.inside.sum())):
+        delays.setdefault((match.after.recording, match.before.recording), []).append(match.delay_s)
+    moved = {(match.after.number, match.before.recording) for match in found}
+    for one, other in both:
+        if not one.timed or (one.number, other.recording) in moved or itself:
+            continue
+        for delay in delays.get((one.recording, other.recording), []):
+            inside, mismatch = _agree(one, other, delay, alike)
+            if inside.sum() >= BLOCK_ROWS:
+                level = float(np.sqrt(np.mean(np.square(mismatch[inside]))))
+                found.append(Match(one, other, delay, inside, level))
+                moved.add((one.number, other.recording))
+                break
+    return found
+
+
 def _length(signal: RunSignal) -> float:
     return float(np.ptp(signal.t_s))
 
@@ -449,41 +481,35 @@ def _partners(after: ResidualTable, before: ResidualTable, itself: bool = False)
     sums, predicted = np.zeros(shape), np.zeros(shape)
     seen, averaging = np.zeros(shape[:2]), np.zeros(shape[0])
     partners, time = np.zeros(shape[0], int), np.full(shape[0], np.nan)
-    stretches = []
-    others = run_signals(before, commanded)
-    for one in run_signals(after, commanded):
-        for other in others:
-            if one.timed != other.timed:
-                continue
-            same = itself and one.number == other.number
-            if itself and one.number > other.number:
-                continue
-            for match in matches(one, other, alike, APART_S if same else 0.0):
-                at = one.t_s[match.inside] + match.delay_s
-                rows = one.rows[match.inside]
-                lower = np.clip(np.searchsorted(other.t_s, at, "right") - 1, 0, len(other.t_s) - 2)
-                share = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
-                share = np.clip(share, 0.0, 1.0)
-                lower = other.rows[lower]
-                residual = _between(before.residual_mm, lower, share)
-                ok = np.isfinite(residual).all(2)
-                sums[rows] += np.where(ok[..., None], residual, 0.0)
-                predicted[rows] += _between(before.predicted_mm, lower, share)
-                seen[rows] += ok
-                partners[rows] += 1
-                averaging[rows] += share**2 + (1 - share) ** 2
-                time[rows] = np.where(np.isnan(time[rows]), at, time[rows])
-                stretches.append(
-                    Stretch(
-                        one.recording,
-                        one.number,
-                        other.recording,
-                        other.number,
-                        match.delay_s,
-                        len(rows),
-                        match.mismatch,
-                    )
-                )
+    stretches: list[Stretch] = []
+    signals = [run_signals(table, commanded) for table in (after, before)]
+    for match in all_matches(*signals, alike, itself):
+        one, other = match.after, match.before
+        at = one.t_s[match.inside] + match.delay_s
+        rows = one.rows[match.inside]
+        lower = np.clip(np.searchsorted(other.t_s, at, "right") - 1, 0, len(other.t_s) - 2)
+        share = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
+        share = np.clip(share, 0.0, 1.0)
+        lower = other.rows[lower]
+        residual = _between(before.residual_mm, lower, share)
+        ok = np.isfinite(residual).all(2)
+        sums[rows] += np.where(ok[..., None], residual, 0.0)
+        predicted[rows] += _between(before.predicted_mm, lower, share)
+        seen[rows] += ok
+        partners[rows] += 1
+        averaging[rows] += share**2 + (1 - share) ** 2
+        time[rows] = np.where(np.isnan(time[rows]), at, time[rows])
+        stretches.append(
+            Stretch(
+                after=one.recording,
+                after_run=one.number,
+                before=other.recording,
+                before_run=other.number,
+                delay_s=match.delay_s,
+                rows=len(rows),
+                mismatch=match.mismatch,
+            )
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         residual = sums / np.where(seen, seen, np.nan)[..., None]
         predicted = predicted / np.where(partners, partners, np.nan)[:, None, None]
@@ -538,10 +564,10 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         + np.square(before.noise_mm) * (np.nanmean(found.averaging) if paired.any() else 1.0)
     )
     free = free_motion(after, measured_before, found.predicted_mm, change)
-    noise = np.maximum(noise, free)
     repeatability, source = _repeatability(before)
     slope = slope_error(after)
     discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
+    noise = np.maximum(noise, free)
     return Pairs(
         before=before.names,
         stretches=found.stretches,
@@ -725,10 +751,10 @@ def slope_error(table: ResidualTable) -> float:
 
 # Before and after ----------------------------------------------------------------------------
 
-Paired = Literal["auto", "always", "never"]
+Paired = str
 """Whether rows are paired: where enough have a partner, or it is an error if too few have, or not
 at all."""
-PAIRED: tuple[Paired, ...] = get_args(Paired)
+PAIRED: tuple[Paired, ...] = ("auto", "always", "never")
 
 
 @dataclass(frozen=True, eq=False)

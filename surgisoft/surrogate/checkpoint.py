@@ -33,8 +33,8 @@ OWN_FILES = ("config.json", "weights.safetensors", "report.json", RESIDUALS_FILE
 """Files of a model's folder. Replacing a model leaves all other files in place."""
 
 NETWORKS = {
-    "haw_nn": (HawNN, ("key_points", "hidden", "directions")),
-    "haw_ensemble": (HawEnsemble, ("key_points", "hidden", "directions", "members")),
+    "haw_nn": (HawNN, ("key_points", "hidden", "directions", "arcs")),
+    "haw_ensemble": (HawEnsemble, ("key_points", "hidden", "directions", "members", "arcs")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
     "recurrent": (RecurrentArm, ("key_points", "width")),
 }

@@ -1,10 +1,10 @@
 """Ensembles: networks trained side by side, each with another share of the data left out.
 
-The effects of a fitted model stay as they are. Runs, or long blocks of time, are dealt into as many
-folds as there are members, and each member is trained from new weights on all folds but its own
-(bagging over blocks: Breiman 1996). The mean of the members is the prediction. Each row was left
-out by one member; that member's error on it is what cross-validation finds, and calibrates the
-interval (CV+, Barber et al. 2021).
+The effects and the prior mean of a fitted model stay as they are. Runs, or long blocks of time,
+are dealt into as many folds as there are members, and each member is trained from new weights on
+all folds but its own (bagging over blocks: Breiman 1996). The mean of the members is the
+prediction. Each row was left out by one member; that member's error on it is what cross-validation
+finds, and calibrates the interval (CV+, Barber et al. 2021).
 
 All members are trained at once by batched products and for a fixed number of epochs: no row stops
 the training, so the errors of rows left out are those of new rows.
@@ -64,7 +64,8 @@ def train_ensemble(
     known, target = ~target.isnan(), target.nan_to_num()
     batch = min(config.batch, max(32, len(target) // 16))
     steps = max(1, len(target) // batch)
-    optimiser = torch.optim.Adam(ensemble.parameters(), lr=config.learning_rate)
+    trained = [parameter for parameter in ensemble.parameters() if parameter.requires_grad]
+    optimiser = torch.optim.Adam(trained, lr=config.learning_rate)
     schedule = cosine_schedule(optimiser, epochs * steps, 2 * steps)
     average = copy.deepcopy(ensemble)
     fast, slow = list(ensemble.parameters()), list(average.parameters())
@@ -109,7 +110,10 @@ def _untrained(network: HawNN, members: int) -> HawEnsemble:
             if isinstance(layer, torch.nn.Linear):
                 layer.reset_parameters()
         made.append(fresh)
-    return HawEnsemble.of(made).requires_grad_(True)
+    ensemble = HawEnsemble.of(made).requires_grad_(True)
+    if ensemble.prior is not None:
+        ensemble.prior.requires_grad_(False)
+    return ensemble
 
 
 def _folds(group: Tensor, folds: int, generator: torch.Generator) -> Tensor:

@@ -28,6 +28,7 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
+from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
     CHECK_EVERY,
@@ -161,6 +162,7 @@ def _signed(pieces: list[np.ndarray], direction: np.ndarray):
         start += len(piece)
 
 
+PRIORS = ("none", "arcs")
 INPUTS = ("pressure", "pressure+direction")
 SIMPLE_SHARE = 0.2
 """Share of the epochs for a stage that precedes others, or comes after an effect."""
@@ -204,6 +206,8 @@ class FitConfig:
     members: int = 1
     """Networks whose mean is the prediction; above 1 an ensemble is trained behind the selection
     of inputs and effects, each member without another share of the training data."""
+    prior: str = "none"
+    """`none`, or `arcs`: a chain of arcs is fitted first, and the network to what is left."""
     hidden: tuple[int, ...] = HIDDEN
     """Widths of the hidden layers of HAW-NN."""
     sections: int = 0
@@ -347,7 +351,7 @@ def fit(
             if name == AUTO:
                 _add_memory(data, spec, config, support, result, progress)
                 continue
-            candidate = _grow(result.model, name, spec, config, support, train)
+            candidate = _grow(result.model, name, spec, config, support, data)
             epochs = _stage_epochs(name, grown, config)
             _stage(candidate, name, epochs, config, data, result, progress)
         interval = None
@@ -397,6 +401,10 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
+    if config.prior not in PRIORS:
+        raise unknown_name("prior mean", config.prior, PRIORS)
+    if config.prior != "none" and config.network != "haw_nn":
+        raise InputError(f"a prior mean needs the network haw_nn, not {config.network}")
     if config.inputs not in INPUTS:
         raise unknown_name("inputs", config.inputs, INPUTS)
     known = known_effects()
@@ -490,16 +498,21 @@ def _supported(result: FitResult, name: str, config: FitConfig, support: _Suppor
     return bool(use.any())
 
 
-def _grow(model: ArmModel | None, name: str, spec, config, support: _Support, train) -> ArmModel:
+def _grow(
+    model: ArmModel | None, name: str, spec, config, support: _Support, data: Data
+) -> ArmModel:
     """The model with one stage more and an unchanged prediction."""
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     if name == "pressure":
-        network = HawNN(low, high, spec.key_points, config.hidden, directions=False)
-        normalise(network, train)
+        arcs = arcs_of(data.train.rows(data.train.key_points)) if config.prior == "arcs" else 0
+        network = HawNN(low, high, spec.key_points, config.hidden, directions=False, arcs=arcs)
+        if network.prior is not None:
+            fit_prior_mean(network.prior, data.fitted, rest_shape(data.train))
+        normalise(network, data.train)
         return ArmModel(spec, network)
     if name == "constant curvature":
         network = ConstantCurvature(low, high, spec.key_points, config.sections)
-        network.set_rest(rest_shape(train))
+        network.set_rest(rest_shape(data.train))
         return ArmModel(spec, network)
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
     grown = copy.deepcopy(model)
@@ -568,7 +581,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
         for name in ("none", *names):
             candidate = copy.deepcopy(result.model)
             if name != "none":
-                candidate = _grow(result.model, name, spec, config, support, data.train)
+                candidate = _grow(result.model, name, spec, config, support, data)
             label = name if name != "none" else "without effects"
             train_model(candidate, data, label, epochs, config, result.loss, progress)
             tried[name] = _rmse(_square(candidate, data))
@@ -577,7 +590,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
             text = ", ".join(f"{name} {rmse:.3f}" for name, rmse in tried.items())
             result.warnings.append(f"no effect with memory added; held-out RMSE in mm: {text}")
             return
-        candidate = _grow(result.model, best, spec, config, support, data.train)
+        candidate = _grow(result.model, best, spec, config, support, data)
         stage_epochs = max(CHECK_EVERY, round(EFFECT_SHARE * config.epochs))
         _stage(candidate, best, stage_epochs, config, data, result, progress)
         result.stages[-1].tried_mm = tried
@@ -587,11 +600,13 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
 
 
 def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval | None:
-    """Train an ensemble and keep it if its held-out error is less; returns the error's interval.
+    """Put an ensemble in the place of the network; returns the interval of its errors.
 
-    The interval is calibrated with errors of single members that were trained on less data, so it
-    would be too wide for the model that is kept. The ratio of both errors on the held-out rows
-    corrects it.
+    The held-out rows do not choose between the two: they stopped the training of the single
+    network, which may suit an unusual run that was held out and little else.
+
+    The interval is calibrated with errors of single members, which are larger than those of their
+    mean. The ratio of both errors on the held-out rows corrects it.
     """
     begin = time.perf_counter()
     epochs = max(CHECK_EVERY, round(MEMBER_SHARE * config.epochs))
@@ -604,16 +619,11 @@ def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval 
     with torch.no_grad():
         inputs = _network_inputs(model, rows)
         single = _rmse((model.network.each(*inputs) - rows.target).square().flatten(0, 1))
-    kept = after < before
-    reason = "" if kept else "its held-out error is no less than that of the single network"
-    if kept:
-        model.rest_mm.copy_(result.model.rest_mm)
-        result.model = model
-    else:
-        result.warnings.append(f"ensemble left out: {reason}")
+    model.rest_mm.copy_(result.model.rest_mm)
+    result.model = model
     name, seconds = f"{config.members} members", time.perf_counter() - begin
-    result.stages.append(StageReport(name, after, epochs, seconds, kept, reason, before))
-    return None if interval is None else interval.scaled(min(before, after) / single)
+    result.stages.append(StageReport(name, after, epochs, seconds, True, "", before))
+    return None if interval is None else interval.scaled(after / single)
 
 
 def _network_inputs(model: ArmModel, rows: Rows) -> tuple[Tensor, Tensor]:

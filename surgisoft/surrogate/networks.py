@@ -42,10 +42,17 @@ class HawNN(nn.Module):
         key_points: int,
         hidden: tuple[int, ...] = HIDDEN,
         directions: bool = True,
+        arcs: int = 0,
     ):
-        """Pressure range low, high (m,) in the arm's unit; `key_points` is n."""
+        """Pressure range low, high (m,) in the arm's unit; `key_points` is n.
+
+        arcs: number of arcs of a prior mean (`ArcChain`), to which the layers add what is left; 0:
+        none.
+        """
         super().__init__()
         chambers = len(low)
+        self.arcs = arcs
+        self.prior = ArcChain(low, high, key_points, arcs) if arcs else None
         self.key_points = key_points
         self.hidden = tuple(hidden)
         self.directions = directions
@@ -68,7 +75,8 @@ class HawNN(nn.Module):
         if self.directions:
             x = torch.cat([x, direction * self.use], dim=-1)
         y = torch.addcmul(self.mean, self.layers(x), self.scale)
-        return y.unflatten(-1, (self.key_points, 3))
+        y = y.unflatten(-1, (self.key_points, 3))
+        return y if self.prior is None else y + self.prior(pressure)
 
     @torch.no_grad()
     def with_directions(self, use: Tensor) -> "HawNN":
@@ -82,6 +90,7 @@ class HawNN(nn.Module):
             self.key_points,
             self.hidden,
             directions=True,
+            arcs=self.arcs,
         )
         state = self.state_dict()
         first = state["layers.0.weight"]
@@ -109,11 +118,16 @@ class HawEnsemble(nn.Module):
         hidden: tuple[int, ...] = HIDDEN,
         directions: bool = True,
         members: int = 5,
+        arcs: int = 0,
     ):
-        """Pressure range low, high (m,) in the arm's unit; `key_points` is n, `members` K."""
+        """Pressure range low, high (m,) in the arm's unit; `key_points` is n, `members` K.
+
+        arcs: number of arcs of the prior mean that all members share; 0: none.
+        """
         super().__init__()
-        self.members = members
+        self.members, self.arcs = members, arcs
         first = HawNN(low, high, key_points, hidden, directions)
+        self.prior = ArcChain(low, high, key_points, arcs) if arcs else None
         self.key_points, self.hidden, self.directions = key_points, first.hidden, directions
         for name, value in first.named_buffers():
             self.register_buffer(name, value)
@@ -131,8 +145,10 @@ class HawEnsemble(nn.Module):
         """The ensemble of networks of one layout and one normalisation."""
         first = networks[0]
         low, high = first.centre - first.half_range, first.centre + first.half_range
-        made = cls(low, high, first.key_points, first.hidden, first.directions, len(networks))
-        made.load_state_dict(dict(first.named_buffers()), strict=False)
+        layout = (first.key_points, first.hidden, first.directions, len(networks), first.arcs)
+        made = cls(low, high, *layout)
+        shared = {k: v for k, v in first.state_dict().items() if not k.startswith("layers.")}
+        made.load_state_dict(shared, strict=False)
         for member, network in enumerate(networks):
             linear = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
             for layer, weight, bias in zip(linear, made.weights, made.biases, strict=True):
@@ -144,11 +160,13 @@ class HawEnsemble(nn.Module):
         x = self._inputs(pressure, direction)
         leading = x.shape[:-1]
         points = self._through(x.reshape(1, -1, x.shape[-1]).expand(self.members, -1, -1))
-        return points.reshape(self.members, *leading, self.key_points, 3)
+        points = points.reshape(self.members, *leading, self.key_points, 3)
+        return points if self.prior is None else points + self.prior(pressure)
 
     def members_at(self, pressure: Tensor, direction: Tensor) -> Tensor:
         """(K, B, n, 3) key points in mm, each member at other rows (K, B, m)."""
-        return self._through(self._inputs(pressure, direction))
+        points = self._through(self._inputs(pressure, direction))
+        return points if self.prior is None else points + self.prior(pressure)
 
     def _inputs(self, pressure: Tensor, direction: Tensor) -> Tensor:
         x = (pressure - self.centre) / self.half_range
@@ -195,7 +213,10 @@ def _rotation(vector: Tensor) -> Tensor:
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(cross)
+    angle = (vector.square().sum(-1) + 1e-12).sqrt()[..., None, None]
+    along = torch.sinc(angle / math.pi)
+    across = 0.5 * torch.sinc(angle / (2 * math.pi)).square()
+    return torch.eye(3).to(cross) + along * cross + across * (cross @ cross)
 
 
 def arc_point(bend: Tensor, length: Tensor) -> Tensor:
@@ -267,6 +288,70 @@ class ConstantCurvature(nn.Module):
                     points[k] = start + (turn @ local[..., None])[..., 0]
             start = start + (turn @ arc_point(bend, length)[..., None])[..., 0]
             turn = turn @ arc_rotation(bend)
+        return torch.stack(points, -2)
+
+
+class ArcChain(nn.Module):
+    """Prior mean of an arm: arcs end to end, whose bends and stretches are linear in the actuation.
+
+    One arc ends at each key point (Webster & Jones 2010); where the first key point does not move,
+    it is the base, and the arcs begin there. Arcs compose by rotations, so that bends that were
+    only recorded one by one already give the shape of all of them together, which a sum of
+    displacements does not.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor, key_points: int, arcs: int):
+        """Pressure range low, high (m,) in the arm's unit; arcs: n, or n - 1 from a fixed base."""
+        super().__init__()
+        if not 1 <= arcs <= key_points or arcs < key_points - 1:
+            raise InputError(f"{arcs} arcs for {key_points} key points, expected one for each")
+        centre, half = centre_and_half(low, high)
+        self.fixed_base = arcs < key_points
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half)
+        self.register_buffer("length_mm", torch.ones(arcs))
+        self.register_buffer("base_mm", torch.zeros(3))
+        self.table = nn.Parameter(torch.zeros(arcs, 3, len(low) + 1))
+        self.base_turn = nn.Parameter(torch.zeros(3))
+        self.base_shift = nn.Parameter(torch.zeros(3))
+        self.offset = nn.Parameter(torch.zeros(arcs, 3))
+
+    @torch.no_grad()
+    def set_rest(self, rest: Tensor) -> None:
+        """Set base and lengths from the key points at rest, (n, 3) in mm, base frame.
+
+        A base below the first key point is assumed as far from it as the second one is.
+        """
+        steps = rest.diff(dim=0)
+        if not self.fixed_base:
+            first = steps[:1] if len(steps) else rest[:1]
+            rest, steps = torch.cat([rest[:1] - first[:1], rest]), torch.cat([first, steps])
+        lengths = steps.norm(dim=-1)
+        if not bool((lengths > 0).all()):
+            raise InputError("prior mean: two key points coincide at rest, expected a chain")
+        self.length_mm.copy_(lengths)
+        self.base_mm.copy_(rest[0])
+        # The rotation that takes z to the first step (Rodrigues 1840).
+        along = torch.nn.functional.normalize(steps[0], dim=0)
+        axis = torch.stack([-along[1], along[0], torch.zeros(())])
+        sine = axis.norm()
+        if sine > 1e-6:
+            self.base_turn.copy_(axis / sine * torch.atan2(sine, along[2]))
+
+    def forward(self, pressure: Tensor) -> Tensor:
+        """Key points (..., n, 3) in mm, base frame, from pressure (..., m)."""
+        x = (pressure - self.centre) / self.half_range
+        values = torch.einsum("acm,...m->...ac", self.table[..., :-1], x) + self.table[..., -1]
+        unit = self.length_mm.mean()
+        turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
+        place = (self.base_mm + unit * self.base_shift).expand(*x.shape[:-1], 3)
+        points = [place] if self.fixed_base else []
+        for number, offset in enumerate(self.offset):
+            bend = values[..., number, :2]
+            length = self.length_mm[number] * values[..., number, 2].exp()
+            place = place + (turn @ arc_point(bend, length)[..., None])[..., 0]
+            turn = turn @ arc_rotation(bend)
+            points.append(place + unit * (turn @ offset))
         return torch.stack(points, -2)
 
 

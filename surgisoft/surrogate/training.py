@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -117,6 +117,11 @@ class Data:
         return make_rows(model, self.train).take(held)
 
     @property
+    def fitted(self) -> History:
+        """The history to fit to, with key points missing in the rows that are held out."""
+        return replace(self.train, key_points=self.targets)
+
+    @property
     def targets(self) -> Tensor:
         """(R, T, n, 3) key points to fit to, mm; NaN where missing or held out."""
         if self.held is None:
@@ -165,9 +170,15 @@ def validated_error(target: Tensor, predicted: Tensor) -> Validation:
     return Validation(math.sqrt(float(square.nanmean())), tuple(points), len(target))
 
 
+@torch.no_grad()
 def normalise(network: nn.Module, history: History) -> None:
-    """Set a network's output mean and scale (3n,) in mm from the measured key points."""
+    """Set a network's output mean and scale (3n,) in mm from the measured key points.
+
+    With a prior mean: from what it leaves of them.
+    """
     points = history.rows(history.key_points)
+    if getattr(network, "prior", None) is not None:
+        points = points - network.prior(history.rows(history.pressure))
     seen = ~points.isnan()
     count = seen.sum(0).clamp(min=1)
     mean = points.nan_to_num().sum(0) / count

@@ -13,7 +13,8 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.histories import actuation_noise, arm_spec, history_of, outside_range
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.interval import ErrorInterval
+from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.networks import HawNN
 
 POINTS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 30.0], [0.0, 0.0, 70.0]])
@@ -51,6 +52,21 @@ def test_errors_by_hand():
     assert result.samples == 4
     assert result.worst[0].error_mm == pytest.approx(12.0)
     assert result.worst[0].key_point == 2
+
+
+def test_the_coverage_of_the_models_interval_is_stated():
+    """Radii 1, 6 and 10 mm: k0 exact, k1 off by 5, the tip off by 12 in two of four rows."""
+    points = np.tile(POINTS, (4, 1, 1))
+    points[:, 1] += [3.0, 4.0, 0.0]
+    points[:2, 2, 2] += 12.0
+    interval = ErrorInterval(
+        (0.5, 0.95), ((0.1,) * 3, (1.0, 6.0, 10.0)), 0.0, 9, 3, "held-out rows"
+    )
+    model = still_model().replace(validation=Validation(1.0, interval=interval))
+    result, _ = compare(model, [recording(points)])
+    assert result.coverage == pytest.approx(10 / 12)
+    assert result.to_json()["coverage"] == pytest.approx(10 / 12)
+    assert compare(still_model(), [recording(points)])[0].coverage is None
 
 
 def test_missing_key_points_are_left_out_and_counted():

@@ -239,16 +239,14 @@ def named(effect: str | None, found) -> Diagnosis:
 def test_without_a_winner_an_effect_that_was_tried_is_not_named_any_more(problem, found):
     """The residuals name creep, but the network alone does as well; or a payload, which stays."""
     none = replace(found, winner=None, competing=(), of_line=False, confidence=0.0)
-    result = with_refit(named("creep", none), none, problem)
-    assert result.verdict.kind == "cannot_tell"
-    assert result.verdict.reason == "refit"
+    known = diagnosing.diagnose(problem.model, [arm_by_hand(rows=800)], refit="never")
+    given = {"statistics": known.statistics, "probabilities": known.probabilities}
+    result = with_refit(replace(named("creep", none), **given), none, problem)
     assert result.verdict.effects == ()
-    assert none.sentence in result.verdict.sentence
-    load = named("payload", none)
+    assert result.verdict.kind not in ("identified", "several", "ambiguous")
+    assert none.sentence in result.checks
+    load = replace(named("payload", none), **given)
     assert with_refit(load, none, problem).verdict == load.verdict
-    assert none.sentence in with_refit(load, none, problem).checks
-    learned = replace(load, verdict=Verdict("cannot_tell", (), "so", reason="learned"))
-    assert with_refit(learned, none, problem).verdict.reason == "refit"
 
 
 def test_the_refit_decides_over_the_residuals(problem, found):
@@ -259,7 +257,6 @@ def test_the_refit_decides_over_the_residuals(problem, found):
     assert result.ranking[0].effect == "line_lag"
     assert result.ranking[0].confidence == pytest.approx(found.confidence, abs=1e-4)
     assert result.ranking[1].confidence <= 1.0 - found.confidence + 1e-4
-    assert "--effect line_lag" in result.next_command
 
 
 def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(

@@ -227,6 +227,19 @@ def _ranking(found: Diagnosis) -> Table:
     return Table(header, rows)
 
 
+def _probabilities(chances: Probabilities) -> Section:
+    """What may be true, with the calibrated probabilities."""
+    rows = [
+        ("nothing is missing", f"{chances.nothing:.2f}"),
+        ("nothing but a better network", f"{chances.network:.2f}"),
+        ("an effect of the list", f"{chances.known:.2f}"),
+        ("something outside the list", f"{chances.unknown:.2f}"),
+    ]
+    if chances.two:
+        rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))
+    return Section("Probabilities", [Table(["what may be true", "probability"], rows)])
+
+
 def _refit(refit: Refit) -> Section:
     """The candidates that were fitted together with the network."""
     rows = [
@@ -261,19 +274,6 @@ def _refit(refit: Refit) -> Section:
     return Section(
         "Fitted together", [Text(text), Table(header, rows), Text(f"Not tried: {left}.")]
     )
-
-
-def _probabilities(chances: Probabilities) -> Section:
-    """What may be true, with the calibrated probabilities."""
-    rows = [
-        ("nothing is missing", f"{chances.nothing:.2f}"),
-        ("nothing but a better network", f"{chances.network:.2f}"),
-        ("an effect of the list", f"{chances.known:.2f}"),
-        ("something outside the list", f"{chances.unknown:.2f}"),
-    ]
-    if chances.two:
-        rows.append((f"both {' and '.join(chances.two)}", f"{chances.pair:.2f}"))
-    return Section("Probabilities", [Table(["what may be true", "probability"], rows)])
 
 
 def _parameters(found: Diagnosis) -> Section:

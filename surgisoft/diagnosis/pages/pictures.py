@@ -31,7 +31,11 @@ def draw_all(
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
-    figures = [("loops", loops(table, unit, title)), ("error", error_over_time(table, title))]
+    radius = None
+    if table.model.states_interval:
+        radius = table.model.error_radius(torch.from_numpy(table.pressure))[:, -1].numpy()
+    error = error_over_time(table, title, radius)
+    figures = [("loops", loops(table, unit, title)), ("error", error)]
     if backbone is not None:
         figures.insert(1, ("body", body(table, backbone, title)))
     for name, figure in figures:
@@ -207,8 +211,11 @@ def _spread(tips: np.ndarray) -> list[int]:
     return chosen
 
 
-def error_over_time(table: ResidualTable, title: str = ""):
-    """Tip and mean error over the rows, runs marked, and the distribution per key point."""
+def error_over_time(table: ResidualTable, title: str = "", radius: np.ndarray | None = None):
+    """Tip and mean error over the rows, runs marked, and the distribution per key point.
+
+    radius: (N,) of the tip's 95 % prediction interval, mm, drawn as a band; None: not known.
+    """
     error = table.error_mm
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(11, 3.8), layout="constrained", width_ratios=(3, 1)
@@ -216,10 +223,9 @@ def error_over_time(table: ResidualTable, title: str = ""):
     # Rows that lack a key point are left out: a mean over the others jumps to the base's error.
     whole = np.flatnonzero(~np.isnan(error).any(axis=1))
     left.plot(whole, error[whole, -1], c=PREDICTED, lw=0.6, label="tip")
-    if table.model.states_interval:
-        radius = table.model.error_radius(torch.from_numpy(table.pressure[whole]))[:, -1].numpy()
+    if radius is not None:
         band = {"color": PREDICTED, "alpha": 0.15, "lw": 0}
-        left.fill_between(whole, 0, radius, label="tip, 95 % interval", **band)
+        left.fill_between(whole, 0, radius[whole], label="tip, 95 % interval", **band)
     mean = error[whole].mean(axis=1)
     left.plot(whole, mean, c=MEASURED, lw=0.6, label="mean of the key points")
     for edge in np.flatnonzero(np.diff(table.run)):

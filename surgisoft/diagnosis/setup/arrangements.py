@@ -81,10 +81,12 @@ def proposed(
             Arrangement(order, tuple(-1.0 if k == at else 1.0 for k in order), factor)
             for at in order
         ]
-    measured, predicted = _body_response(sample), _model_response(sample.model)
+    (measured, spread), predicted = _body_response(sample), _model_response(sample.model)
+    scale = _scale(sample)
     for factor in factors:
         for way in points:
-            found += _matched(measured[:, list(way)] / factor, predicted, factor)
+            likely = measured[:, list(way)] / (factor * scale)
+            found += _matched(likely, spread * factor, predicted, factor)
     return list(dict.fromkeys(found))
 
 
@@ -119,8 +121,9 @@ def improved(
     return path
 
 
-def _body_response(sample: Sample) -> np.ndarray:
-    """(m, n, 3) linear response of the recorded key points to each recorded channel."""
+def _body_response(sample: Sample) -> tuple[np.ndarray, np.ndarray]:
+    """(m, n, 3) linear response of the recorded key points to each recorded channel, and the
+    standard deviation (m,) of each channel."""
     actuation = sample.history.rows(sample.history.pressure).double().numpy()
     points = sample.measured()[0]
     response = np.zeros((actuation.shape[1], *points.shape[1:]))
@@ -128,7 +131,20 @@ def _body_response(sample: Sample) -> np.ndarray:
         seen = np.isfinite(points[:, k]).all(1)
         if seen.sum() > 3 * actuation.shape[1]:
             response[:, k] = _slope(actuation[seen], points[seen, k])
-    return response
+    return response, actuation.std(0)
+
+
+def _scale(sample: Sample) -> float:
+    """Recorded units in one mm, from the distances between neighbouring key points, or motion."""
+    recorded, rest = sample.measured()[0], sample.model.rest_mm.double().cpu().numpy()
+    if rest.shape[0] > 1:
+        links = np.linalg.norm(np.diff(recorded, axis=1), axis=2)
+        true = float(np.linalg.norm(np.diff(rest, axis=0), axis=1).sum())
+        found = float(np.nanmedian(links, axis=0).sum()) / max(true, 1e-12)
+    else:
+        plain = Arrangement.as_recorded(sample.history.chambers)
+        found = float(np.nanstd(recorded) / max(sample.predicted([plain])[0].std(), 1e-12))
+    return found if np.isfinite(found) and found > 0 else 1.0
 
 
 def _model_response(model: ArmModel) -> np.ndarray:
@@ -158,19 +174,31 @@ def _slope(actuation: np.ndarray, points: np.ndarray) -> np.ndarray:
     return slope / np.where(spread > 0, spread, 1.0)[:, None]
 
 
-def _matched(measured: np.ndarray, predicted: np.ndarray, factor: float) -> list[Arrangement]:
-    """The best assignments of responses (m, n, 3) under turned and mirrored frames."""
+def _matched(
+    measured: np.ndarray, spread: np.ndarray, predicted: np.ndarray, factor: float
+) -> list[Arrangement]:
+    """The best assignments of responses (m, n, 3), mm a unit, under turned and mirrored frames.
+
+    spread: (m,) standard deviation of each channel: what a channel hardly shows counts little.
+    """
     turns = Rotation.from_euler("z", np.arange(TURNS)[:, None] * 2 * np.pi / TURNS).as_matrix()
     frames = np.concatenate([turns, Rotation.create_group("O").as_matrix()])
     frames = np.concatenate([frames, frames * np.array([1.0, -1.0, 1.0])])
-    scale = np.linalg.norm(measured) / max(np.linalg.norm(predicted), 1e-12)
-    chambers, drawn = len(measured), {}
-    for frame in frames:
-        likely = scale * np.einsum("ij,mnj->mni", frame, predicted).reshape(chambers, -1)
-        inner = likely @ measured.reshape(chambers, -1).T
-        rows, columns = linear_sum_assignment(-np.abs(inner))
-        sign = np.sign(inner[rows, columns])
-        key = (tuple(columns.tolist()), tuple(np.where(sign == 0, 1.0, sign).tolist()))
-        drawn[key] = max(drawn.get(key, -np.inf), float(np.abs(inner[rows, columns]).sum()))
-    best = sorted(drawn, key=drawn.__getitem__, reverse=True)[:MATCHED]
-    return [Arrangement(order, sign, factor) for order, sign in best]
+    chambers = len(measured)
+    flat, weight = measured.reshape(chambers, -1), spread**2
+    size = np.square(predicted).sum((1, 2))
+    found = []
+    # Opposite chambers pull alike, to first order, once a sign is flipped: permutations without a
+    # flip have a list of their own.
+    for flips in (False, True):
+        drawn: dict[Arrangement, float] = {}
+        for frame in frames:
+            likely = np.einsum("ij,mnj->mni", frame, predicted).reshape(chambers, -1)
+            inner = likely @ flat.T
+            cost = weight * (size[:, None] - 2 * (np.abs(inner) if flips else inner))
+            rows, columns = linear_sum_assignment(cost)
+            sign = np.where(flips & (inner[rows, columns] < 0), -1.0, 1.0)
+            each = Arrangement(tuple(columns.tolist()), tuple(sign.tolist()), factor)
+            drawn[each] = min(drawn.get(each, np.inf), float(cost[rows, columns].sum()))
+        found += sorted(drawn, key=drawn.__getitem__)[:MATCHED]
+    return found

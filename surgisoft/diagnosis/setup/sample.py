@@ -44,6 +44,12 @@ class Arrangement:
         """Whether channels are permuted, flipped or left out."""
         return self.order != tuple(range(len(self.order))) or any(s != 1.0 for s in self.sign)
 
+    @property
+    def changes(self) -> int:
+        """Number of chambers that another channel drives, or the same one with another sign."""
+        own = enumerate(zip(self.order, self.sign, strict=True))
+        return sum(k != given or sign != 1.0 for k, (given, sign) in own)
+
     def of(self, actuation: np.ndarray) -> np.ndarray:
         """(..., m) actuation of the chambers from the recorded channels (..., m)."""
         return actuation[..., list(self.order)] * self.gain

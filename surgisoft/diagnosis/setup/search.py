@@ -73,6 +73,9 @@ class Proof:
     explained: float = 0.9
     """Least share of the squared error above the model's validated error that the correction
     removes on held-out blocks: what a correct set-up would."""
+    halved: float = 2.0
+    """... or the factor by which the error has to fall where it falls to the level of `noticed`:
+    the validated error is no exact measure of what a correct set-up reaches in other recordings."""
     left_of_motion: float = 0.35
     """Most error that may be left, as a share of the motion of the key points: with a correct
     set-up a model of the same arm predicts most of its motion, whatever physics is missing."""
@@ -84,7 +87,7 @@ class Proof:
     """Corrections whose errors differ by less than this factor do equally well: the simplest of
     them is named, and those of its number of kinds are named together."""
     blocks: float = 0.9
-    """Least share of the blocks of time whose error falls, of those above the validated error."""
+    """Least share of the blocks of time whose error falls, of those with a noticed error."""
     lag_t: float = 3.0
     """By how many standard errors, over blocks of time, the logarithm of the error must be less
     with a pure delay than with any lag, alone or behind a quarter of the delay."""
@@ -103,6 +106,8 @@ LAG_STRETCHES = (0.7, 1.0, 1.3)
 """Time constants of their lags, in units of what is left of the delay."""
 LAG_MARGIN = 3.0
 """Rows that take no part at the begin of each run, in units of the delay."""
+MOST_EQUALS = 3
+"""Most other explanations that are named."""
 SETTINGS, PROOF = SearchSettings(), Proof()
 
 
@@ -528,7 +533,7 @@ class Search:
             for each in tried
             if each.rmse_mm <= self.proof.as_good * max(least, self.levels.noise)
         ]
-        return min(near, key=lambda each: (each.complexity, each.rmse_mm))
+        return min(near, key=lambda e: (e.complexity, e.hypothesis.arrangement.changes, e.rmse_mm))
 
     def _equals(self, best: Fitted, tried: Sequence[Fitted]) -> tuple[Fitted, ...]:
         """Other explanations with as many kinds, each once, that do as well."""
@@ -538,23 +543,25 @@ class Search:
             same = each.complexity == best.complexity and each.rmse_mm <= limit
             if same and each.hypothesis.what not in found:
                 found[each.hypothesis.what] = each
-        return tuple(found.values())[1:]
+        return tuple(found.values())[1 : 1 + MOST_EQUALS]
 
     def _proved(self, before: Fitted, after: Fitted) -> bool:
         """Whether a correction shows what `Proof` asks for."""
         asked = self.proof
         # In a wrong unit of length the error before is in that unit, too.
         start = before.rmse_mm * max(1.0, after.hypothesis.mm_per_unit)
-        explained = self._share(start, after.rmse_mm)
+        enough = self._share(start, after.rmse_mm) >= asked.explained or (
+            after.rmse_mm <= min(asked.noticed * self.levels.reference, start / asked.halved)
+        )
         motion = float(np.sqrt(np.mean(self.motion(after.hypothesis.arrangement) ** 2)))
         most = max(asked.near_validated * self.levels.reference, asked.left_of_motion * motion)
         # A fault need not show in a block in which nothing moves.
         counted = (after.blocks.count > 0) & (before.blocks.count > 0)
-        noticed = before.losses > self.levels.reference**2 * before.blocks.count
+        noticed = before.losses > self.limit_mm**2 * before.blocks.count
         falls = after.losses < before.losses
         known = after.hypothesis.mm_per_unit != 1.0 or not (counted & noticed).any()
         share = 1.0 if known else float(np.mean(falls[counted & noticed]))
-        return explained >= asked.explained and after.rmse_mm <= most and share >= asked.blocks
+        return enough and after.rmse_mm <= most and share >= asked.blocks
 
     def _pure_delay(self, given: Fitted) -> bool:
         """Whether an offset in time is one of the clocks and no lag of the arm or its line.

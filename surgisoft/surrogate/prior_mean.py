@@ -1,0 +1,62 @@
+"""Fit of the prior mean: a chain of arcs by regularised least squares, before any training.
+
+Minimised over the bends, stretches and base are
+
+    mean |measured - arcs|^2 + (ridge |table|^2 + offset_ridge |offsets|^2) v,
+
+with v the mean squared motion of a key point, by L-BFGS (Liu & Nocedal 1989) in double precision.
+"""
+
+import torch
+from torch import Tensor
+
+from surgisoft.surrogate.history import History
+from surgisoft.surrogate.networks import ArcChain
+
+RIDGE = 2e-5
+"""Weight of the squared bends (rad) and relative stretches, in mean squared motions."""
+OFFSET_RIDGE = 1e-3
+"""Weight of the squared offsets of markers from the arcs' ends, in mean lengths of an arc."""
+MOST_ROWS = 1500
+"""Largest number of rows that are fitted to, evenly thinned."""
+ITERATIONS = 150
+"""Most iterations."""
+STILL = 0.02
+"""A first key point that moves less than this share of the last one's motion is the fixed base."""
+
+
+def arcs_of(points: Tensor) -> int:
+    """Number of arcs of a prior mean for measured key points (S, n, 3) in mm, NaN where missing."""
+    motion = (points - points.nanmean(0)).square().sum(-1).nanmean(0).sqrt()
+    return points.shape[1] - int(motion[0] < STILL * motion[-1])
+
+
+def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
+    """Fit a prior mean to the measured rows of a history; rest: (n, 3) key points at rest, mm."""
+    prior.set_rest(rest)
+    points = history.rows(history.key_points)
+    seen = (~points.isnan()).all(-1).any(-1)
+    step = max(1, -(-int(seen.sum()) // MOST_ROWS))
+    points = points[seen][::step].double()
+    pressure = history.rows(history.pressure)[seen][::step].double()
+    known, points = ~points.isnan(), points.nan_to_num()
+    count = known.sum().clamp(min=1) / 3
+    mean = points.sum(0) / known.sum(0).clamp(min=1)
+    motion = float(((points - mean) * known).square().sum() / count)
+    prior.double()
+    parameters = list(prior.parameters())
+    optimiser = torch.optim.LBFGS(
+        parameters, max_iter=ITERATIONS, history_size=30, line_search_fn="strong_wolfe"
+    )
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        left = ((prior(pressure) - points) * known).square().sum() / count
+        held = RIDGE * prior.table[..., :-1].square().sum()
+        held = held + OFFSET_RIDGE * prior.offset.square().sum()
+        total = left / motion + held
+        total.backward()
+        return total
+
+    optimiser.step(loss)
+    prior.float()

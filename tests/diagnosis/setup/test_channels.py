@@ -1,0 +1,102 @@
+"""Dead and frozen channels, and chambers that do not act."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.setup.recordings import measured, predicted, turned, with_points
+
+
+@pytest.fixture(scope="module")
+def model():
+    return default_arm()
+
+
+def without_channel(recording, k, commanded=True):
+    values = recording.measured.copy()
+    values[:, k] = 0.0
+    command = recording.commanded if commanded else None
+    return replace(recording, measured=values, commanded=command)
+
+
+def test_a_dead_channel_is_mended_by_its_command(model):
+    original = measured()
+    wrong = without_channel(original, 1)
+    found = find_setup_faults(model, [wrong])
+    assert found.kinds == ("dead_chamber",)
+    assert found.faults[0].numbers["channel"] == 2
+    np.testing.assert_array_equal(found.mended([wrong])[0].measured, original.measured)
+
+
+@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (0.4, -0.8, 1.0)])
+def test_a_dead_channel_without_a_command_shows_in_the_body(model, vector):
+    original = turned(measured(), vector)
+    found = find_setup_faults(model, [without_channel(original, 2, commanded=False)])
+    assert found.kinds[0] == "dead_chamber"
+    assert ("frame" in found.kinds) == any(vector)
+    assert not found.mendable
+    low, high = np.quantile(original.measured[:, 2], [0.05, 0.95])
+    assert found.faults[0].numbers["range"] == pytest.approx([low, high], abs=4.0)
+
+
+def test_a_channel_that_rests_in_truth_is_not_dead(model):
+    import torch
+
+    from surgisoft.measurement.histories import history_of
+
+    still = without_channel(predicted(), 0)
+    with torch.no_grad():
+        true = model.predict(history_of([still]))[0].double().numpy()
+    noise = np.random.default_rng(0).normal(0, 0.05, true.shape)
+    assert find_setup_faults(model, [with_points(still, true + noise)]) is None
+
+
+def test_a_dead_key_point_becomes_missing(model):
+    original = measured()
+    points = original.key_points_mm.copy()
+    points[:, 3] = [1.0, 2.0, 3.0]
+    wrong = with_points(original, points)
+    found = find_setup_faults(model, [wrong])
+    assert found.kinds == ("dead_key_point",)
+    assert "k3" in found.sentence
+    mended = found.mended([wrong])[0].key_points_mm
+    assert np.isnan(mended[:, 3]).all()
+    np.testing.assert_array_equal(mended[:, [0, 1, 2, 4]], original.key_points_mm[:, [0, 1, 2, 4]])
+
+
+def test_a_key_point_frozen_for_a_while_is_missing_there(model):
+    original = measured()
+    points = original.key_points_mm.copy()
+    points[600:1100, 4] = points[600, 4]
+    wrong = with_points(original, points)
+    found = find_setup_faults(model, [wrong])
+    assert found.kinds == ("dead_key_point",)
+    lost = np.isnan(found.mended([wrong])[0].key_points_mm[:, 4, 0])
+    assert lost[601:1100].all()
+    assert not lost[:600].any()
+    assert not lost[1100:].any()
+
+
+def test_a_base_that_stands_still_is_no_fault(model):
+    points = measured().key_points_mm.copy()
+    points[:, 0] = points[0, 0]
+    assert find_setup_faults(model, [with_points(measured(), points)]) is None
+
+
+def test_a_chamber_that_does_not_act(model):
+    import torch
+
+    from surgisoft.measurement.histories import history_of
+
+    logged = predicted()
+    at_rest = without_channel(logged, 0)
+    with torch.no_grad():
+        true = model.predict(history_of([at_rest]))[0].double().numpy()
+    noise = np.random.default_rng(0).normal(0, 0.05, true.shape)
+    found = find_setup_faults(model, [with_points(logged, true + noise)])
+    assert found.kinds == ("chambers",)
+    assert "chamber 1 does not act" in found.sentence
+    assert not found.mendable

@@ -1,0 +1,185 @@
+"""Faults of a set-up that were put into recordings are named, mended, and told from physics."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.setup.recordings import (
+    driven,
+    late,
+    measured,
+    predicted,
+    turned,
+    with_points,
+)
+
+PSI = 6.894757293168361  # kPa, NIST SP 811
+
+
+def points(change):
+    return lambda r: with_points(r, change(r.key_points_mm))
+
+
+def actuation(change):
+    return lambda r: driven(r, change)
+
+
+SINGLE = {
+    "turned by 90 degrees": (
+        lambda r: turned(r, [0.0, 0.0, np.pi / 2]),
+        "frame",
+        "turned by 90.0 deg about z",
+    ),
+    "turned and shifted": (
+        lambda r: turned(r, [0.3, -1.4, 0.5], [100.0, 3.0, -50.0]),
+        "frame",
+        "and shifted by (100.0, 3.0, -50.0) mm",
+    ),
+    "shifted": (
+        lambda r: turned(r, [0.0, 0.0, 0.0], [0.0, 35.0, 0.0]),
+        "frame",
+        "shifted by (0.0, 35.0, 0.0) mm",
+    ),
+    "mirrored": (
+        points(lambda x: x * [1.0, -1.0, 1.0]),
+        "frame",
+        "mirrored: the sign of y is wrong",
+    ),
+    "swapped": (
+        points(lambda x: x[..., [1, 0, 2]]),
+        "frame",
+        "mirrored: the axes x and y are swapped",
+    ),
+    "cm": (points(lambda x: x / 10), "length_unit", "in cm where mm are stated"),
+    "m": (points(lambda x: x / 1000), "length_unit", "in m where mm are stated"),
+    "inch": (points(lambda x: x / 25.4), "length_unit", "in inches where mm are stated"),
+    "mm read as m": (points(lambda x: x * 1000), "length_unit", "mm were read as m"),
+    "psi": (actuation(lambda u: u / PSI), "actuation_unit", "in psi where kPa is stated"),
+    "bar": (actuation(lambda u: u / 100), "actuation_unit", "in bar where kPa is stated"),
+    "Pa": (actuation(lambda u: u * 1000), "actuation_unit", "in Pa where kPa is stated"),
+    "permuted": (
+        actuation(lambda u: u[:, [1, 2, 0]]),
+        "chambers",
+        "chambers 1, 2, 3 are driven by channels 3, 1, 2",
+    ),
+    "sign": (
+        actuation(lambda u: u * [1.0, 1.0, -1.0]),
+        "chambers",
+        "the sign of chamber 3 is flipped",
+    ),
+    "reversed": (points(lambda x: x[:, ::-1]), "key_points", "in reverse order, tip to base"),
+    "late": (lambda r: late(r, 6), "time", "s late relative to the actuation"),
+    "early": (lambda r: late(r, -4), "time", "s early relative to the actuation"),
+}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return default_arm()
+
+
+@pytest.mark.parametrize("name", SINGLE)
+def test_one_fault_is_named_and_mended(model, name):
+    change, kind, words = SINGLE[name]
+    original = measured()
+    wrong = change(original)
+    found = find_setup_faults(model, [wrong])
+    assert found.kinds == (kind,)
+    assert words in found.sentence.replace("-0.0", "0.0")
+    assert found.alternatives == ()
+    mended = found.mended([wrong])[0]
+    assert find_setup_faults(model, [mended]) is None
+    if kind != "time":
+        apart = mended.key_points_mm - original.key_points_mm
+        assert np.sqrt(np.square(apart).sum(2).mean()) < 0.05
+        np.testing.assert_allclose(mended.measured, original.measured, atol=1e-9)
+
+
+def test_without_noise_a_rotation_is_exact(model):
+    vector, shift = np.array([0.9, 0.2, -1.1]), [12.0, -70.0, 3.0]
+    found = find_setup_faults(model, [turned(predicted(), vector, shift)])
+    rotation = np.array(found.faults[0].numbers["rotation"])
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(found.faults[0].numbers["shift_mm"], shift, atol=1e-6)
+    expected = np.degrees(np.linalg.norm(vector))
+    assert found.faults[0].numbers["turn_deg"] == pytest.approx(expected, abs=1e-6)
+
+
+def test_an_offset_in_time_is_estimated_within_its_error(model):
+    found = find_setup_faults(model, [late(measured(), 7)])
+    fault = found.faults[0]
+    assert fault.numbers["late_s"] == pytest.approx(0.7, abs=4 * fault.errors["late_s"] + 1e-3)
+    assert fault.errors["late_s"] < 0.02
+
+
+PAIRS = [
+    ("turned and shifted", "permuted"),
+    ("mirrored", "sign"),
+    ("cm", "reversed"),
+    ("psi", "late"),
+    ("turned and shifted", "late"),
+    ("permuted", "psi"),
+]
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=" + ".join)
+def test_two_faults_are_both_named(model, pair):
+    wrong = measured()
+    for name in pair:
+        wrong = SINGLE[name][0](wrong)
+    found = find_setup_faults(model, [wrong])
+    assert sorted(found.kinds) == sorted(SINGLE[name][1] for name in pair)
+    assert find_setup_faults(model, found.mended([wrong])) is None
+
+
+def lagged(recording, tau_s: float):
+    """Key points behind a first-order lag, by a difference equation of its own."""
+    keep = np.exp(-np.diff(recording.t_s).mean() / tau_s)
+    x = recording.key_points_mm
+    return with_points(recording, lfilter([1 - keep], [1, -keep], x, axis=0, zi=keep * x[:1])[0])
+
+
+PHYSICS = {
+    "nothing": lambda r: r,
+    "a misalignment of 5 degrees": lambda r: turned(r, [0.05, 0.07, -0.02], [2.0, -1.0, 0.5]),
+    "a gain of 7 %": actuation(lambda u: u * [1.07, 1.0, 1.0]),
+    "a lag of 0.25 s": lambda r: lagged(r, 0.25),
+    "a lag of 0.6 s": lambda r: lagged(r, 0.6),
+    "a load that bends the arm aside": points(
+        lambda x: x + np.array([4.0, 0.0, 0.0]) * np.linspace(0, 1, 5)[:, None] ** 2
+    ),
+    "a drift": lambda r: with_points(
+        r, r.key_points_mm + np.linspace(0, 4, r.samples)[:, None, None] * [0.0, 1.0, 0.0]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_physics_is_no_fault_of_the_set_up(model, name):
+    assert find_setup_faults(model, [PHYSICS[name](measured())]) is None
+
+
+def test_one_of_two_recordings_with_a_turned_frame(model):
+    right = measured()
+    wrong = replace(turned(measured(seed=3), [0.0, 1.2, 0.0]), name="moved")
+    found = find_setup_faults(model, [right, wrong])
+    assert found.recordings == ("moved",)
+    assert found.kinds == ("frame",)
+    same, mended = found.mended([right, wrong])
+    assert same is right
+    assert find_setup_faults(model, [same, mended]) is None
+
+
+def test_a_diagnosis_ends_with_the_set_up(model):
+    found = diagnose(model, [turned(measured(), [0.0, 0.0, 2.0])])
+    assert found.verdict.kind == "setup"
+    assert found.verdict.effects == ()
+    assert found.error_mm.before > 10 * found.error_mm.ceiling
+    assert found.to_json()["setup"]["faults"][0]["kind"] == "frame"
+    assert "114.6 deg about z" in found.verdict.sentence  # 2 rad

@@ -1,0 +1,150 @@
+"""What mends a set-up: the lines of a map, `--apply`, and what the commands say."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tomli_w
+
+from surgisoft.cli import run
+from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.measurement.importing import import_files, load_map
+from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.surrogate.checkpoint import default_arm
+from tests.diagnosis.setup.recordings import driven, late, measured, turned, with_points
+
+WRONG = {
+    "frame and cm": lambda r: with_points(
+        turned(r, [0.3, 0.1, 1.9], [30.0, 0.0, 8.0]),
+        turned(r, [0.3, 0.1, 1.9], [30.0, 0.0, 8.0]).key_points_mm / 10,
+    ),
+    "mirrored and permuted": lambda r: driven(
+        with_points(r, r.key_points_mm * [-1.0, 1.0, 1.0]), lambda u: u[:, [2, 1, 0]]
+    ),
+    "psi and sign": lambda r: driven(r, lambda u: u * [1.0, -1.0, 1.0] / 6.894757293168361),
+    "reversed and too large": lambda r: with_points(r, r.key_points_mm[:, ::-1] * 1000),
+    "late": lambda r: late(r, 5),
+    "early": lambda r: late(r, -8),
+}
+
+
+def map_of(recording) -> dict:
+    """A map that reads a recording as it is."""
+    count = recording.key_points
+    return {
+        "time": {"column": "t_s"},
+        "measured": {},
+        "commanded": {},
+        "key_points": {
+            "positions": [[f"k{k}_{axis}_mm" for axis in "xyz"] for k in range(count)],
+            "unit": "mm",
+        },
+        "runs": {"column": "run"},
+    }
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_the_lines_of_the_map_mend_like_apply(name, tmp_path):
+    wrong = WRONG[name](measured())
+    found = find_setup_faults(default_arm(), [wrong])
+    assert found.mendable
+    save_recording(wrong, tmp_path / "raw.parquet")
+    table = map_of(wrong)
+    for section, fields in found.correction.tables().items():
+        table[section] = table.get(section, {}) | fields
+    if "columns" in table["measured"] and "unit" not in table["commanded"]:
+        order = [name.replace("p", "c", 1) for name in table["measured"]["columns"]]
+        table["commanded"] |= {"columns": order, "unit": table["measured"]["unit"]}
+    if "to" in table["measured"]:
+        columns = [f"p{k}_kPa" for k in (1, 2, 3)]
+        table["measured"]["columns"] = columns
+        table.pop("commanded")
+    (tmp_path / "mend.toml").write_text(tomli_w.dumps(table))
+    part = import_files([tmp_path / "raw.parquet"], load_map(str(tmp_path / "mend.toml")), None)[0]
+    mended = found.mended([wrong])[0]
+    np.testing.assert_allclose(part.recording.measured, mended.measured, atol=5e-3)
+    np.testing.assert_allclose(part.recording.key_points_mm, mended.key_points_mm, atol=2e-2)
+    assert find_setup_faults(default_arm(), [part.recording]) is None
+
+
+@pytest.fixture
+def folder(tmp_path):
+    wrong = turned(measured(), [0.0, 0.0, 1.5], [40.0, 0.0, 0.0])
+    save_recording(replace(wrong, name="day2"), tmp_path / "day2.parquet")
+    save_recording(measured(), tmp_path / "day1.parquet")
+    return tmp_path
+
+
+def test_apply_writes_what_is_mended_and_nothing_else(folder, capsys):
+    before = (folder / "day2.parquet").read_bytes()
+    out = folder / "mended"
+    given = ["diagnose", "default", str(folder / "day2.parquet"), "--apply", str(out)]
+    assert run([*given, "--json", str(folder / "found.json")]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("setup: the frame of the key points is turned by 85.9 deg about z")
+    assert "[frame]" in text
+    assert f"next: surgisoft diagnose default {out}" in text
+    assert (folder / "day2.parquet").read_bytes() == before
+    assert sorted(path.name for path in out.iterdir()) == ["day2.parquet", "day2.toml"]
+    mended = load_recording(out / "day2.parquet")
+    apart = mended.key_points_mm - measured().key_points_mm
+    assert np.abs(apart).max() < 0.1
+    plain = json.loads((folder / "found.json").read_text())
+    assert plain["verdict"]["kind"] == "setup"
+    assert plain["setup"]["recordings"] == ["day2"]
+    assert run(["diagnose", "default", str(out)]) == 0
+    assert not capsys.readouterr().out.startswith("setup")
+
+
+def test_apply_replaces_nothing(folder, capsys):
+    given = ["diagnose", "default", str(folder / "day2.parquet"), "--apply", str(folder)]
+    assert run(given) == 2
+    assert "is not empty" in capsys.readouterr().err
+
+
+def test_nothing_is_written_where_nothing_is_wrong(folder, capsys):
+    out = folder / "mended"
+    assert run(["diagnose", "default", str(folder / "day1.parquet"), "--apply", str(out)]) == 0
+    assert "nothing to mend" in capsys.readouterr().out
+    assert not out.exists()
+
+
+def test_the_tests_can_be_left_out(folder, capsys):
+    given = ["diagnose", "default", str(folder / "day2.parquet"), "--no-setup-tests"]
+    assert run(given) == 0
+    assert not capsys.readouterr().out.startswith("setup")
+
+
+def test_compare_points_to_diagnose(folder, capsys):
+    assert run(["compare", "default", str(folder / "day2.parquet")]) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("set-up:"))
+    assert "turned by 85.9 deg about z" in line
+    assert "surgisoft diagnose" in line
+
+
+def test_a_wrong_unit_of_length_is_named_by_the_command(folder, capsys):
+    wrong = with_points(measured(), measured().key_points_mm / 1000)
+    save_recording(wrong, folder / "metres.parquet")
+    assert run(["diagnose", "default", str(folder / "metres.parquet")]) == 0
+    text = capsys.readouterr().out
+    assert "the positions are in m where mm are stated" in text
+    assert 'unit = "m"' in text
+
+
+def test_import_tests_the_set_up_against_a_model(folder, capsys):
+    (folder / "map.toml").write_text(tomli_w.dumps(map_of(measured())))
+    given = ["import", str(folder / "day2.parquet"), "--map", str(folder / "map.toml")]
+    out = ["-o", str(folder / "new.parquet"), "--model", "default"]
+    assert run([*given, *out]) == 0
+    text = capsys.readouterr()
+    assert "set-up: the frame of the key points is turned by 85.9 deg" in text.err
+    assert "[frame]" in text.out
+
+
+def test_the_report_shows_what_mends_it(folder):
+    given = ["diagnose", "default", str(folder / "day2.parquet"), "--report", str(folder / "page")]
+    assert run(given) == 0
+    page = (folder / "page" / "diagnosis.html").read_text()
+    assert "Set-up of the recordings" in page
+    assert "rotation = [[" in page

@@ -1,0 +1,144 @@
+"""The prior mean: it recovers constant-curvature arms, and adds bends that were recorded singly."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.surrogate.history import pack
+from surgisoft.surrogate.networks import ArcChain, HawEnsemble, HawNN
+from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
+from tests.surrogate.truth import SPEC, history, walk
+
+LOW, HIGH = torch.zeros(2), torch.full((2,), 50.0)
+LENGTHS = (80.0, 60.0)
+BENDS = (1.1, -0.9)
+
+
+def arm(pressure: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) base, middle and tip, mm, of two planar arcs of angle BENDS p / 50, by hand.
+
+    Plane geometry: an arc of length L and angle a goes L sin(a) / a along and L (1 - cos a) / a
+    across the direction in which it starts.
+    """
+    place, heading = np.zeros((len(pressure), 2)), np.zeros(len(pressure))
+    points = [place]
+    for number, (length, bend) in enumerate(zip(LENGTHS, BENDS, strict=True)):
+        angle = bend * pressure[:, number] / 50 + 1e-9
+        along, across = length * np.sin(angle) / angle, length * (1 - np.cos(angle)) / angle
+        step = np.stack(
+            [
+                along * np.sin(heading) + across * np.cos(heading),
+                along * np.cos(heading) - across * np.sin(heading),
+            ],
+            axis=1,
+        )
+        place, heading = place + step, heading + angle
+        points.append(place)
+    flat = np.stack(points, axis=1)
+    return np.stack([flat[..., 0], np.zeros(flat.shape[:2]), flat[..., 1]], axis=-1)
+
+
+def one_by_one() -> np.ndarray:
+    """Each chamber alone up and down: never both at once."""
+    sweep = np.concatenate([np.linspace(0, 50, 60), np.linspace(50, 0, 60)])
+    still = np.zeros_like(sweep)
+    return np.concatenate([np.stack([sweep, still], 1), np.stack([still, sweep], 1)])
+
+
+def recorded(pressure: np.ndarray):
+    times = torch.arange(len(pressure)) * 0.1
+    return pack([times], [torch.tensor(pressure)], [torch.tensor(arm(pressure))])
+
+
+def test_bends_recorded_one_by_one_give_the_arm_of_both():
+    seen = recorded(one_by_one())
+    assert arcs_of(seen.rows(seen.key_points)) == 2, "the base does not move"
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    fit_prior_mean(prior, seen, torch.tensor(arm(np.zeros((1, 2)))[0]).float())
+    both = np.random.default_rng(0).uniform(0, 50, (200, 2))
+    with torch.no_grad():
+        error = prior(torch.tensor(both).float()) - torch.tensor(arm(both))
+    assert float(error.norm(dim=-1).max()) < 0.15, "of a motion of 100 mm"
+
+
+def test_an_arm_at_rest_along_any_axis_is_recovered():
+    """The base is turned by 0.7 rad: the first arc starts along the measured first step."""
+    turn = 0.7
+    frame = torch.tensor(
+        [
+            [math.cos(turn), 0, math.sin(turn)],
+            [0, 1, 0],
+            [-math.sin(turn), 0, math.cos(turn)],
+        ]
+    )
+    straight = torch.tensor(arm(np.zeros((1, 2)))[0]).float() @ frame.T + 5.0
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    prior.set_rest(straight)
+    assert torch.allclose(prior(torch.zeros(1, 2))[0], straight, atol=1e-3)
+
+
+def test_without_a_fixed_base_one_arc_more_is_added():
+    points = torch.randn(100, 3, 3) * 30
+    assert arcs_of(points) == 3
+    still = points.clone()
+    still[:, 0] = 0.01 * still[:, 0]
+    assert arcs_of(still) == 2
+    rest = torch.tensor([[0.0, 0, 50], [0, 0, 110], [0, 0, 160]])
+    prior = ArcChain(LOW, HIGH, 3, 3)
+    prior.set_rest(rest)
+    assert prior.base_mm.tolist() == pytest.approx([0, 0, -10])
+    assert torch.allclose(prior(torch.zeros(1, 2))[0], rest, atol=1e-3)
+
+
+def test_the_network_adds_to_its_prior_mean():
+    torch.manual_seed(0)
+    network = HawNN(LOW, HIGH, 3, (8,), arcs=2)
+    network.prior.set_rest(torch.tensor([[0.0, 0, 0], [0, 0, 80], [0, 0, 140]]))
+    network.prior.table.data.normal_()
+    pressure, direction = torch.rand(9, 2) * 50, torch.ones(9, 2)
+    plain = HawNN(LOW, HIGH, 3, (8,))
+    plain.load_state_dict(network.state_dict(), strict=False)
+    expected = plain(pressure, direction) + network.prior(pressure)
+    assert torch.allclose(network(pressure, direction), expected, atol=1e-4)
+    ensemble = HawEnsemble.of([network, network])
+    assert torch.allclose(ensemble(pressure, direction), expected, atol=1e-4)
+    assert torch.allclose(ensemble.each(pressure, direction)[1], expected, atol=1e-4)
+
+
+def test_a_fit_with_prior_mean_round_trips_and_extrapolates(tmp_path):
+    """On motions that only the test has, the prior mean leaves less than half the error."""
+    rng = np.random.default_rng(3)
+    singly = []
+    for chamber in range(3):
+        path = np.tile(SPEC.rest, (150, 1))
+        path[:, chamber] = walk(150, rng)[:, chamber]
+        singly += [path, path[::-1].copy()]
+    train, test = history(singly, 0.0), history([walk(300, rng)], 0.0, seed=9)
+    config = FitConfig(hidden=(32, 32), epochs=40, inputs="pressure", batch=128)
+    errors = {}
+    for prior in ("none", "arcs"):
+        result = fit(train, None, SPEC, replace(config, prior=prior))
+        error = (result.model.predict(test) - test.key_points).norm(dim=-1)
+        errors[prior] = float(error.square().mean().sqrt())
+    assert errors["arcs"] < 0.5 * errors["none"]
+    save_model(result.model, tmp_path / "arm")
+    again = load_model(tmp_path / "arm")
+    assert torch.equal(again.predict(test), result.model.predict(test))
+
+
+def test_impossible_chains_are_refused():
+    with pytest.raises(InputError, match="4 arcs for 3 key points"):
+        ArcChain(LOW, HIGH, 3, 4)
+    prior = ArcChain(LOW, HIGH, 3, 2)
+    with pytest.raises(InputError, match="coincide"):
+        prior.set_rest(torch.zeros(3, 3))
+
+
+def test_models_without_a_prior_mean_are_as_before():
+    assert default_arm().network.prior is None

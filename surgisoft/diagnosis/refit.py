@@ -265,6 +265,12 @@ def _trainable(model: ArmModel) -> bool:
     return not isinstance(model.network, RecurrentArm)
 
 
+LINE = "line_lag"
+"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
+of the wall are the same operator on the actuation: where both do as well and the model's input is a
+command, which has passed a line in any case, the lag is that of the line."""
+
+
 def can_hide(name: str) -> bool:
     """Whether a network can hide an effect by imitation: one with memory that acts in front."""
     kind = known_effects()[name]
@@ -276,7 +282,8 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
 
     A network of actuation and direction learns every static function by itself, so a static effect
     leaves no trace in a joint fit. Effects behind the network act on the shape; the network does
-    not see what they need. Effects that the model has already were fitted with it.
+    not see what they need. Effects that the model has already were fitted with it. A lag of the
+    line lies between the command and the measured actuation, so it is tried for commands alone.
     """
     tried, left = [], {}
     timed = bool(problem.table.timed[problem.index.numpy()].any())
@@ -287,6 +294,11 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
             left[name] = "the model has it already, and it was fitted with the network"
         elif kind.stage not in ("line", "material"):
             left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
+        elif name == LINE and problem.model.spec.actuation == "measured":
+            left[name] = (
+                "the model's input is the measured actuation, in which the line's lag is already: "
+                "a lag behind it is one of the wall; the residuals decide about a longer line"
+            )
         elif issubclass(kind, Memoryless):
             left[name] = "is a function of the actuation, which a network learns by itself"
         elif not timed:
@@ -722,12 +734,6 @@ def _decided(
     if competing:
         sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure
-
-
-LINE = "line_lag"
-"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
-of the wall are the same operator on the actuation: where both do as well and the model's input is a
-command, which has passed a line in any case, the lag is that of the line."""
 
 
 # The model that results -----------------------------------------------------------------------

@@ -1,9 +1,8 @@
-from dataclasses import replace
-
 """`improve`: effect after effect until the gates are silent, and the waterfall of it."""
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 

@@ -165,8 +165,8 @@ class Refit:
     of_line: bool
     """Whether a tie was settled for the lag of the line, because the model's input is a command."""
     confidence: float
-    """Share of bootstrap samples in which the winner leaves the least error of all candidates, less
-    its p-value; 0 without a winner."""
+    """Share of bootstrap samples in which the winner, or what does about as well, leaves the least
+    error of all candidates, less its p-value; 0 without a winner."""
     not_tried: tuple[tuple[str, str], ...]
     """(effect, why it was not tried)."""
     unit: str
@@ -728,9 +728,9 @@ def _decided(
     if of_line:
         competing = [score for score in (best, *competing) if score is not line[0]]
         best = line[0]
-    others = [gain for name, gain in gains.items() if name != best.effect]
-    shares = win_shares(-np.stack([gains[best.effect], *others]))
-    sure = max(float(shares[0]) - best.p_value, 0.0)
+    alike = {score.effect for score in (best, *competing)}
+    shares = dict(zip(gains, win_shares(-np.stack(list(gains.values()))), strict=True))
+    sure = max(float(sum(shares[name] for name in alike)) - best.p_value, 0.0)
     if competing:
         sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure

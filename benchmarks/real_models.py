@@ -173,7 +173,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--actuation", choices=("measured", "commanded"), default="measured")
     parser.add_argument("--folds", type=int, default=5)
-    parser.add_argument("--judged", type=int, default=None, help="folds left out; default: all")
+    parser.add_argument("--judged", default="", help="folds to leave out, as 1,2; default: all")
     parser.add_argument("--members", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=200)
     parser.add_argument("--effects", default="auto")
@@ -198,12 +198,17 @@ def main() -> None:
     names = group[history.valid].unique()
     order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(0))]
     every: dict[str, list[Fold]] = {}
-    for number in range(options.judged or options.folds):
+    judged = [int(x) - 1 for x in options.judged.split(",") if x] or range(options.folds)
+    for number in judged:
         left_out = torch.isin(group, order[number :: options.folds]) & history.valid
         for fold in judge(history, spec, left_out, config):
             every.setdefault(fold.name, []).append(fold)
             rmse = np.sqrt(np.nanmean(fold.square_mm2))
-            print(f"  fold {number + 1}: {fold.name:20s} {rmse:8.3f} mm", flush=True)
+            line = f"  fold {number + 1}: {fold.name:20s} {rmse:8.3f} mm"
+            if fold.inside is not None:
+                inside = fold.inside[~np.isnan(fold.square_mm2)].mean()
+                line += f", {inside:.1%} within the 95 % interval"
+            print(line, flush=True)
     errors = {
         name: float(np.sqrt(np.nanmean(np.concatenate([f.square_mm2 for f in folds]))))
         for name, folds in every.items()

@@ -239,6 +239,7 @@ def compare(
             missing=int((looked_at & ~seen).sum()),
             bands=tuple(bands(problem)),
             worst=tuple(_worst(table)),
+            coverage=_coverage(table),
             notes=notes,
             setup=wrong and wrong.sentence,
             change=None if both is None else both.change,

@@ -2,9 +2,14 @@
 
 Minimised over the bends, stretches and base are
 
-    mean |measured - arcs|^2 + (ridge |table|^2 + offset_ridge |offsets|^2) v,
+    mean |measured - arcs|^2 + v (ridge |bends|^2 + stretch_ridge |stretches|^2
+                                  + offset_ridge |offsets|^2),
 
 with v the mean squared motion of a key point, by L-BFGS (Liu & Nocedal 1989) in double precision.
+Bends and stretches are those of half a chamber's range. A ridge is the prior of a Gaussian
+variable, s^2 / (N w^2): what the arcs leave is about s = 15 % of the motion, of which a short
+recording has about N = 20 independent samples, and the variable is of the size w. Without it, a
+chamber that hardly moved gets a large bend that fits the others' residuals.
 """
 
 import torch
@@ -13,8 +18,10 @@ from torch import Tensor
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.networks import ArcChain
 
-RIDGE = 2e-5
-"""Weight of the squared bends (rad) and relative stretches, in mean squared motions."""
+RIDGE = 1e-3
+"""Weight of the squared bends (rad), in mean squared motions: bends of the size of 1 rad."""
+STRETCH_RIDGE = 1e-1
+"""Weight of the squared relative stretches, in mean squared motions: stretches of 0.1."""
 OFFSET_RIDGE = 1e-3
 """Weight of the squared offsets of markers from the arcs' ends, in mean lengths of an arc."""
 MOST_ROWS = 1500
@@ -52,7 +59,8 @@ def fit_prior_mean(prior: ArcChain, history: History, rest: Tensor) -> None:
     def loss() -> Tensor:
         optimiser.zero_grad()
         left = ((prior(pressure) - points) * known).square().sum() / count
-        held = RIDGE * prior.table[..., :-1].square().sum()
+        held = RIDGE * prior.table[:, :2, :-1].square().sum()
+        held = held + STRETCH_RIDGE * prior.table[:, 2, :-1].square().sum()
         held = held + OFFSET_RIDGE * prior.offset.square().sum()
         total = left / motion + held
         total.backward()

@@ -582,20 +582,21 @@ def decide(
     chances = probabilities(evidence, model)
     names = list(chances.effects)
     known, pair = chances.known, chances.pair
+    needless = (1.0 - known) * worth.needless_name
     tried: list[tuple[float, Kind, tuple[str, ...], float]] = []
     both = pair / known if known and names[0] in chances.two else 0.0
     whole = 1.0 - both * (1.0 - worth.first_of_pair)
     if names:
         first = chances.effects[names[0]]
-        value = first * whole + (1.0 - first) * worth.wrong_name
+        value = first * whole + (known - first) * worth.wrong_name + needless
         tried.append((value, "identified", (names[0],), first))
     if len(names) > 1:
         either = chances.effects[names[0]] + chances.effects[names[1]]
-        value = either * whole * worth.right_set + (1.0 - either) * worth.wrong_name
+        value = either * whole * worth.right_set + (known - either) * worth.wrong_name + needless
         tried.append((value, "ambiguous", (names[0], names[1]), either))
     if chances.two:
         half = max(known - pair, 0.0)
-        value = pair + half * worth.half_pair + (1.0 - known) * worth.wrong_name
+        value = pair + half * worth.half_pair + needless
         tried.append((value, "several", chances.two, pair))
     unknown = chances.unknown + (1.0 - chances.unknown) * worth.wrong_unknown
     tried.append((unknown, "unknown_effect", (), chances.unknown))

@@ -256,8 +256,9 @@ def diagnose(
     if both is not None:
         result = since(result, both, found)
     elif reason:
+        cannot = [*without, *(each.effect for each in not_testable)]
         joint = fit_candidates_together(
-            problem, reason, without, progress=refit_progress, processes=processes
+            problem, reason, cannot, progress=refit_progress, processes=processes
         )
         result = with_refit(result, joint, problem)
     if result.verdict.kind == "unknown_effect":

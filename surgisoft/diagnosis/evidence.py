@@ -65,7 +65,8 @@ class ProposalEvidence:
     gain: float
     """Share of what can be explained that they explain together."""
     left_size: float
-    """Error that they leave above the floor, in units of the model discrepancy."""
+    """Error that they leave above the floor, in units of the model discrepancy, in a paired
+    difference of what the right effect may leave."""
     left_log_box: float
     """Mean over blocks of log(error with them / error of the black box), the noise in both."""
     form_gain: float
@@ -253,7 +254,7 @@ def _proposal(found: Findings, place: int) -> ProposalEvidence:
     return ProposalEvidence(
         effects=proposal.effects,
         gain=_share(null.sum() - after.sum(), selection.explainable(null, tried)),
-        left_size=selection.size(after),
+        left_size=selection.left_size(after),
         left_log_box=float(selection.log_ratio(after, found.box.losses).mean()),
         form_gain=form.share,
         form_log_gain=form.log_gain,

@@ -80,9 +80,6 @@ FREE_POWER = 4.0
 LEAST_BINS = 8
 """Lowest frequency at which motion can be free, in steps of the spectrum: below it the few bins say
 little, and creep and drift act there."""
-UNSEEN_NOISE = 1.0
-"""Repeatability beyond the noise floor, in noise floors, where BEFORE has no repeats that show it:
-slow noise is then taken to be as large as fast noise."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +133,9 @@ class Pairs:
     discrepancy_mm: np.ndarray
     """(n,) what takes the place of the model discrepancy, mm, see `paired_discrepancy`."""
     tolerance_mm: np.ndarray
-    """(n,) what the right effect may leave, mm: the discrepancy, and the share of the change that
-    the sensitivities of the effects are off by (`slope_error`)."""
+    """(n,) what the right effect may leave, mm: the discrepancy, the share of the change that the
+    sensitivities of the effects are off by (`slope_error`), and where BEFORE has no repeats slow
+    noise of the size of its noise floor."""
 
     @property
     def paired(self) -> np.ndarray:
@@ -567,6 +565,8 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
     repeatability, source = _repeatability(before)
     slope = slope_error(after)
     discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
+    # Without repeats slow noise may be as large as fast noise.
+    slow = noise if source == "noise" else np.zeros_like(noise)
     noise = np.maximum(noise, free)
     return Pairs(
         before=before.names,
@@ -581,7 +581,9 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         free_mm=free,
         noise_mm=noise,
         discrepancy_mm=discrepancy,
-        tolerance_mm=np.hypot(discrepancy, slope * rms_by_point(change[training])),
+        tolerance_mm=np.sqrt(
+            discrepancy**2 + slow**2 + (slope * rms_by_point(change[training])) ** 2
+        ),
     )
 
 
@@ -696,16 +698,18 @@ def _enough(after: ResidualTable, pairs: Pairs) -> bool:
 def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
     """(n,) RMS distance by which a recording of the same motion differs, mm, and its source.
 
-    Two recordings of BEFORE differ by twice the variance of one.
+    Two recordings of BEFORE differ by twice the variance of one. Where BEFORE has no repeats, the
+    noise floor is what is known of it.
     """
     found = _partners(before, before, itself=True)
-    difference = before.residual_mm - found.residual_mm
-    square = np.square(difference).sum(2)
+    difference = before.measured_mm - found.residual_mm - found.predicted_mm
+    correction = before.predicted_mm - found.predicted_mm
+    square = np.square(difference - without_noise(before, difference, correction)).sum(2)
     # A mean of several partners has less of a variance.
     square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
     seen = np.isfinite(square)
     if (seen.sum(0) < 2 * LEAST_BLOCKS * BLOCK_ROWS).any():
-        return np.hypot(1.0, UNSEEN_NOISE) * before.noise_mm, "noise"
+        return before.noise_mm, "noise"
     return np.sqrt(np.nanmean(square, axis=0)), "repeats"
 
 

@@ -165,8 +165,8 @@ class Refit:
     of_line: bool
     """Whether a tie was settled for the lag of the line, because the model's input is a command."""
     confidence: float
-    """Share of bootstrap samples in which the winner leaves the least error of all candidates, less
-    its p-value; 0 without a winner."""
+    """Share of bootstrap samples in which the winner, or what does about as well, leaves the least
+    error of all candidates, less its p-value; 0 without a winner."""
     not_tried: tuple[tuple[str, str], ...]
     """(effect, why it was not tried)."""
     unit: str
@@ -265,6 +265,12 @@ def _trainable(model: ArmModel) -> bool:
     return not isinstance(model.network, RecurrentArm)
 
 
+LINE = "line_lag"
+"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
+of the wall are the same operator on the actuation: where both do as well and the model's input is a
+command, which has passed a line in any case, the lag is that of the line."""
+
+
 def can_hide(name: str) -> bool:
     """Whether a network can hide an effect by imitation: one with memory that acts in front."""
     kind = known_effects()[name]
@@ -276,7 +282,8 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
 
     A network of actuation and direction learns every static function by itself, so a static effect
     leaves no trace in a joint fit. Effects behind the network act on the shape; the network does
-    not see what they need. Effects that the model has already were fitted with it.
+    not see what they need. Effects that the model has already were fitted with it. A lag of the
+    line lies between the command and the measured actuation, so it is tried for commands alone.
     """
     tried, left = [], {}
     timed = bool(problem.table.timed[problem.index.numpy()].any())
@@ -287,6 +294,11 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
             left[name] = "the model has it already, and it was fitted with the network"
         elif kind.stage not in ("line", "material"):
             left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
+        elif name == LINE and problem.model.spec.actuation == "measured":
+            left[name] = (
+                "the model's input is the measured actuation, in which the line's lag is already: "
+                "a lag behind it is one of the wall; the residuals decide about a longer line"
+            )
         elif issubclass(kind, Memoryless):
             left[name] = "is a function of the actuation, which a network learns by itself"
         elif not timed:
@@ -716,18 +728,12 @@ def _decided(
     if of_line:
         competing = [score for score in (best, *competing) if score is not line[0]]
         best = line[0]
-    others = [gain for name, gain in gains.items() if name != best.effect]
-    shares = win_shares(-np.stack([gains[best.effect], *others]))
-    sure = max(float(shares[0]) - best.p_value, 0.0)
+    alike = {score.effect for score in (best, *competing)}
+    shares = dict(zip(gains, win_shares(-np.stack(list(gains.values()))), strict=True))
+    sure = max(float(sum(shares[name] for name in alike)) - best.p_value, 0.0)
     if competing:
         sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure
-
-
-LINE = "line_lag"
-"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
-of the wall are the same operator on the actuation: where both do as well and the model's input is a
-command, which has passed a line in any case, the lag is that of the line."""
 
 
 # The model that results -----------------------------------------------------------------------

@@ -162,10 +162,17 @@ class ModelSelection:
         return max(self.excess(before), float(before.sum()) - least)
 
     def size(self, losses: np.ndarray) -> float:
-        """Error that is left above the noise floor, in units of the model discrepancy (of what the
-        right effect may leave, `Problem.tolerance_mm`)."""
+        """Error that is left above the noise floor, in units of the model discrepancy."""
+        return self._over(losses, self.problem.discrepancy_mm)
+
+    def left_size(self, losses: np.ndarray) -> float:
+        """Error that effects leave above the noise floor, in units of what the right ones may leave
+        (`Problem.tolerance_mm`)."""
+        return self._over(losses, self.problem.tolerance_mm)
+
+    def _over(self, losses: np.ndarray, level_mm: np.ndarray) -> float:
         seen = np.isfinite(self.problem.residual).all(2).sum(0)
-        return float(np.sqrt(self.excess(losses) / (seen @ np.square(self.problem.tolerance_mm))))
+        return float(np.sqrt(self.excess(losses) / (seen @ np.square(level_mm))))
 
     @property
     def whole_size(self) -> float:

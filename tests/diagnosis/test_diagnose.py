@@ -36,12 +36,13 @@ def test_nothing_is_named_on_a_clean_robot(found):
 
 @pytest.mark.parametrize("name", ["creep", "misalignment", "hysteresis"])
 def test_the_hidden_effect_is_named(found, name):
+    """Alone or in a set of two, whichever the fitted decision finds worth more."""
     answer = found[name]
-    assert answer.verdict.kind == "identified"
-    assert answer.verdict.effects == (name,)
+    assert answer.verdict.kind in ("identified", "ambiguous")
+    assert name in answer.verdict.effects
     first = answer.ranking[0]
     assert first.effect == name
-    assert first.confidence > 0.9
+    assert first.confidence > 0.6
     assert first.gain_alone > 0.7
     assert first.heldout_rmse_mm < 0.5 * answer.error_mm.before
     assert answer.error_mm.floor < answer.error_mm.before

@@ -87,12 +87,13 @@ def test_delay_is_found_to_a_fraction_of_a_sample(model, after_s, before_s, nois
 def test_partner_is_the_measurement_at_the_matching_instant(model):
     """Without noise and network, the partner of a row is BEFORE between its two nearest rows."""
     motion = smooth_walk(4)
-    after, before = (replace(made(motion, s), key_points_mm=np.zeros((ROWS, 3, 3))) for s in (3, 1))
+    still = np.zeros((ROWS, 3, 3))
+    after, before = (replace(made(motion, s), key_points_mm=still.copy()) for s in (3, 1.03))
     before.key_points_mm[:, -1, 0] = before.t_s
     pairs = paired(model, after, before).pairs
     there = pairs.paired
     assert there.sum() > ROWS - 100
-    expected = after.t_s[there] + 2.0
+    expected = after.t_s[there] + 1.97
     np.testing.assert_allclose(pairs.partner_t_s[there], expected, atol=0.01)
     np.testing.assert_allclose(pairs.before_mm[there][:, -1, 0], expected, atol=0.01)
 
@@ -105,6 +106,8 @@ def test_only_the_common_part_is_paired(model):
     after = recording(unlearned(mixed), mixed)
     pairs = paired(model, after, made(one, 0.0, seed=2), "auto").pairs
     assert pairs.paired[: ROWS // 2].mean() < 0.05
+    # The past has to agree too, for 2 s.
+    assert not pairs.paired[ROWS // 2 : ROWS // 2 + 10].any()
     assert pairs.paired[ROWS // 2 + 30 :].mean() > 0.95
     assert pairs.stretches[0].delay_s == pytest.approx(-PERIOD_S * (ROWS // 2), abs=0.1)
 

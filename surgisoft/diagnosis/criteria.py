@@ -69,7 +69,7 @@ class Worth:
     """An effect is named, alone or in a set, and none of the list is missing."""
     wrong_name: float = -2.0
     """An effect is named, alone or in a set, and another one of the list is missing."""
-    right_set: float = 0.8
+    right_set: float = 0.7
     """The missing effect is one of two that are named as a set."""
     half_pair: float = 0.0
     """One of two effects that are named together is missing, the other not: what is right of it and

@@ -20,9 +20,9 @@ LAG_S = 0.5
 """Low pass whose distance from the actuation is the axis `lag`, s; one of `TIMES_S`."""
 PAST_S = 15.0
 """The same for the axis `past actuation`, s."""
-WAYS = (0.05, 0.2, 0.6)
+REVERSAL_WAY_SHARES = (0.05, 0.2, 0.6)
 """Ways after a reversal on which its trace may die out, shares of a chamber's range."""
-DWELLS_S = (1.0, 4.0, 16.0)
+DWELL_TIMES_S = (1.0, 4.0, 16.0)
 """Times of rest on which a trace may die out, s."""
 LEAST_SIDE = 0.1
 """Least lateral part of the weight for which the bending plane has an angle to it."""
@@ -116,13 +116,13 @@ def _around(degrees: np.ndarray) -> np.ndarray:
 
 def _since_reversal(table: ResidualTable) -> np.ndarray:
     way = table.memory.since_reversal / np.array(table.spec.span)
-    parts = [table.memory.direction * np.exp(-way / width) for width in WAYS]
+    parts = [table.memory.direction * np.exp(-way / width) for width in REVERSAL_WAY_SHARES]
     return np.concatenate([table.memory.direction, *parts], axis=1)
 
 
 def _dwell(table: ResidualTable) -> np.ndarray:
     """Grows with the time at table, differently after a rise and after a fall."""
-    grown = np.stack([-np.expm1(-table.memory.dwell_s / time) for time in DWELLS_S], axis=1)
+    grown = np.stack([-np.expm1(-table.memory.dwell_s / time) for time in DWELL_TIMES_S], axis=1)
     return _with(table, grown, table.memory.direction)
 
 

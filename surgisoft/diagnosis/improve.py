@@ -31,6 +31,8 @@ MOST_EFFECTS = 6
 PLAUSIBLE_GAIN = 0.95
 """Least share of the fall of the squared error that an effect must keep at the end of its plausible
 range; it is then held there."""
+LIKELY = 0.5
+"""Probability that an effect of the list is missing from which the most probable one is tried."""
 NETWORK = "network"
 """Name of the step that re-tunes the network."""
 
@@ -225,10 +227,15 @@ def improve(
 def next_effects(found: Diagnosis) -> tuple[str, ...]:
     """The effects to add after a diagnosis, in order; none where the loop ends.
 
-    Of effects that cannot be told apart the first is taken: the error falls with any of them.
+    Of effects that cannot be told apart the first is taken: the error falls with any of them. Where
+    a diagnosis cannot tell, but an effect of the list is more likely missing than not, the most
+    probable one is tried: it stays only if the error falls by it.
     """
-    effects = found.verdict.effects
-    return effects[:1] if found.verdict.kind == "ambiguous" else effects
+    kind, effects = found.verdict.kind, found.verdict.effects
+    chances = found.probabilities
+    if kind == "cannot_tell" and chances is not None and chances.known > LIKELY:
+        return tuple(chances.effects)[:1]
+    return effects[:1] if kind == "ambiguous" else effects
 
 
 def _as_good(held: Fall, free: Fall) -> bool:

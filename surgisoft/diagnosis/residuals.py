@@ -536,7 +536,8 @@ def folds(motion: np.ndarray) -> np.ndarray:
 # Motions that repeat -------------------------------------------------------------------------
 
 MOTION_TIMES_S = (0.5, 2.0)
-"""Time constants of the low passes that say how an actuation came about, s."""
+"""Time constants of the low passes of the actuation, s: two rows repeat a motion where the
+actuation and its low passes agree within `MOTION_ALIKE`."""
 MOTION_ALIKE = 0.1
 """How far actuation and its past may differ, in half ranges, to count as the same motion."""
 MOTION_SHARE = 0.5

@@ -2,11 +2,13 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
 from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
+from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
 from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
 from surgisoft.errors import InputError
@@ -112,6 +114,13 @@ def test_what_a_diagnosis_leads_to():
     assert next_effects(said("identified", "creep")) == ("creep",)
     assert next_effects(said("several", "creep", "payload")) == ("creep", "payload")
     assert next_effects(said("ambiguous", "creep", "drift")) == ("creep",)
+    assert next_effects(said("cannot_tell")) == ()
+
+
+def test_what_is_more_likely_missing_than_not_is_tried():
+    for known, tried in ((0.6, ("creep",)), (0.4, ())):
+        chances = Probabilities(0.0, 0.0, 1 - known, {"creep": known - 0.1, "drift": 0.1}, 0.0, ())
+        assert next_effects(replace(said("cannot_tell"), probabilities=chances)) == tried
 
 
 def test_rounds_are_reported_as_they_end(recited):

@@ -87,9 +87,8 @@ def test_delay_is_found_to_a_fraction_of_a_sample(model, after_s, before_s, nois
 def test_partner_is_the_measurement_at_the_matching_instant(model):
     """Without noise and network, the partner of a row is BEFORE between its two nearest rows."""
     motion = smooth_walk(4)
-    after, before = (
-        replace(made(motion, s), key_points_mm=np.zeros((ROWS, 3, 3))) for s in (3, 1.03)
-    )
+    still = np.zeros((ROWS, 3, 3))
+    after, before = (replace(made(motion, s), key_points_mm=still.copy()) for s in (3, 1.03))
     before.key_points_mm[:, -1, 0] = before.t_s
     pairs = paired(model, after, before).pairs
     there = pairs.paired

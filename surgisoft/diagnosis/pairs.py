@@ -59,6 +59,9 @@ ALIKE_NOISES = 4.0
 """Or: so many standard deviations of the actuation's noise in both recordings."""
 ALIKE_NOW = 2.0
 """Largest difference at the row itself, in multiples of the one over the past."""
+MORE_ROWS = 1.1
+"""Rows that the measured actuation must pair, as a multiple of those of the commands, to be taken
+in their place: its noise makes pairs less exact."""
 PAST_S = 2.0
 """Time before a row over which the actuation must agree, s: the longest of the memories by which
 motions are told apart (`residuals.MOTION_TIMES_S`)."""
@@ -474,16 +477,18 @@ def _best_matches(after: ResidualTable, before: ResidualTable, itself: bool) -> 
     """What AFTER repeats of BEFORE by the commands, or by the actuation that the model takes.
 
     A command has no noise, and a change of the arm does not change it. But where commands are steps
-    whose instants jitter from run to run, the measured actuation agrees better. Whichever pairs
-    more rows is taken, the commands where both pair as many.
+    whose instants jitter from run to run, the measured actuation agrees better: it is taken where
+    it pairs clearly more rows.
     """
     known = all(np.isfinite(table.commanded).all() for table in (after, before))
     best: list[Match] = []
+    most = 0.0
     for commanded in (True, False) if known else (False,):
         signals = [run_signals(table, commanded) for table in (after, before)]
         found = all_matches(*signals, _alike(after, before, commanded), itself)
-        if sum(int(m.inside.sum()) for m in found) > sum(int(m.inside.sum()) for m in best):
-            best = found
+        rows = sum(int(match.inside.sum()) for match in found)
+        if rows > most:
+            best, most = found, MORE_ROWS * rows
     return best
 
 

@@ -31,6 +31,7 @@ from surgisoft.diagnosis.residuals import (
     BLOCK_ROWS,
     LEAST_BLOCKS,
     LEAST_DISCREPANCY,
+    MOTION_ALIKE,
     ROWS,
     Floor,
     Problem,
@@ -50,14 +51,17 @@ STRIDE_SHARE = 0.5
 """Distance of two windows as a share of their length."""
 GRID_ROWS = 20_000
 """Most samples of a run in the search; longer runs are searched on a coarser grid."""
-ALIKE = 0.03
+ALIKE = MOTION_ALIKE / 2
 """Largest difference of the actuation, as a share of its range, at which two rows count as the same
-(root mean square over the past, any chamber). The difference that remains is corrected by the
-model."""
+(root mean square over the past, any chamber): the one up to which two blocks show the same motion.
+The difference that remains is corrected by the model."""
 ALIKE_NOISES = 4.0
 """Or: so many standard deviations of the actuation's noise in both recordings."""
 ALIKE_NOW = 2.0
 """Largest difference at the row itself, in multiples of the one over the past."""
+MORE_ROWS = 1.1
+"""Rows that the measured actuation must pair, as a multiple of those of the commands, to be taken
+in their place: its noise makes pairs less exact."""
 PAST_S = 2.0
 """Time before a row over which the actuation must agree, s: the longest of the memories by which
 motions are told apart (`residuals.MOTION_TIMES_S`)."""
@@ -469,19 +473,34 @@ def _alike(after: ResidualTable, before: ResidualTable, commanded: bool) -> np.n
     return np.maximum(ALIKE, noise_share)
 
 
+def _best_matches(after: ResidualTable, before: ResidualTable, itself: bool) -> list[Match]:
+    """What AFTER repeats of BEFORE by the commands, or by the actuation that the model takes.
+
+    A command has no noise, and a change of the arm does not change it. But where commands are steps
+    whose instants jitter from run to run, the measured actuation agrees better: it is taken where
+    it pairs clearly more rows.
+    """
+    known = all(np.isfinite(table.commanded).all() for table in (after, before))
+    best: list[Match] = []
+    most = 0.0
+    for commanded in (True, False) if known else (False,):
+        signals = [run_signals(table, commanded) for table in (after, before)]
+        found = all_matches(*signals, _alike(after, before, commanded), itself)
+        rows = sum(int(match.inside.sum()) for match in found)
+        if rows > most:
+            best, most = found, MORE_ROWS * rows
+    return best
+
+
 def _partners(after: ResidualTable, before: ResidualTable, itself: bool = False) -> _Found:
     """The partners of every row of AFTER; itself: BEFORE is the same table, rows are not their own
     partners."""
     shape = after.measured_mm.shape
-    # A command has no noise, and a change of the arm does not change it.
-    commanded = all(np.isfinite(table.commanded).all() for table in (after, before))
-    alike = _alike(after, before, commanded)
     sums, predicted = np.zeros(shape), np.zeros(shape)
     seen, averaging = np.zeros(shape[:2]), np.zeros(shape[0])
     partners, time = np.zeros(shape[0], int), np.full(shape[0], np.nan)
     stretches: list[Stretch] = []
-    signals = [run_signals(table, commanded) for table in (after, before)]
-    for match in all_matches(*signals, alike, itself):
+    for match in _best_matches(after, before, itself):
         one, other = match.after, match.before
         at = one.t_s[match.inside] + match.delay_s
         rows = one.rows[match.inside]

@@ -81,7 +81,7 @@ def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):
     assert as_written(compared) == of_command(lab, "compare", arm, data)
     diagnosed = diagnose(arm, [data])
     assert as_written(diagnosed) == of_command(lab, "diagnose", arm, data)
-    assert "payload" in diagnosed.verdict.effects
+    assert diagnosed.ranking[0].effect == "payload"
     amended = amend(arm, data, ["payload"])
     new = ["-o", str(lab / "new"), "--force"]
     command = ["amend", arm, "--effect", "payload", "--data", data, *new]

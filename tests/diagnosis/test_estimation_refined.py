@@ -62,7 +62,8 @@ def test_a_backlash_beside_the_plays_of_the_model_is_hysteresis():
 
 def test_a_lag_before_the_plays_is_no_viscosity_behind_them(lagging, monkeypatch):
     found = diagnose(default_arm(), [lagging])
-    assert found.verdict.effects == ("line_lag",)
+    assert found.ranking[0].effect == "line_lag"
+    assert found.verdict.effects[:1] == ("line_lag",)
     monkeypatch.setattr(selection, "refined", lambda *_: [])
     grid = diagnose(default_arm(), [lagging])
     fine = {row.effect: row.heldout_rmse_mm for row in found.ranking}

@@ -33,6 +33,7 @@ from surgisoft.diagnosis.residuals import (
     LEAST_DISCREPANCY,
     MOTION_ALIKE,
     ROWS,
+    STILL,
     Floor,
     Problem,
     ResidualTable,
@@ -55,19 +56,27 @@ ALIKE = MOTION_ALIKE / 2
 """Largest difference of the actuation, as a share of its range, at which two rows count as the same
 (root mean square over the past, any chamber): the one up to which two blocks show the same motion.
 The difference that remains is corrected by the model."""
+EXACT = ALIKE / 10
+"""The same in exact repeats, as of one protocol by its commands: the model's correction is then too
+small for its error to matter."""
 ALIKE_NOISES = 4.0
 """Or: so many standard deviations of the actuation's noise in both recordings."""
 ALIKE_NOW = 2.0
 """Largest difference at the row itself, in multiples of the one over the past."""
+NOISE_SHARE = 0.5
+"""Least repeatability, as a share of the noise floor, which may be stated too large."""
 MORE_ROWS = 1.1
 """Rows that the measured actuation must pair, as a multiple of those of the commands, to be taken
 in their place: its noise makes pairs less exact."""
 PAST_S = 2.0
 """Time before a row over which the actuation must agree, s: the longest of the memories by which
 motions are told apart (`residuals.MOTION_TIMES_S`)."""
-MOVES = 2.0
-"""A window counts where a chamber moves, RMS, by this multiple of what counts as the same: at rest
-every delay fits."""
+MOVES = STILL / 2
+"""A window counts where a chamber moves, RMS, by this share of its range: at rest every delay
+fits."""
+NEAR = 2.0
+"""Largest difference that counts for the refinement of a delay, in multiples of what counts as the
+same."""
 REFINEMENTS = 8
 """Most Newton steps of a delay."""
 APART_S = 10.0
@@ -283,12 +292,17 @@ class Match:
 
 
 def matches(
-    after: RunSignal, before: RunSignal, alike: np.ndarray, apart_s: float = 0.0
+    after: RunSignal,
+    before: RunSignal,
+    alike: np.ndarray,
+    apart_s: float = 0.0,
+    least: np.ndarray | None = None,
 ) -> list[Match]:
     """Delays at which a run of AFTER repeats a run of BEFORE, the one with most rows first.
 
     alike: (m,) difference of each chamber, as a share of its range, that counts as the same;
-    apart_s: least size of a delay, s. A row belongs to one match only.
+    apart_s: least size of a delay, s; least: (m,) motion, RMS as a share of the range, of windows
+    that count. A row belongs to one match only.
     """
     step = max(after.step_s, before.step_s, _length(after) / GRID_ROWS, _length(before) / GRID_ROWS)
     a, b = _on_grid(after, step), _on_grid(before, step)
@@ -297,7 +311,8 @@ def matches(
     if width < BLOCK_ROWS:
         return []
     begins = np.arange(0, len(a) - width + 1, max(1, int(STRIDE_SHARE * width)))
-    moving = [(a[i : i + width].std(0) >= MOVES * alike).any() for i in begins]
+    least = np.maximum(MOVES, alike - ALIKE) if least is None else least
+    moving = [(a[i : i + width].std(0) >= least).any() for i in begins]
     begins = begins[np.array(moving, bool)]
     lags = np.arange(-len(a) + 1, len(b))
     fits = np.zeros((len(begins), len(lags)), bool)
@@ -343,7 +358,7 @@ def all_matches(
         both = [(one, other) for one, other in both if one.number <= other.number]
     for one, other in both:
         apart = APART_S if itself and one.number == other.number else 0.0
-        found += matches(one, other, alike, apart)
+        found += matches(one, other, alike, apart, NEAR * alike if itself else None)
     delays: dict[tuple[str, str], list[float]] = {}
     for match in sorted(found, key=lambda match: -int(match.inside.sum())):
         delays.setdefault((match.after.recording, match.before.recording), []).append(match.delay_s)
@@ -351,13 +366,15 @@ def all_matches(
     for one, other in both:
         if not one.timed or (one.number, other.recording) in moved or itself:
             continue
+        tried = []
         for delay in delays.get((one.recording, other.recording), []):
             inside, mismatch = _agree(one, other, delay, alike)
             if inside.sum() >= BLOCK_ROWS:
                 level = float(np.sqrt(np.mean(np.square(mismatch[inside]))))
-                found.append(Match(one, other, delay, inside, level))
-                moved.add((one.number, other.recording))
-                break
+                tried.append(Match(one, other, delay, inside, level))
+        if tried:
+            found.append(min(tried, key=lambda match: match.mismatch))
+            moved.add((one.number, other.recording))
     return found
 
 
@@ -407,7 +424,7 @@ def _refined(
     start = delay
     for _ in range(REFINEMENTS):
         difference = before.at(after.t_s + delay) - after.values
-        whole = np.isfinite(difference).all(1) & (np.abs(difference) <= MOVES * alike).all(1)
+        whole = np.isfinite(difference).all(1) & (np.abs(difference) <= NEAR * alike).all(1)
         power = np.square(slope[whole] / alike).sum()
         if power <= 0:
             return start
@@ -462,7 +479,9 @@ class _Found:
     stretches: tuple[Stretch, ...]
 
 
-def _alike(after: ResidualTable, before: ResidualTable, commanded: bool) -> np.ndarray:
+def _alike(
+    after: ResidualTable, before: ResidualTable, commanded: bool, share: float = ALIKE
+) -> np.ndarray:
     """(m,) difference of each chamber, as a share of its range, that counts as the same."""
     span = np.array(after.spec.span)
     noise = [
@@ -470,10 +489,12 @@ def _alike(after: ResidualTable, before: ResidualTable, commanded: bool) -> np.n
         for table in (after, before)
     ]
     noise_share = 0.0 if commanded else ALIKE_NOISES * np.hypot(*noise) / span
-    return np.maximum(ALIKE, noise_share)
+    return np.maximum(share, noise_share)
 
 
-def _best_matches(after: ResidualTable, before: ResidualTable, itself: bool) -> list[Match]:
+def _best_matches(
+    after: ResidualTable, before: ResidualTable, itself: bool, share: float
+) -> list[Match]:
     """What AFTER repeats of BEFORE by the commands, or by the actuation that the model takes.
 
     A command has no noise, and a change of the arm does not change it. But where commands are steps
@@ -485,22 +506,25 @@ def _best_matches(after: ResidualTable, before: ResidualTable, itself: bool) -> 
     most = 0.0
     for commanded in (True, False) if known else (False,):
         signals = [run_signals(table, commanded) for table in (after, before)]
-        found = all_matches(*signals, _alike(after, before, commanded), itself)
+        found = all_matches(*signals, _alike(after, before, commanded, share), itself)
         rows = sum(int(match.inside.sum()) for match in found)
         if rows > most:
             best, most = found, MORE_ROWS * rows
     return best
 
 
-def _partners(after: ResidualTable, before: ResidualTable, itself: bool = False) -> _Found:
+def _partners(
+    after: ResidualTable, before: ResidualTable, itself: bool = False, share: float = ALIKE
+) -> _Found:
     """The partners of every row of AFTER; itself: BEFORE is the same table, rows are not their own
-    partners."""
+    partners; share: difference of the actuation, as a share of its range, that counts as the same.
+    """
     shape = after.measured_mm.shape
     sums, predicted = np.zeros(shape), np.zeros(shape)
     seen, averaging = np.zeros(shape[:2]), np.zeros(shape[0])
     partners, time = np.zeros(shape[0], int), np.full(shape[0], np.nan)
     stretches: list[Stretch] = []
-    for match in _best_matches(after, before, itself):
+    for match in _best_matches(after, before, itself, share):
         one, other = match.after, match.before
         at = one.t_s[match.inside] + match.delay_s
         rows = one.rows[match.inside]
@@ -717,19 +741,24 @@ def _enough(after: ResidualTable, pairs: Pairs) -> bool:
 def _repeatability(before: ResidualTable) -> tuple[np.ndarray, str]:
     """(n,) RMS distance by which a recording of the same motion differs, mm, and its source.
 
-    Two recordings of BEFORE differ by twice the variance of one. Where BEFORE has no repeats, the
-    noise floor is what is known of it.
+    Two recordings of BEFORE differ by twice the variance of one. Exact repeats of a motion count;
+    where there are too few, rows that are alike, with the model's correction. Where BEFORE repeats
+    nothing, the noise floor is what is known.
     """
-    found = _partners(before, before, itself=True)
-    difference = before.measured_mm - found.residual_mm - found.predicted_mm
-    correction = before.predicted_mm - found.predicted_mm
-    square = np.square(difference - without_noise(before, difference, correction)).sum(2)
-    # A mean of several partners has less of a variance.
-    square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
-    seen = np.isfinite(square)
-    if (seen.sum(0) < 2 * LEAST_BLOCKS * BLOCK_ROWS).any():
-        return before.noise_mm, "noise"
-    return np.sqrt(np.nanmean(square, axis=0)), "repeats"
+    for share in (EXACT, ALIKE):
+        found = _partners(before, before, True, share)
+        difference = before.measured_mm - found.residual_mm - found.predicted_mm
+        correction = before.predicted_mm - found.predicted_mm
+        correction = without_noise(before, difference, correction)
+        square = np.square(difference - correction).sum(2)
+        # Less what an error of the model's slope does to the correction.
+        square -= np.square(slope_error(before)) * np.square(correction).sum(2)
+        # A mean of several partners has less of a variance.
+        square /= 1.0 + 1.0 / np.maximum(found.partners, 1)[:, None]
+        if (np.isfinite(square).sum(0) >= 2 * LEAST_BLOCKS * BLOCK_ROWS).all():
+            mean = np.maximum(np.nanmean(square, axis=0), 0.0)
+            return np.maximum(np.sqrt(mean), NOISE_SHARE * before.noise_mm), "repeats"
+    return before.noise_mm, "noise"
 
 
 def paired_discrepancy(

@@ -193,7 +193,7 @@ def _show(found) -> None:
     if found.next_experiment:
         plan = found.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates)
-        print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, tells {pairs}")
+        print(f"next experiment: {plan.name}, {plan.minutes:g} minutes, distinguishes {pairs}")
     print(f"{found.seconds:.1f} s")
 
 

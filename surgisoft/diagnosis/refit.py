@@ -78,8 +78,8 @@ REFIT = RefitConfig()
 class RefitCriteria:
     """What starts a refit, and what decides in it.
 
-    The values are those of the selection among residuals (`criteria`), which were set on virtual
-    robots; none was set by looking at a refit.
+    The values were set by hand on virtual robots, for residuals and before there was a refit; none
+    was set by looking at one.
     """
 
     over_floor: float = 2.0
@@ -101,7 +101,8 @@ class RefitCriteria:
     tie_of_left: float = 0.3
     """The same as a share of what the better one leaves; the smaller of both counts."""
     most_confidence: float = 0.81
-    """Most confidence where others do about as well (`criteria.Calibration.ambiguous`)."""
+    """Most confidence where others do about as well: of 21 ambiguous statements on virtual robots
+    17 were right about the first effect."""
 
 
 ASKED = RefitCriteria()

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import ArmInfo
 
 
@@ -84,3 +85,24 @@ class SimulatedRig(Rig, Protocol):
 
     def read_beside_truth(self) -> tuple[Sample, Truth]:
         """Do what `read` does, and return the true state of the same instant (T = 1) with it."""
+
+
+def checked_command(pressures: np.ndarray, limits: np.ndarray, unit: str) -> np.ndarray:
+    """The pressures (m,) of a command as float64 [unit].
+
+    limits: (m, 2) lowest and highest [unit]. Raises InputError for a wrong shape, and for values
+    that are not finite or beyond the limits.
+    """
+    pressures = np.asarray(pressures, np.float64)
+    if pressures.shape != (len(limits),) or not np.isfinite(pressures).all():
+        raise InputError(
+            f"command has shape {pressures.shape} with values {pressures.tolist()}, "
+            f"expected {len(limits)} finite pressures in {unit}"
+        )
+    low, high = limits.T
+    if (pressures < low - 1e-9).any() or (pressures > high + 1e-9).any():
+        raise InputError(
+            f"command {pressures.tolist()} {unit} leaves the rig's limits "
+            f"{low.min():g} to {high.max():g} {unit}"
+        )
+    return pressures

@@ -33,7 +33,7 @@ from surgisoft.rig.collect import (
 )
 from surgisoft.rig.effects import no_effects
 from surgisoft.rig.hidden import EVENT_WINDOW_S, Setup, switch_on
-from surgisoft.rig.interface import Sample, Truth
+from surgisoft.rig.interface import Sample, Truth, checked_command
 from surgisoft.rig.motion_capture import CameraDesign, build_cameras
 from surgisoft.rig.pneumatics import PumpDesign, build_pumps
 
@@ -169,19 +169,7 @@ class VirtualRig:
 
     def command(self, pressures: np.ndarray) -> None:
         """Set the pressures (m,) [kPa gauge] that the controllers reach for from now on."""
-        pressures = np.asarray(pressures, np.float64)
-        if pressures.shape != (self.chambers,) or not np.isfinite(pressures).all():
-            raise InputError(
-                f"command has shape {pressures.shape} with values {pressures.tolist()}, "
-                f"expected {self.chambers} finite pressures in kPa"
-            )
-        low, high = self.limits.T
-        if (pressures < low - 1e-9).any() or (pressures > high + 1e-9).any():
-            raise InputError(
-                f"command {pressures.tolist()} kPa leaves the rig's limits "
-                f"{low.min():g} to {high.max():g} kPa"
-            )
-        self._state.target[:] = pressures
+        self._state.target[:] = checked_command(pressures, self.limits, self.unit)
 
     def wait(self, seconds: float) -> None:
         """Let time [s] pass without reading."""

@@ -136,8 +136,8 @@ def linear_scan(factor: Tensor, addend: Tensor, start: Tensor) -> Tensor:
     factor = factor.reshape(runs, blocks, block, *factor.shape[2:])
     addend = addend.reshape(runs, blocks, block, *addend.shape[2:])
     within = [addend[:, :, 0]]
-    for now, plus in zip(factor.unbind(2)[1:], addend.unbind(2)[1:], strict=True):
-        within.append(now * within[-1] + plus)
+    for scale, plus in zip(factor.unbind(2)[1:], addend.unbind(2)[1:], strict=True):
+        within.append(scale * within[-1] + plus)
     share = factor.cumprod(2)
     before = [start]
     for factor_of_block, last in zip(share[:, :, -1].unbind(1), within[-1].unbind(1), strict=True):

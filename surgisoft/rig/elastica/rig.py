@@ -21,7 +21,7 @@ from surgisoft.rig.elastica.hidden import EVENT_WINDOW_S, Setup, switch_on
 from surgisoft.rig.elastica.robot import make_robot, vacuum_limit
 from surgisoft.rig.elastica.rod import largest_step
 from surgisoft.rig.elastica.wall import stiffest
-from surgisoft.rig.interface import Sample, Truth
+from surgisoft.rig.interface import Sample, Truth, checked_command
 from surgisoft.rig.motion_capture import normals_per_frame, normals_per_pause
 
 REST_S = 30.0
@@ -121,19 +121,7 @@ class ElasticaRig:
 
     def command(self, pressures: np.ndarray) -> None:
         """Set the pressures (m,) [kPa gauge] that the regulators reach for from now on."""
-        pressures = np.asarray(pressures, np.float64)
-        if pressures.shape != (self.chambers,) or not np.isfinite(pressures).all():
-            raise InputError(
-                f"command has shape {pressures.shape} with values {pressures.tolist()}, "
-                f"expected {self.chambers} finite pressures in kPa"
-            )
-        low, high = self.limits.T
-        if (pressures < low - 1e-9).any() or (pressures > high + 1e-9).any():
-            raise InputError(
-                f"command {pressures.tolist()} kPa leaves the rig's limits "
-                f"{low.min():g} to {high.max():g} kPa"
-            )
-        self._state.air.target[:] = 1e3 * pressures
+        self._state.air.target[:] = 1e3 * checked_command(pressures, self.limits, self.unit)
 
     def wait(self, seconds: float) -> None:
         """Let time [s] pass without reading."""

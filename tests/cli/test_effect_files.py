@@ -45,6 +45,7 @@ NO_MODEL = {
     "collect": "makes a recording of the virtual rig",
     "import": "reads raw files",
     "recording": "reads recordings",
+    "rig list": "lists rigs and their options",
     "replay": "shows what was recorded",
     "experiment list": "reads experiment files",
     "export": "opens policies, which hold no arm",

@@ -1,7 +1,7 @@
 """Libraries of the optional parts, and what to install where one is missing.
 
-`pip install surgisoft` brings the core: arm models, recordings, the rig, diagnosis. Scenes, training
-and replays need more libraries, which the extras of the package install.
+`pip install surgisoft` brings the core: arm models, recordings, the rig, diagnosis. Scenes,
+training and replays need more libraries, which the extras of the package install.
 """
 
 EXTRA_OF = {

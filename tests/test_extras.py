@@ -79,7 +79,7 @@ recording = surgisoft.collect("mixed", seed=0, points=300)
 surgisoft.save_recording(recording, folder / "bench.parquet")
 comparison, _ = surgisoft.compare("default", [folder / "bench.parquet"])
 print(comparison.rmse_mm > 0)
-print(surgisoft.diagnose("default", [folder / "bench.parquet"]).kind)
+print(surgisoft.diagnose("default", [folder / "bench.parquet"]).verdict.kind)
 """,
         tmp_path,
     )

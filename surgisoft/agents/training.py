@@ -243,7 +243,7 @@ def train_new(
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
     # Everything is read back from the folder, so that resuming finds the same.
-    return _continue(RunFolder(folder), None, processes, device, report)
+    return _continue(RunFolder(folder), processes, device, report)
 
 
 def resume(
@@ -253,16 +253,22 @@ def resume(
     report: Callable[[TrainingProgress], None] = lambda progress: None,
 ) -> Result:
     """Continue a run from its last checkpoint; from the start if it has none."""
+    return _continue(RunFolder(folder), processes, device, report)
+
+
+def reopened(folder: Path, processes: Processes, device: torch.device) -> Training:
+    """The training of a run at its last checkpoint, ready to go on; new where it has none."""
     run = RunFolder(folder)
     saved = run.load(LAST) if run.checkpoint(LAST).is_file() else None
-    return _continue(run, saved, processes, device, report)
-
-
-def _continue(run, saved, processes, device, report) -> Result:
-    plan = run.plan()
-    training = Training(plan, run.task(device), processes)
+    training = Training(run.plan(), run.task(device), processes)
     if saved is not None:
         training.load_state(saved)
+    return training
+
+
+def _continue(run, processes, device, report) -> Result:
+    training = reopened(run.path, processes, device)
+    plan = training.plan
     log = _Log(run, training.iteration) if processes.leads else None
     written, found = time.monotonic(), training.best
     stopped = reached = False

@@ -82,7 +82,7 @@ FLOORS = {
         ("colours", "shapes", "surfaces"),
         ("plots",),
         ("recording",),
-        ("arms", "endoscope"),
+        ("arms", "endoscope", "contents"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
         ("show",),

@@ -33,21 +33,8 @@ VALUES += (-(2**63), 10**30, 10**400, 0.5, -1.5, 1e308, 1e-320, math.nan, math.i
 VALUES += ("", "x", "a" * 2000, "nan", "\0", "\x1b[2J", "../..", [], {}, [[]], [0], [0.0] * 3)
 VALUES += ([1e9] * 3, {"": 0}, {"array": "x"}, {"table": {}}, [None], [[[0]]])
 """Values of JSON that readers stumble over."""
-INTEGERS = (
-    0,
-    1,
-    255,
-    2**15,
-    2**16,
-    2**24,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**40,
-    2**62,
-    2**63,
-    2**64 - 1,
-)
+INTEGERS = (0, 1, 255, 2**15, 2**16, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
+INTEGERS += (2**40, 2**62, 2**63, 2**64 - 1)
 """Integers to write over bytes, for lengths and offsets in headers."""
 
 

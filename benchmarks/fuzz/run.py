@@ -38,7 +38,7 @@ class Limits:
     """Wall time of one input, s: for a reader that waits; a loaded machine has to stay below."""
     memory_bytes: int = 1 << 30
     """Address space beyond that of a worker which has read the valid files."""
-    batch_s: float = 15.0
+    batch_s: float = 30.0
     """Time of one worker, s."""
     message: int = 1000
     """Longest message, characters."""
@@ -289,7 +289,7 @@ def examine(name: str, number: int, sample: Path, limits: Limits) -> dict | None
 
 def _out_of_memory(error: BaseException | None) -> bool:
     while error is not None:
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -309,7 +309,8 @@ def _place(error: BaseException) -> str:
 
 def _finding(target: str, number: int, kind: str, error: str, place: str, message: str) -> dict:
     text = message[:300].encode("utf-8", "replace").decode()
-    return dict(target=target, input=number, kind=kind, type=error, place=place, message=text)
+    about = {"target": target, "input": number, "kind": kind}
+    return about | {"type": error, "place": place, "message": text}
 
 
 def again(name: str, seed: int, number: int, keep: Path | None) -> None:

@@ -275,8 +275,14 @@ def _smaller(log):
     """The log with the organ alone, for small files."""
     from dataclasses import replace
 
-    organ = None if log.dose is None else log.dose.body
-    return replace(log, bodies=tuple(body for body in log.bodies if body.name == organ))
+    if log.dose is None:
+        return log
+    (organ,) = (body for body in log.bodies if body.name == log.dose.body)
+    kept, own = np.unique(log.dose.faces, return_inverse=True)
+    used, faces = np.unique(organ.faces[kept], return_inverse=True)
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    organ = replace(organ, vertices_mm=organ.vertices_mm[used], faces=faces)
+    return replace(log, bodies=(organ,), dose=replace(log.dose, faces=own.astype(np.int32)))
 
 
 def read_episode(sample: Path) -> None:
@@ -320,12 +326,10 @@ def make_replays(folder: Path) -> None:
 
 def read_rrd(sample: Path) -> None:
     """The recording's duration and views, as `replay --screenshot` needs them."""
-    from surgisoft.replay.show import find_replay, moment
-    from surgisoft.replay.viewer import view_names
+    from surgisoft.replay.contents import contents
+    from surgisoft.replay.show import find_replay
 
-    found = find_replay(sample / "replay.rrd")
-    moment(found, None)
-    view_names(found)
+    contents(find_replay(sample / "replay.rrd"))
 
 
 def make_scenes(folder: Path) -> None:
@@ -429,7 +433,7 @@ def read_decision(sample: Path) -> None:
         values = json.loads(path.read_text())
         values["sha256"] = content_hash(values)
         path.write_text(json.dumps(values))
-    except (ValueError, TypeError, RecursionError):
+    except (ValueError, TypeError, AttributeError, RecursionError):
         pass
     load_decision(path)
 

@@ -79,10 +79,10 @@ FLOORS = {
         ("author",),
     ),
     "replay": (
-        ("colours", "shapes", "surfaces"),
+        ("colours", "contents", "shapes", "surfaces"),
         ("plots",),
         ("recording",),
-        ("arms", "endoscope", "contents"),
+        ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
         ("show",),

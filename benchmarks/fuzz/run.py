@@ -82,7 +82,7 @@ def fuzz(
         for name in names:
             in_child(lambda name=name: make_corpus(corpus, name))
         end = time.monotonic() + seconds
-        queue, position = _order(names), dict.fromkeys(names, 0)
+        queue, position = turns_of(names), dict.fromkeys(names, 0)
         running: dict[int, Batch] = {}
         while time.monotonic() < end or running:
             busy = {batch.target for batch in running.values()}
@@ -102,7 +102,7 @@ def fuzz(
             time.sleep(0.1)
 
 
-def _order(names: Sequence[str]) -> Iterator[str]:
+def turns_of(names: Sequence[str]) -> Iterator[str]:
     """The targets in turn for ever, each as often as its weight says."""
     due = dict.fromkeys(names, 0.0)
     while True:

@@ -20,7 +20,7 @@ ACTIVATIONS: tuple[str, ...] = (
     "sigmoid",
     "softplus",
 )
-ACTIVATIONS += ("gelu", "swish", "mish", "identity")
+ACTIVATIONS += ("softplus", "gelu", "swish", "mish", "identity")
 """Activations by rsl-rl's names."""
 MOST_TRANSITIONS = 1 << 21
 """Most steps, over all episodes, between two updates: their storage has to fit into memory."""

@@ -14,8 +14,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from surgisoft.errors import InputError
-from surgisoft.replay.recording import TIME
 
+TIME = "time"
+"""Timeline of every replay, s since the start."""
 MEMORY_BYTES = 4 << 30
 """Address space of the reading process, bytes; most of it is the library's own."""
 MEMORY_PER_BYTE = 20

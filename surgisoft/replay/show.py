@@ -6,9 +6,9 @@ from pathlib import Path
 
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
-from surgisoft.replay.contents import contents
+from surgisoft.replay.contents import TIME, contents
 from surgisoft.replay.episode_view import Replay, layout_names, write_replay
-from surgisoft.replay.recording import SUFFIX, TIME
+from surgisoft.replay.recording import SUFFIX
 from surgisoft.replay.viewer import (
     check_view,
     open_viewer,

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from surgisoft.scene.mesh import ROLES
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import (
     LEVELS,
+    ROLES,
     ArmLog,
     BeamLog,
     BodyLog,

@@ -92,7 +92,9 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
                     raise ValueError(f"'{member.filename}' has an unknown version of .npy")
                 shape, fortran, kind = _HEADERS[version](file)
                 claimed = math.prod(shape) * kind.itemsize
-                if kind.hasobject or min(shape, default=0) < 0 or claimed > member.file_size:
+                if kind.hasobject:
+                    raise ValueError(f"'{member.filename}' holds Python objects, not numbers")
+                if min(shape, default=0) < 0 or claimed > member.file_size:
                     raise ValueError(f"'{member.filename}' claims an array that is not in it")
                 content = file.read(claimed)
             if len(content) < claimed:

@@ -143,6 +143,11 @@ def run(arguments: list[str] | None = None) -> int:
         if advice is None:
             raise
         return _fail(advice)
+    except SystemExit as ended:
+        if isinstance(ended.code, int) and ended.code > 128:  # `surgisoft.rig.safety.Terminated`
+            print(f"surgisoft: {ended}", file=sys.stderr)
+            return ended.code
+        raise
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

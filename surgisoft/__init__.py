@@ -20,6 +20,7 @@ Surgical tasks:
     make, parallel_env           Gymnasium and PettingZoo environments
     train, evaluate              policies (PPO, centralised training, decentralised execution)
     open_scene, open_replay      scenes and episodes
+    demo                         the demonstration in five steps
 """
 
 from importlib import import_module
@@ -33,6 +34,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from surgisoft.agents.session import evaluate
     from surgisoft.agents.training_request import train
+    from surgisoft.demo.story import demo
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
     from surgisoft.diagnosis.design.next_experiment import next_experiment
@@ -57,6 +59,7 @@ _PLACES = {
     "amend": "diagnosis.amend",
     "collect": "rig.trial",
     "compare": "diagnosis.compare",
+    "demo": "demo.story",
     "diagnose": "diagnosis.diagnose",
     "evaluate": "agents.session",
     "fit": "measurement.fitting",
@@ -83,6 +86,7 @@ __all__ = [
     "amend",
     "collect",
     "compare",
+    "demo",
     "diagnose",
     "evaluate",
     "fit",

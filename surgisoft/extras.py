@@ -33,6 +33,7 @@ EXTRA_OF_USE = {
     "make": "train",
     "parallel_env": "train",
     "experiment": "all",
+    "demo": "all",
 }
 """The extra that a command or function needs in whole, by its name."""
 

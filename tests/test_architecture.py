@@ -29,8 +29,10 @@ MAY_IMPORT = {
     },
     "replay": {"scene", "tasks"},
     "report": set(),
+    "demo": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
     "cli": {
         "agents",
+        "demo",
         "experiments",
         "tasks",
         "scene",

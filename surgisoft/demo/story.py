@@ -119,9 +119,7 @@ def demo(
         page = amend_page(amendment, "default, amended", amendment.model.summary())
         write_page(page, folder / "amendment.html")
 
-    result = Demonstration(
-        cut, comparison, found, amendment, folder / "index.html", no_picture
-    )
+    result = Demonstration(cut, comparison, found, amendment, folder / "index.html", no_picture)
     write_page(_page(result, log, picture, drawn), result.page)
     progress(100, 100, "done")
     return result
@@ -165,9 +163,7 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
     if result.amendment is not None:
         names = " ".join(result.amendment.effects)
         amended = [
-            Command(
-                f"surgisoft amend default --effect {names} --data bench.parquet -o amended"
-            ),
+            Command(f"surgisoft amend default --effect {names} --data bench.parquet -o amended"),
             *amended,
             track_chart(result.amendment.tracks[1], "Held-out part of the recording"),
             Text(

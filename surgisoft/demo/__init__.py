@@ -1,4 +1,4 @@
-"""A demonstration in five steps: the cut, the measurement, the error, its cause, the mended model."""
+"""A demonstration in five steps: cut, measurement, error, its cause, and the mended model."""
 
 from surgisoft.demo.story import Demonstration, demo
 

@@ -118,9 +118,9 @@ def serve_viewer(
 ) -> None:
     """Serve viewer and recording to browsers on this machine until interrupted.
 
-    port: that of the page, on which the data's follows, as `ssh -L` needs to know them; None: two
-    free ones. An InputError where one of them is in use. The recording is sent to the running server. As an argument of the server it would keep one core
-    busy for ever (rerun-sdk 0.41).
+    port: that of the page, and the next one is that of the data; None: two free ones. An InputError
+    where one of them is in use. The recording is sent to the running server: as an argument of the
+    server it would keep one core busy for ever (rerun-sdk 0.41).
     """
     page, data = (free_port(), free_port()) if port is None else (port, port + 1)
     for number in (page, data):

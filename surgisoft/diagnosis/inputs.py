@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.weight import under_weight
 from surgisoft.measurement.histories import check_fits, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
@@ -43,7 +43,8 @@ def identification_problem(
     reference: recordings from before something changed. Without them the residuals that the model
     keeps of its own fit (`ArmModel.training_residuals`), where it has them.
     """
-    return with_known_residuals(residual_table(model, recordings).training(), reference)
+    table = residual_table(model, Sealed(recordings).training)
+    return with_known_residuals(table.training(), reference)
 
 
 def with_known_residuals(

@@ -17,7 +17,7 @@ import numpy as np
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
@@ -28,6 +28,7 @@ from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effect
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
@@ -63,6 +64,9 @@ class Fall:
     """Probability that noise and the network's own error alone would have been fitted by so much of
     the effects; None where that was not tested."""
 
+    in_fit: float = 0.0
+    """Share of the rows that the old model had been fitted to: there its error is no test."""
+
     @property
     def claimed(self) -> bool:
         """Whether the fall is significant, large enough to matter, and due to the effects.
@@ -85,8 +89,9 @@ class Fall:
     def sentence(self) -> str:
         """The fall in words."""
         low, high = self.ci95
+        part = f", {self.in_fit:.0%} of which the model had been fitted to," if self.in_fit else ""
         numbers = (
-            f"{self.before:.3f} to {self.after:.3f} mm on held-out data "
+            f"{self.before:.3f} to {self.after:.3f} mm on held-out data{part} "
             f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
         )
         if self.claimed:
@@ -284,6 +289,7 @@ def amend(
         alone = fall_of(held_out, held_out.with_model(fitted.model), fitted.p_value)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         better.training_residuals = None if retuned else model.training_residuals
+    better.fitted_rows = FittedRows.of([plain.history]).joined(model.fitted_rows)
     is_paired = both is not None and both.used
     # The paired difference holds for the network that predicted BEFORE.
     shown = fitted.model if is_paired else better
@@ -313,6 +319,8 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
     p_value: of the effects' amplitudes, see `Fall.p_value`.
     """
     seen = np.isfinite(before.residual).all(2).sum(1)
+    known = before.model.fitted_rows
+    share = 0.0 if known is None else known.share_of(before.history)
     sums = [
         block_sums(np.nansum(np.square(problem.residual), axis=(1, 2)), before.block)
         for problem in (before, after)
@@ -329,6 +337,7 @@ def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fa
         rows=len(before.index),
         blocks=len(count),
         p_value=p_value,
+        in_fit=0.0 if share < LEAST_KNOWN else share,
     )
 
 

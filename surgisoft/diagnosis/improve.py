@@ -22,6 +22,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -208,6 +209,7 @@ def improve(
         kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         models[-1].training_residuals = known if kept else None
+        models[-1].fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
     held_out = sealed.opened(table).final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []

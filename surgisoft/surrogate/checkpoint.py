@@ -17,6 +17,7 @@ from surgisoft.files import new_folder
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.interval import ErrorInterval
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
@@ -113,6 +114,8 @@ def save_model(
     if model.validation.interval is not None:
         # Beside the validation, where versions without intervals do not look.
         config["interval"] = model.validation.interval.to_json()
+    if model.fitted_rows is not None:
+        config["fitted_rows"] = model.fitted_rows.to_json()
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         # Not by `save_file`, which makes a file that only its owner can read.
@@ -190,6 +193,8 @@ def load_model(
             Validation(per_key_point_mm=points, interval=interval, **validation),
         )
         model.load_state_dict(weights)
+        if "fitted_rows" in config:
+            model.fitted_rows = FittedRows.from_json(config["fitted_rows"])
     except InputError:
         raise
     except Exception as error:

@@ -50,7 +50,7 @@ def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]
         share = known.share_of(history_of([recording], model.spec.actuation))
         if share >= LEAST_KNOWN:
             notes.append(
-                f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows, so the "
+                f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows: the "
                 "error there is no test; use recordings that took no part in the fit"
             )
     return tuple(notes)

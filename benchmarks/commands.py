@@ -108,6 +108,35 @@ def diagnosis(
 
 
 @app.command()
+def intervals(
+    robots: Annotated[
+        str,
+        typer.Option(help="Seeds of the robots, with commas; 201 to 204 served for calibration."),
+    ] = "205,206,207,208",
+    count: Annotated[
+        int, typer.Option(min=1, help="Number of recordings of each setting with an effect.")
+    ] = 30,
+    clean: Annotated[
+        int, typer.Option(min=0, help="Number of recordings of each setting without an effect.")
+    ] = 32,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    work: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
+    ] = Path("runs/benchmark-intervals"),
+    output: Output = None,
+) -> None:
+    """Coverage of the intervals of `amend`, and falls that it claims on clean arms."""
+    from benchmarks.intervals import cases, markdown, run
+
+    some = cases(count, clean, tuple(_numbers("--robots", robots)))
+    with progress("intervals") as report:
+        outcomes = run(some, work, processes, report)
+    command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
+    _show("Intervals of amend", command, markdown(outcomes), output)
+
+
+@app.command()
 def decision(
     cases: Annotated[
         list[str] | None,

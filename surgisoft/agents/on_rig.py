@@ -9,10 +9,9 @@ errors are the true ones of the plant, without the cameras' noise. A real rig ha
 is the measured one, errors contain the noise of the cameras, and where a key point is lost the
 estimate stands in. There is one bench, so that episodes run one after the other.
 
-An observer makes an estimate of them: the arm's model runs beside the rig, driven by the measured
-pressures, and its output is corrected by a filtered output disturbance, as in offset-free model
-predictive control (Pannocchia & Rawlings 2003). With `observer_gain` = 1 the estimate is the raw
-measurement.
+An observer (`tasks.world.observer`) makes an estimate of them: the arm's model runs beside the rig,
+driven by the measured pressures. With `observer_gain` = 1 and `drift_gain` = 0 the estimate is the
+raw measurement.
 """
 
 from __future__ import annotations
@@ -36,6 +35,7 @@ from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import Arm, ArmPart, ModelArm
+from surgisoft.tasks.world.observer import Observer
 from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -164,6 +164,7 @@ class RigArm:
     def __init__(self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = named_rig):
         """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
         self.config, self.build = config, build
+        self.observer = Observer(config.observer_gain, config.drift_gain)
         rig = build(config, 0)
         self.real: SafeRig | None = None
         if not is_simulated(rig):
@@ -225,6 +226,7 @@ class RigArm:
             part,
             gain=torch.ones_like(part.gain),
             arm=self.model.initial_state(len(rigs.items)),
+            belief=None,
             plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
         )
         for target in (*passed, first):
@@ -254,6 +256,10 @@ class RigArm:
     def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
         """One-step prediction of the key points, see `Arm.predict`, with the estimated offset."""
         return self.simulated.predict(part, pressure, dt_s)
+
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The state with its body moved to key points, see `Arm.posed`."""
+        return self.simulated.posed(part, points_mm)
 
     def settled(self, pressure: Tensor) -> Tensor:
         """Steady-state key points of the arm model, see `Arm.settled`."""
@@ -297,21 +303,16 @@ class RigArm:
     def _observed(self, part: ArmPart, reading: Reading, begins: bool = False) -> ArmPart:
         """The part as estimated and as it truly is; its key points so far are the model's.
 
-        An alpha-beta filter (Kalata 1984) estimates by how much the body lies off the model: it
-        follows a steady drift without lag. At the beginning of an episode the whole first
-        innovation is taken over.
+        The observer estimates by how much the body lies off the model. At the beginning of an
+        episode it adopts the whole first innovation.
         """
         seen, offset, plant = part.points_mm, part.offset_mm, part.plant
         if self.config.cameras:
             measured = frames.apply(part.mount, reading.points_mm)
             surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
-            if begins:
-                drift, now = plant.drift_mm, offset + surprise
-            else:
-                drift = plant.drift_mm + self.config.drift_gain * surprise
-                now = offset + self.config.observer_gain * surprise
-            seen, offset = seen + now, now + drift
-            plant = replace(plant, drift_mm=drift)
+            observer = Observer() if begins else self.observer
+            now, offset, drift = observer.adopted(surprise, offset, plant.drift_mm)
+            seen, plant = seen + now, replace(plant, drift_mm=drift)
         body = frames.apply(part.mount, reading.true_mm)
         if self.real is not None:
             body = body.where(body.isfinite(), seen)

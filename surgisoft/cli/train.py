@@ -27,7 +27,9 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            metavar="fast|paper", help="Hyper-parameters: fast (default), or those of the paper."
+            metavar="fast|randomised|paper",
+            help="fast (default); randomised: with camera noise, mounts and gains that differ "
+            "between episodes, and a state observer; or the hyper-parameters of the paper.",
         ),
     ] = None,
     steps: Annotated[

@@ -43,7 +43,7 @@ from surgisoft.diagnosis.inputs import (
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -214,10 +214,10 @@ def diagnose(
     set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
     recordings.
 
-    Only the training rows are looked at: the view of the residual table that is worked on holds no
-    other key points. before: recordings from before a change in question. Where they were made with
-    the same actuation, the paired difference is explained (`pairs`), else the residuals of the
-    model, with those of `before` as what was known; paired: `auto`, `always` (too few common
+    Only the training rows are looked at: the key points of all others are removed first (`Sealed`).
+    before: recordings from before a change in question. Where they were made with the same
+    actuation, the paired difference is explained (`pairs`), else the residuals of the model, with
+    those of `before` as what was known; paired: `auto`, `always` (too few common
     motions are an error) or `never`. reference: recordings, as before; or residuals of the model
     from before, default those that it keeps of its fit. without: effects that cannot act, such as a
     contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
@@ -229,6 +229,7 @@ def diagnose(
     begin = time.perf_counter()
     report = progress or (lambda text: None)
     model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    recordings = Sealed(recordings).training
     if setup_tests:
         report("set-up")
         wrong = find_setup_faults(model, recordings)

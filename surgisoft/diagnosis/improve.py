@@ -17,11 +17,12 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.refit import JointFit, fit_together
-from surgisoft.diagnosis.residuals import model_discrepancy, residual_table
+from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -137,7 +138,8 @@ def improve(
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
     model, recordings, notes = open_inputs(model, recordings)
-    known = model.training_residuals
+    known, sealed = model.training_residuals, Sealed(recordings)
+    recordings = sealed.training
     table = residual_table(model, recordings)
     problem = table.training()
     models, rounds, parameters = [model], [], ()
@@ -207,7 +209,8 @@ def improve(
         kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         models[-1].training_residuals = known if kept else None
-    held_out = table.final_check()
+        models[-1].fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
+    held_out = sealed.opened(table).final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []
     for done in rounds:

@@ -146,7 +146,6 @@ class VirtualRig:
             ),
             effects=setup.effects,
         )
-        self._thermometer = setup.effects.warmth != 0.0
         self.period_s = self._plant.cameras.period
         self._rng = np.random.default_rng([seed, config.take, 0x5EED])
         self._state = bench.new_state(self._plant)
@@ -187,7 +186,7 @@ class VirtualRig:
             measured=frame.measured[0],
             commanded=self._state.target.copy(),
             key_points_mm=frame.points[0],
-            temp_C=float(frame.temperature[0]) if self._thermometer else None,
+            temp_C=float(frame.temperature[0]),
         )
         return sample, Truth(frame.centres, frame.clean, frame.chamber)
 
@@ -221,7 +220,7 @@ class VirtualRig:
             frames.points,
             commanded,
             noise_mm,
-            frames.temperature if self._thermometer else None,
+            frames.temperature,
         )
         return recording, truth
 

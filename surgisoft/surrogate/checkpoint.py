@@ -19,6 +19,7 @@ from surgisoft.files import new_folder, read_json
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
@@ -118,6 +119,8 @@ def save_model(
     if model.validation.interval is not None:
         # Beside the validation, where versions without intervals do not look.
         config["interval"] = model.validation.interval.to_json()
+    if model.fitted_rows is not None:
+        config["fitted_rows"] = model.fitted_rows.to_json()
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         # Not by `save_file`, which makes a file that only its owner can read.
@@ -186,6 +189,8 @@ def load_model(
         validation = from_table(Validation, config["validation"] | stated, Where(file))
         model = ArmModel(spec, NETWORKS[kind][0](low, high, **network), effects, None, validation)
         model.load_state_dict(weights)
+        if "fitted_rows" in config:
+            model.fitted_rows = FittedRows.from_json(config["fitted_rows"])
         _check_finite(folder, model.state_dict())
     except InputError:
         raise

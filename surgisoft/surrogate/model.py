@@ -12,6 +12,7 @@ from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.chain import Chain, Taps
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import LEVEL, ErrorInterval, distance_to
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
@@ -62,6 +63,9 @@ class ArmModel(nn.Module):
 
     training_residuals: TrainingResiduals | None = None
     """Residuals of the model on rows of its fit; None where they are not known."""
+    fitted_rows: FittedRows | None = None
+    """Which measured rows the model was fitted to; None for models that were fitted before this
+    was kept."""
 
     def __init__(
         self,
@@ -115,6 +119,7 @@ class ArmModel(nn.Module):
         )
         if not changed:
             fresh.training_residuals = self.training_residuals
+        fresh.fitted_rows = self.fitted_rows
         return fresh.to(self.rest_mm.device).train(self.training)
 
     @torch.no_grad()

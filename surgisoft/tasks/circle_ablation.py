@@ -106,7 +106,9 @@ class CircleAblationConfig:
     cut_s: float = 45.0
     """Time for once around with the beam on, s."""
     fire_mm: float = 0.5
-    """Distance of the beam from its target within which the beam is switched on, mm."""
+    """Measured distance of the beam from its target within which the beam is switched on, mm."""
+    approach_s: float = 5.0
+    """Time at the beginning that the measure `pointing_error_mm` leaves out, s."""
     fine_mm: float = 0.1
     """Scale of the reward term `fine`, mm."""
     far_mm: float = 10.0
@@ -119,7 +121,7 @@ class CircleAblationConfig:
     """The simulator and its domain randomization."""
 
     def __post_init__(self):
-        for name in ("cut_s", "fire_mm", "fine_mm", "far_mm", "preview"):
+        for name in ("cut_s", "fire_mm", "approach_s", "fine_mm", "far_mm", "preview"):
             if not getattr(self, name) > 0:
                 raise InputError(f"circle_ablation: {name} is {getattr(self, name)}, expected > 0")
         check_weights("circle_ablation: laser", self.weights.laser)
@@ -162,17 +164,32 @@ class CircleAblation:
         return self.scene.centres_mm[state.world.scene.lesion]
 
     def beam_error_mm(self, state: TaskState[RingCut]) -> Tensor:
-        """(B,) mm: perpendicular distance of the beam's axis from its target."""
-        laser = state.world.arms["laser"]
-        offset = self.pointing["laser"].offset_mm(laser.points_mm, self.target_mm(state))
-        return offset.norm(dim=1)
+        """(B,) mm: true perpendicular distance of the beam's axis from its target."""
+        return self._off_target_mm(state, state.world.arms["laser"].points_mm)
+
+    def measured_error_mm(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) mm: distance of the beam's axis from its target as measured or estimated."""
+        return self._off_target_mm(state, state.world.arms["laser"].seen_mm)
+
+    def _off_target_mm(self, state: TaskState[RingCut], points_mm: Tensor) -> Tensor:
+        return self.pointing["laser"].offset_mm(points_mm, self.target_mm(state)).norm(dim=1)
 
     def fires(self, state: TaskState[RingCut]) -> Tensor:
-        """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
+        """(B,) bool: as far as is measured the beam is near its target and meets the organ, and the
+        endoscope's picture shows enough of the ring. The true pose of the arms does not enter."""
         scene = state.world.scene
         seen = scene.view.fraction >= self.spec.limits.view_fraction
-        near = self.beam_error_mm(state) <= self.config.fire_mm
-        return seen & near & scene.hit.on_organ
+        near = self.measured_error_mm(state) <= self.config.fire_mm
+        return seen & near & self._on_organ(state)
+
+    def _on_organ(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) bool: the beam meets the organ, from the measured key points of both arms."""
+        parts, hit = state.world.arms, state.world.scene.hit
+        if all(torch.equal(part.seen_mm, part.points_mm) for part in parts.values()):
+            return hit.on_organ  # what is measured is the truth: the ray was cast already
+        return self.scene.aimed(
+            {name: self.world.arms[name].posed(part, part.seen_mm) for name, part in parts.items()}
+        ).on_organ
 
     def advance(
         self,
@@ -245,11 +262,18 @@ class CircleAblation:
         return done | state.world.scene.clearance.collides
 
     def measures(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
-        """Beam error, progress of the cut, healthy tissue burnt, view, clearance, success."""
-        scene = state.world.scene
+        """Beam error, progress of the cut, healthy tissue burnt, view, clearance, success.
+
+        beam_error_mm: true error while the beam is on. pointing_error_mm: true error at every step
+        after `approach_s`, with the beam on or off, so that no gate truncates it.
+        """
+        scene, error = state.world.scene, self.beam_error_mm(state)
         ring, hit = self.scene.ablation.report(scene.dose), scene.clearance.collides
         return {
-            "beam_error_mm": self.beam_error_mm(state).where(state.goal.fired, float("nan")),
+            "beam_error_mm": error.where(state.goal.fired, float("nan")),
+            "pointing_error_mm": error.where(
+                state.world.steps * self.dt_s > self.config.approach_s, float("nan")
+            ),
             "completion": ring.completion,
             "largest_gap_mm": ring.largest_gap_mm,
             "healthy_mm2": ring.healthy_mm2,

@@ -193,4 +193,4 @@ def _tip_error(points_mm: Tensor, target_mm: Tensor) -> Tensor:
     return points_mm[:, -1] - target_mm
 
 
-KEYHOLE = TaskSpec(Keyhole, KeyholeConfig(), ("arm",))
+KEYHOLE = TaskSpec(Keyhole, KeyholeConfig(), ("arm",), training_steps=2_000_000)

@@ -77,13 +77,15 @@ def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
 def pressure_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
     """Commands, measured pressures, directions of change and distances to a reversal, (B, m) each.
 
-    The last two come from the model beside the arm, fed with the arm's pressures.
+    The last two come from the model beside the arm, fed with the arm's pressures (with an observer:
+    with the measured ones).
     """
     half = 0.5 * (arm.high - arm.low)
-    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
+    beside = part.model_beside
+    back = (beside.pressure - beside.anchor) / arm.model.band.clamp(min=1e-3)
     return {
         COMMAND: (part.command - arm.low) / half - 1.0,
         PRESSURE: (part.seen_kPa - arm.low) / half - 1.0,
-        DIRECTION: part.arm.direction,
+        DIRECTION: beside.direction,
         REVERSAL: back.clamp(-1.5, 1.5),
     }

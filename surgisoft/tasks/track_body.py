@@ -20,6 +20,7 @@ from surgisoft.tasks.observations import (
     numbered,
     pressure_blocks,
 )
+from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS
 from surgisoft.tasks.track import level_world
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random_streams import Stream
@@ -181,4 +182,6 @@ class TrackBody:
         return {"arm": action_towards(self.arm, part, target, error, self.dt_s, STUCK_MM)}
 
 
-TRACK_BODY = TaskSpec(TrackBody, TrackBodyConfig(), ("arm",))
+TRACK_BODY = TaskSpec(
+    TrackBody, TrackBodyConfig(), ("arm",), preset=FOLLOW_PRESET, training_steps=FOLLOW_STEPS
+)

@@ -155,11 +155,15 @@ class SceneEngine:
         in_place = scene.donated and overwritable(dose.dose)
         return self.ablation.reset(dose, mask, *beam, in_place, scene.lesion)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
+    def aimed(self, parts: Mapping[str, ArmPart]) -> RayHit:
+        """Where the beam of the arms in `parts` ends, (B,)."""
         lines = {name: part.line_mm for name, part in parts.items()}
-        beam, eye = parts[LASER], parts[ENDOSCOPE]
-        clearance = self.collision.clearance(lines)
-        hit = self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+        beam = parts[LASER]
+        return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
+        lines, eye = {name: part.line_mm for name, part in parts.items()}, parts[ENDOSCOPE]
+        clearance, hit = self.collision.clearance(lines), self.aimed(parts)
         pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
         ring = (self.rings_mm[lesion], self.ring_normals[lesion])
         seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)

@@ -245,3 +245,14 @@ def test_a_fibre_breaks_once_and_no_rest_mends_it():
     assert 40.0 < 30.0 + 12.0 * late < 115.0
     np.testing.assert_allclose(shift[late + 1 :], shift[-1], rtol=0.1)
     assert shift[-1] > 1.0
+
+
+@pytest.mark.parametrize("hidden", [(), (("creep", 1.0),), (("thermal_drift", 1.0),)])
+def test_the_temperature_is_written_whatever_is_hidden(hidden):
+    """A column that only one hidden effect writes would give it away."""
+    rig = VirtualRig(0, hidden=hidden)
+    made, _ = rig.record(make_protocol("mixed", rig.limits, 600, seed=1))
+    plain = VirtualRig(0)
+    same, _ = plain.record(make_protocol("mixed", plain.limits, 600, seed=1))
+    np.testing.assert_array_equal(made.temp_C, same.temp_C)
+    assert np.ptp(made.temp_C) > 0.0

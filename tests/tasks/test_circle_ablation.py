@@ -211,3 +211,34 @@ def test_impossible_lesions_are_one_line():
     vary = Randomisation(lesion_mm=400.0, lesions=3)
     with pytest.raises(InputError, match="up to 400 mm; expected at most"):
         CircleAblation(CircleAblationConfig(world=WorldConfig(randomisation=vary)))
+
+
+def test_the_gate_follows_what_is_measured_and_never_the_true_beam(quick, cut):
+    """Where cameras see the arm on its path the beam is released, however far it truly is away."""
+    states, _ = cut
+    on = next(state for state in states if quick.fires(state).all())
+    laser = on.world.arms["laser"]
+    tilted = laser.points_mm.clone()
+    tilted[:, -2] += torch.tensor([1.0, 0.0, 0.0])  # the tip then points past the target
+
+    def with_laser(part):
+        world = replace(on.world, arms={**on.world.arms, "laser": part})
+        return replace(on, world=world)
+
+    arm = quick.world.arms["laser"]
+    truly_off = with_laser(replace(arm.posed(laser, tilted), seen_mm=laser.points_mm))
+    assert (quick.beam_error_mm(truly_off) > 2.0).all()
+    assert quick.fires(truly_off).all()
+    seen_off = with_laser(replace(laser, seen_mm=tilted))
+    assert (quick.beam_error_mm(seen_off) < 0.5).all()
+    assert not quick.fires(seen_off).any()
+
+
+def test_the_pointing_error_is_measured_with_the_beam_off_too(quick, cut):
+    """No gate truncates it; it leaves out the approach alone."""
+    states, outcomes = cut
+    measured = torch.stack([o.measures["pointing_error_mm"] for o in outcomes])
+    true = torch.stack([quick.beam_error_mm(state) for state in states[1:]])
+    begins = round(quick.config.approach_s / quick.dt_s)
+    assert measured[: begins - 1].isnan().all()
+    torch.testing.assert_close(measured[begins + 1 :], true[begins + 1 :])

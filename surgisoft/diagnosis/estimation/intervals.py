@@ -131,8 +131,8 @@ def with_covariance(fit: Fit, problem: Problem) -> Fitted:
 def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:
     """Probability of so large amplitudes if there were no effect (Wald 1943).
 
-    amplitudes: (P,) bool. Without an effect its nonlinear parameters mean nothing, and a fit chooses
-    those with which the amplitudes are largest (Davies 1977). So the amplitudes are tested at the
+    amplitudes: (P,) bool. Without an effect its nonlinear parameters mean nothing, and a fit
+    chooses those with which the amplitudes are largest (Davies 1977). So they are tested at the
     fitted nonlinear parameters, and all free values count as degrees of freedom.
     """
     among = np.ix_(amplitudes, amplitudes)

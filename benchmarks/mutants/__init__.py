@@ -27,7 +27,7 @@ class Mutant:
     new: str
     """Text in its place."""
     tests: tuple[str, ...]
-    """Files of tests that should notice, the most likely first."""
+    """Tests that should notice, files or single ones (`FILE::TEST`), the most likely first."""
     issue: bool = False
     """Whether no test noticed it in the trial of 2026-11-22."""
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -231,3 +232,27 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert not without.claimed
     assert not without.retuned
     assert without.held_out == without.alone
+
+
+def test_a_fall_is_claimed_where_it_is_significant_and_large():
+    """Above the floor stand 1.0 mm: what counts is more than a twentieth of them."""
+    fall = Fall(1.2, 1.0, 0.2, fall=0.2, ci95=(0.1, 0.3), rows=9, blocks=3)
+    assert fall.claimed
+    assert not replace(fall, ci95=(-0.01, 0.4)).claimed
+    assert not replace(fall, fall=0.04, ci95=(0.02, 0.06)).claimed
+    assert replace(fall, fall=0.06, ci95=(0.02, 0.1)).claimed
+
+
+def test_the_fall_is_that_of_the_rms_distance():
+    """Errors of 3 mm that become 2 mm at one key point of two, in 12 blocks of 5 rows."""
+    block = np.repeat(np.arange(12), 5)
+    residual = np.zeros((60, 2, 3))
+    residual[:, 0, 1] = 3.0
+    before = SimpleNamespace(residual=residual, block=block, floor_mm=0.1, index=np.arange(60))
+    after = SimpleNamespace(residual=residual * (2 / 3), block=block)
+    found = fall_of(before, after)
+    assert found.before == pytest.approx(3.0 / np.sqrt(2))
+    assert found.after == pytest.approx(2.0 / np.sqrt(2))
+    assert found.fall == pytest.approx(1.0 / np.sqrt(2))
+    assert found.ci95 == pytest.approx((found.fall, found.fall))
+    assert (found.rows, found.blocks) == (60, 12)

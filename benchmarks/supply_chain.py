@@ -60,7 +60,8 @@ IN_WORDS = {
 
 IN_TEXT = {
     "Redistribution and use in source and binary forms, with or without modification, are "
-    "permitted provided that the following conditions are met: * Redistributions of source code must retain "
+    "permitted provided that the following conditions are met: * Redistributions of source "
+    "code must retain "
     "the above copyright notice, this list of conditions and the following disclaimer. * "
     "Redistributions in binary form must reproduce the above copyright notice, this list of "
     "conditions and the following disclaimer in the documentation and/or other materials provided "

@@ -13,6 +13,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import Fall, amend, fall_of
 from surgisoft.diagnosis.compare import compare
+from surgisoft.diagnosis.estimation.network import Retuned
 from surgisoft.diagnosis.residuals import held_out_rows, problem_of
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
@@ -256,3 +257,19 @@ def test_the_fall_is_that_of_the_rms_distance():
     assert found.fall == pytest.approx(1.0 / np.sqrt(2))
     assert found.ci95 == pytest.approx((found.fall, found.fall))
     assert (found.rows, found.blocks) == (60, 12)
+
+
+def test_the_last_layer_is_tuned_on_training_rows_alone(lab, monkeypatch):
+    """What `retune` is given holds no measurement of a held-out row."""
+    seen = []
+
+    def retune(model, problem):
+        seen.append(problem.table)
+        return Retuned(model, False, 0.0)
+
+    monkeypatch.setattr("surgisoft.diagnosis.amend.retune", retune)
+    amend(lab / "arm", lab / "creep.parquet", "creep", refit="never")
+    (table,) = seen
+    assert table.held_out.sum() > 100
+    assert np.isnan(table.measured_mm[table.held_out]).all()
+    assert np.isfinite(table.measured_mm[~table.held_out]).any()

@@ -111,10 +111,16 @@ def licence_of(metadata) -> str:
 def project_requirements() -> list[Requirement]:
     """Direct requirements of the package and of the extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    texts = list(project["dependencies"])
-    for extra in EXTRAS:
-        texts += project["optional-dependencies"][extra]
-    return [Requirement(text) for text in texts]
+    found = {text: Requirement(text) for text in project["dependencies"]}
+    waiting = list(EXTRAS)
+    while waiting:
+        for text in project["optional-dependencies"][waiting.pop()]:
+            one = Requirement(text)
+            if one.name == project["name"]:
+                waiting += sorted(one.extras)
+            else:
+                found[text] = one
+    return [found[text] for text in sorted(found)]
 
 
 def installed() -> dict[str, Distribution]:

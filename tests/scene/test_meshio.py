@@ -1,10 +1,9 @@
 """Mesh files: one mesh from every format, no guess of the unit, one line for broken files."""
 
-from pathlib import Path
-
 import json
 import struct
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest

@@ -71,11 +71,22 @@ class Observer:
         model, points = self.arm.bent(part, pressure, dt_s)
         return replace(part, arm=model, points_mm=points, pressure=pressure)
 
-    def order(self, part: ArmPart, action: Tensor) -> Order:
-        """What to command for changes of pressure (B, m) kPa, and what should come of it."""
+    def order(
+        self,
+        part: ArmPart,
+        action: Tensor,
+        lowest: Tensor | None = None,
+        highest: Tensor | None = None,
+    ) -> Order:
+        """What to command for changes of pressure (B, m) kPa, and what should come of it.
+
+        lowest, highest: (B, m) kPa, other limits of a command than those of the observer.
+        """
         pump, target = self.arm.pneumatics, part.plant.target_kPa.to(action)
         shift = part.command - target
-        target = pump.command(target, action, self.lowest, self.highest)
+        low = self.lowest if lowest is None else lowest
+        high = self.highest if highest is None else highest
+        target = pump.command(target, action, low, high)
         return Order(target, shift, pump.follow(part.pressure, target + shift, self.dt_s))
 
     def begun(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> ArmPart:

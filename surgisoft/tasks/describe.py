@@ -40,8 +40,22 @@ class ObservedBlock:
     """Unit of x before scaling; `-` where it has none."""
     scale: str
     """The observed value as a function of x."""
+    low: float
+    """Lowest observed value, noise left aside."""
+    high: float
+    """Highest observed value, noise left aside."""
     meaning: str
     """What is observed."""
+
+    @property
+    def index(self) -> str:
+        """Its entries, such as `12-14`, or `27` for one."""
+        return f"{self.first}" if self.first == self.last else f"{self.first}-{self.last}"
+
+    @property
+    def range(self) -> str:
+        """Its range, such as `-1..1`."""
+        return f"{self.low:g}..{self.high:g}"
 
 
 @dataclass(frozen=True)
@@ -115,17 +129,22 @@ def describe(name: str, config: Any = None) -> TaskDescription:
     """The facts of the named task; it is built, and started once, to know its sizes."""
     spec = spec_of(name)
     task: DocumentedTask = make_task(name, config)
-    blocks = task.blocks(Episodes(task).seeded(0, 1))
     return TaskDescription(
         name=name,
         summary=_summary(spec.build),
-        agents={agent: _agent(task, agent, blocks[agent]) for agent in task.agents},
+        agents=describe_agents(task),
         dt_s=task.world.config.dt_s,
         steps=task.steps,
         ends=_first(task.ended),
         settings=tuple(_settings(spec.config if config is None else config)),
         randomisation=tuple(_settings(task.world.config.randomisation)),
     )
+
+
+def describe_agents(task: DocumentedTask) -> dict[str, AgentDescription]:
+    """What each agent of a task observes, does and is rewarded for, by name."""
+    blocks = task.blocks(Episodes(task).seeded(0, 1))
+    return {agent: _agent(task, agent, blocks[agent]) for agent in task.agents}
 
 
 def field_docs(kind: type) -> dict[str, str]:
@@ -186,7 +205,16 @@ def _agent(task: DocumentedTask, agent: str, blocks) -> AgentDescription:
         if size:
             last = first + size - 1
             observed.append(
-                ObservedBlock(block.name, first, last, block.unit, block.scale, block.meaning)
+                ObservedBlock(
+                    block.name,
+                    first,
+                    last,
+                    block.unit,
+                    block.scale,
+                    block.low,
+                    block.high,
+                    block.meaning,
+                )
             )
         first += size
     weights, arm = task.weights[agent], task.world.arms[agent]

@@ -134,8 +134,15 @@ def _line(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _quiet():
-    """Without the exporter's chatter; its errors are raised."""
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        yield
+    """Without the exporter's chatter, which takes most of its time where logs are kept.
+
+    Its errors are raised.
+    """
+    before = logging.root.manager.disable
+    logging.disable(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

@@ -7,15 +7,18 @@ The same robot, with the same history, is driven twice: by the policy inside thi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from surgisoft.agents.controller import named_tensors
 from surgisoft.agents.controller_runner import Controller
-from surgisoft.agents.on_rig import BuildRig, RigConfig, on_rig, virtual_rig
+from surgisoft.agents.on_rig import BuildRig, RigConfig, named_rig, on_rig
 from surgisoft.agents.policies import Policy
 from surgisoft.agents.rollout import Instant, rollout
+from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig
+from surgisoft.rig.interface import is_simulated
 from surgisoft.tasks.base import Task, TaskState
 
 
@@ -34,8 +37,13 @@ class RigCheck:
 class _LoggedRig:
     """A simulated rig that keeps its commands; it has the methods and attributes of the rig."""
 
-    def __init__(self, rig: SimulatedRig, trial: int):
-        self.rig, self.trial, self.commands = rig, trial, []
+    def __init__(self, build: BuildRig, config: RigConfig, trial: int):
+        rig = build(config, trial)
+        if not is_simulated(rig):
+            raise InputError("a controller is checked on simulated rigs, which can be driven twice")
+        self.rig: SimulatedRig = rig
+        self.made = (config, trial)
+        self.commands: list[np.ndarray] = []
 
     def __getattr__(self, name: str):
         return getattr(self.rig, name)
@@ -51,7 +59,7 @@ def check_on_rig(
     policy: Policy,
     config: RigConfig | None = None,
     seed: int = 0,
-    build: BuildRig = virtual_rig,
+    build: BuildRig = named_rig,
 ) -> RigCheck:
     """Compare a controller with its policy in episode 0 of a seed, on virtual rigs.
 
@@ -59,7 +67,7 @@ def check_on_rig(
     controller as it was in the episode of the policy.
     """
     config = config or RigConfig()
-    moved = on_rig(task, config, lambda plain, trial: _LoggedRig(build(plain, trial), trial))
+    moved = on_rig(task, config, partial(_LoggedRig, build))
     states: list[TaskState] = []
 
     def keep(instant: Instant) -> None:
@@ -68,7 +76,7 @@ def check_on_rig(
     rollout(moved, policy, 1, seed, watch=keep)
     first, decisions = states[0], len(states) - 1
     logged = {name: part.plant.rigs.items[0] for name, part in first.world.arms.items()}
-    rigs = {name: build(config, rig.trial) for name, rig in logged.items()}
+    rigs = {name: build(*rig.made) for name, rig in logged.items()}
     controller.reset()
     _as_started(controller, first, rigs)
     reads = {name: moved.world.arms[name].reads for name in rigs}

@@ -29,11 +29,11 @@ from surgisoft.graphs import (
     write_torch_script_of,
 )
 from surgisoft.surrogate.arm import ArmState
-from surgisoft.surrogate.chain import Signal, Standing, Stepping
+from surgisoft.surrogate.chain import STOOD_S, Signal, Standing, Stepping
 from surgisoft.surrogate.effects import EFFECTS, Context, Effect
 from surgisoft.surrogate.effects.user_defined import kind_of
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.model import AWAY_SHARE, ArmModel
 
 FORMAT = 1
 """Version of `arm.json`."""
@@ -107,7 +107,9 @@ class ArmGraph(nn.Module):
         mode = Standing(rest)
         signal = chain.walk(Signal(pressure), mode)
         stood = ArmState(pressure, mode.anchor, signal.direction, mode.memory)
-        away = (pressure != rest.pressure).any(-1)
+        span = pressure.new_tensor(self.model.spec.span)
+        away = ((pressure - rest.pressure).abs() > AWAY_SHARE * span) & ~self.model.still
+        away = away.any(-1)
         return self.packed(rest.where(away, stood))
 
     def step(
@@ -227,8 +229,13 @@ def describe_arm(graph: ArmGraph, worst_mm: float) -> dict[str, Any]:
             "inputs": graph.inputs,
             "outputs": ["next_state", "key_points_mm"],
         },
-        "start_meaning": "pressure (1, m) at which a run begins: an arm at rest there has no past; "
-        "one away from rest is assumed to have been held there for 10 s",
+        "start_meaning": "pressure (1, m) at which a run begins; an arm that begins away from rest "
+        f"by more than {AWAY_SHARE:.0%} of a range is assumed to have been held there for "
+        f"{STOOD_S:g} s, any other one to be at rest without a past",
+        "recording_columns": [
+            f"{'c' if spec.actuation == 'commanded' else 'p'}{number}_{spec.unit}"
+            for number in range(1, spec.chambers + 1)
+        ],
         "tensors": tensors,
         "rest": {"pressure": list(spec.rest), "state": graph.rest_state[0].tolist()},
         "state": {"size": size, "parts": parts},

@@ -23,19 +23,15 @@ def functions(folder, about, engine):
         from onnxruntime import InferenceSession as Session
     else:
         from onnx.reference import ReferenceEvaluator as Session
-    found = []
-    for part in (about["start"], about["step"]):
-        session = Session(str(folder / part["onnx"]))
-        names = part["inputs"]
-        found.append(lambda *x, s=session, n=names: s.run(None, dict(zip(n, x, strict=True))))
-    return found
+    files = {part["onnx"]: part["inputs"] for part in (about["start"], about["step"])}
+    found = [(Session(str(folder / file)), names) for file, names in files.items()]
+    return [lambda *x, s=s, n=n: s.run(None, dict(zip(n, x, strict=True))) for s, n in found]
 
 
 folder = Path(sys.argv[1])
 about = json.loads((folder / "arm.json").read_text())
 start, step = functions(folder, about, (sys.argv[3:] or ["onnxruntime"])[0])
-with open(sys.argv[2], newline="") as file:
-    rows = list(csv.DictReader(file))
+rows = list(csv.DictReader(Path(sys.argv[2]).open(newline="")))
 pressure = np.array([[float(row[name]) for name in about["recording_columns"]] for row in rows])
 time = np.array([float(row["t_s"]) for row in rows])
 (state,) = start(pressure[:1])

@@ -11,19 +11,19 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from surgisoft.agents.observer import Observer, ObserverGains, Order
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Episodes, Signal, Task, TaskState
+from surgisoft.tasks.base import Episodes, MeasuredTask, Signal, Task, TaskState
 from surgisoft.tasks.describe import field_docs
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.scene import SceneState
+from surgisoft.tasks.world.scene import SceneEngine, SceneState
 from surgisoft.tasks.world.world import WorldState
 
 EARLY = 1e-3
@@ -163,6 +163,9 @@ class ControllerGraph(nn.Module):
     mm in the world frame, and the agent's last observation (1, D).
     """
 
+    initial: Tensor
+    """(1, S): the state of a robot at rest."""
+
     def __init__(
         self,
         task: Task,
@@ -180,11 +183,14 @@ class ControllerGraph(nn.Module):
         self.control_s = task.world.config.dt_s
         self.actors = nn.ModuleDict({name: actors[name] for name in task.agents})
         world, moved = copy.copy(task.world), copy.copy(task)
-        self.arms = {
-            name: MeasuredArm(arm, gains, self.control_s) for name, arm in world.arms.items()
-        }
+        self.arms: dict[str, MeasuredArm] = {}
+        for name, arm in world.arms.items():
+            if not isinstance(arm, ModelArm):
+                raise InputError(f"arm '{name}' is on a rig, expected the simulated task")
+            self.arms[name] = MeasuredArm(arm, gains, self.control_s)
         world.arms = dict(self.arms)
-        world.scene = _MeasuredScene() if world.scene is not None else None
+        if world.scene is not None:
+            world.scene = cast(SceneEngine, _MeasuredScene())
         moved.world = world
         self.simulated = task
         self.task, self.episodes = moved, Episodes(moved)
@@ -194,9 +200,9 @@ class ControllerGraph(nn.Module):
             self.leaves = tuple(_leaves(self.start))
             first = self._known(self.start, {s.name: torch.zeros(1) for s in self.signals})
             seen = self.episodes.observe(first)
-            self.register_buffer("_seen", torch.cat([seen[a] for a in moved.agents], 1))
+            joint = torch.cat([seen[agent] for agent in moved.agents], 1)
         self.widths = {agent: seen[agent].shape[1] for agent in moved.agents}
-        self.register_buffer("initial", self.packed(self.start, self._seen))
+        self.register_buffer("initial", self.packed(self.start, joint))
 
     @property
     def inputs(self) -> list[str]:
@@ -300,7 +306,7 @@ class ControllerGraph(nn.Module):
         }
         state = self._known(replace(memory, arms=waiting), signals)
         if self.signals:
-            state = self.task.advance_measured(state, signals)
+            state = cast(MeasuredTask, self.task).advance_measured(state, signals)
         else:
             none = {name: torch.zeros_like(part.command) for name, part in waiting.items()}
             state = self.task.advance(state, none)
@@ -310,7 +316,7 @@ class ControllerGraph(nn.Module):
         """The state of the task, as far as it is measured."""
         scene = SceneState()
         if self.signals:
-            scene = self.task.measured_scene(signals, memory.lesion)
+            scene = cast(MeasuredTask, self.task).measured_scene(signals, memory.lesion)
         failed = torch.zeros(1, dtype=torch.bool)
         world = WorldState(self._stream, memory.steps, memory.arms, scene, failed)
         return TaskState(world, memory.goal)
@@ -325,7 +331,7 @@ class ControllerGraph(nn.Module):
 
 def goal_docs(goal: Any, prefix: str = "goal") -> dict[str, str]:
     """Path of each tensor of a goal -> its docstring."""
-    found = {}
+    found: dict[str, str] = {}
     docs = field_docs(type(goal))
     for field in fields(goal):
         value, path = getattr(goal, field.name), f"{prefix}.{field.name}"

@@ -103,11 +103,11 @@ class Controller:
         leaf = self._leaf(name)
         return self._state[0, leaf["first"] : leaf["last"]].reshape(leaf["shape"]).copy()
 
-    def observe(self, pressure_kPa, key_points_mm, commanded_kPa, dt_s, **signals) -> None:
+    def observe(self, pressure_kPa, key_points_mm, commanded_kPa, dt_s, **signals: float) -> None:
         """Follow a sample before the episode begins: the models remember what the arm did."""
         self._run(pressure_kPa, key_points_mm, commanded_kPa, dt_s, 0.0, signals)
 
-    def begin(self, pressure_kPa, key_points_mm, commanded_kPa, dt_s, goal=None, **signals):
+    def begin(self, pressure_kPa, key_points_mm, commanded_kPa, dt_s, goal=None, **signals: float):
         """Begin an episode with this sample; returns the pressures to command, kPa.
 
         goal: values by the names in `policy.json`, such as {"traversal.start": 0.25}; what is not
@@ -124,7 +124,7 @@ class Controller:
         self._begun = True
         return self._commands()
 
-    def step(self, pressure_kPa, key_points_mm, dt_s, commanded_kPa=None, **signals):
+    def step(self, pressure_kPa, key_points_mm, dt_s, commanded_kPa=None, **signals: float):
         """Follow a sample; returns the pressures to command, kPa.
 
         A new decision is made once in a control period; in between the last one is returned.
@@ -223,7 +223,7 @@ def _onnxruntime(folder: Path, about: dict) -> Function:
     session = onnxruntime.InferenceSession(
         str(folder / about["onnx"]), providers=["CPUExecutionProvider"]
     )
-    return lambda given: session.run(about["outputs"], given)
+    return lambda given: list(session.run(about["outputs"], given))
 
 
 def _torch(folder: Path, about: dict) -> Function:
@@ -243,4 +243,4 @@ def _onnx(folder: Path, about: dict) -> Function:
     from onnx.reference import ReferenceEvaluator
 
     session = ReferenceEvaluator(str(folder / about["onnx"]))
-    return lambda given: session.run(about["outputs"], given)
+    return lambda given: list(session.run(about["outputs"], given))

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe, new_folder, write_json
 from surgisoft.graphs import DoesNotTrace, largest_difference, write_onnx, write_torch_script
-from surgisoft.tasks.base import Task
+from surgisoft.tasks.base import DocumentedTask, Task
 from surgisoft.tasks.describe import describe_agents
 
 FORMAT = 2
@@ -118,7 +118,7 @@ def running(graph: ControllerGraph) -> Controller:
 def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
     """What `policy.json` says of a controller: names, order, units, scales and ranges."""
     task, meanings = graph.task, goal_docs(graph.start.goal)
-    leaves = [
+    leaves: list[dict[str, Any]] = [
         {"name": leaf.name, "first": leaf.first, "last": leaf.last, "shape": list(leaf.shape)}
         for leaf in graph.leaves
     ]
@@ -150,7 +150,7 @@ def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
         for suffix, meaning in SETTABLE.items()
         if leaf["name"].startswith("arms.") and leaf["name"].split(".", 2)[2] == suffix
     ]
-    described = describe_agents(graph.simulated)
+    described = describe_agents(cast(DocumentedTask, graph.simulated))
     signals = [
         asdict(signal) | {"optional": signal.default is not None} for signal in graph.signals
     ]
@@ -262,7 +262,7 @@ def _samples(graph: ControllerGraph) -> Iterator[list[Tensor]]:
             step = arm.pneumatics.step_kPa * torch.randn(arm.chambers, generator=random)
             pressure[name] = (pressure[name] + step).clamp(arm.low, arm.high)
             noise = torch.randn(1, arm.key_points, 3, generator=random)
-            points = arm.model.rest_mm + noise
+            points = cast(Tensor, arm.model.rest_mm) + noise
             commanded = pressure[name] + 0.1 * torch.rand(arm.chambers, generator=random)
             given += [pressure[name][None].clone(), points, commanded[None]]
         for signal in graph.signals:

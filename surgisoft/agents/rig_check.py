@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.base import MeasuredTask, Task, TaskState
 
 
 @dataclass(frozen=True)
@@ -76,20 +77,19 @@ def check_on_rig(
     rollout(moved, policy, 1, seed, watch=keep)
     first, decisions = states[0], len(states) - 1
     logged = {name: part.plant.rigs.items[0] for name, part in first.world.arms.items()}
-    rigs = {name: build(*rig.made) for name, rig in logged.items()}
+    rigs = {name: cast(SimulatedRig, build(*rig.made)) for name, rig in logged.items()}
     controller.reset()
     _as_started(controller, first, rigs)
-    reads = {name: moved.world.arms[name].reads for name in rigs}
-    (samples,) = set(reads.values())
+    period_s = next(iter(rigs.values())).period_s
+    samples = round(task.world.config.dt_s / period_s)
     settled = len(next(iter(logged.values())).commands) - samples * decisions
     for rig in rigs.values():
         rig.reset()
-    period_s = next(iter(rigs.values())).period_s
     for number in range(settled):
         asked = {name: rig.commands[number] for name, rig in logged.items()}
         measured = _measured(rigs, asked)
         if number < settled - 1:
-            controller.observe(*measured[:2], asked, period_s, **_anything(controller))
+            controller.observe(measured[0], measured[1], asked, period_s, **_anything(controller))
     goal = {
         name.removeprefix("goal."): value[0].numpy()
         for name, value in named_tensors(first.goal, "goal")
@@ -97,7 +97,7 @@ def check_on_rig(
     if first.world.scene.lesion is not None:
         goal["lesion"] = first.world.scene.lesion[0].numpy()
     signals = _signals(task, None, first)
-    command = controller.begin(*measured[:2], asked, period_s, goal=goal, **signals)
+    command = controller.begin(measured[0], measured[1], asked, period_s, goal=goal, **signals)
     points, commands = 0.0, 0.0
     for decision in range(decisions):
         before, after = states[decision], states[decision + 1]
@@ -109,7 +109,7 @@ def check_on_rig(
                 gap = np.abs(np.clip(asked[name], *rig.limits.T) - rig.commands[row]).max()
                 commands = max(commands, float(gap))
             measured = _measured(rigs, asked)
-            command = controller.step(*measured[:2], period_s, **signals)
+            command = controller.step(measured[0], measured[1], period_s, **signals)
         for name, part in after.world.arms.items():
             pose = part.mount[0].double().numpy()
             true = measured[2][name] @ pose[:3, :3].T + pose[:3, 3]
@@ -129,7 +129,8 @@ def _signals(task: Task, before: TaskState | None, after: TaskState) -> dict[str
     """The task's signals as they are in simulation."""
     if not getattr(task, "signals", ()):
         return {}
-    return {name: float(value[0]) for name, value in task.true_signals(before, after).items()}
+    found = cast(MeasuredTask, task).true_signals(before, after)
+    return {name: float(value[0]) for name, value in found.items()}
 
 
 def _anything(controller: Controller) -> dict[str, float]:

@@ -54,10 +54,10 @@ def every_effect():
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """A recording of two minutes of a virtual rig, as CSV and in memory."""
+    """A recording of four seconds of a virtual rig, as CSV and in memory."""
     folder = tmp_path_factory.mktemp("bench")
     rig = VirtualRig(0, take=3)
-    recording = rig.record(make_protocol("ramps", rig.limits, 300, seed=2))[0]
+    recording = rig.record(make_protocol("ramps", rig.limits, 80, seed=2))[0]
     save_recording(recording, folder / "bench.csv")
     return folder / "bench.csv", recording
 

@@ -31,7 +31,7 @@ def functions(folder, about, engine):
 folder = Path(sys.argv[1])
 about = json.loads((folder / "arm.json").read_text())
 start, step = functions(folder, about, (sys.argv[3:] or ["onnxruntime"])[0])
-rows = list(csv.DictReader(Path(sys.argv[2]).open(newline="")))
+rows = list(csv.DictReader(Path(sys.argv[2]).read_text().splitlines()))
 pressure = np.array([[float(row[name]) for name in about["recording_columns"]] for row in rows])
 time = np.array([float(row["t_s"]) for row in rows])
 (state,) = start(pressure[:1])

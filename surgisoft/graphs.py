@@ -83,6 +83,8 @@ def write_onnx(
                 dynamo=True,
                 verbose=False,
             )
+        except ImportError:
+            raise
         except Exception as error:
             file.unlink(missing_ok=True)
             raise DoesNotTrace(_line(error)) from error

@@ -79,7 +79,7 @@ FLOORS = {
         ("author",),
     ),
     "replay": (
-        ("colours", "shapes", "surfaces"),
+        ("colours", "contents", "shapes", "surfaces"),
         ("plots",),
         ("recording",),
         ("arms", "endoscope"),

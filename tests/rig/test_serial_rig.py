@@ -179,7 +179,8 @@ def test_cameras_without_key_points_hold_and_then_vent(bench):
             for k in range(200):
                 drive(rig, [10.0 + 0.1 * k, 10.0, 10.0], 1)
 
-    with pytest.raises(RigStopped, match=r"no key point was seen for [12]\.\d s; the rig is vented"):
+    message = r"no key point was seen for [12]\.\d s; the rig is vented"
+    with pytest.raises(RigStopped, match=message):
         blinded()
     highest = max(target[0] for _, _, target in bench.log)
     assert highest < 13.0, "held half a second after the last key point"

@@ -375,3 +375,15 @@ def test_the_seed_that_selects_judges_nothing():
     used = {TrainingRequest("track_circle").seed, EvaluationRequest(("random",), "x").seed}
     assert used == {0}
     assert SEED > 10_000
+
+
+def test_weights_of_a_new_training_follow_from_its_seed():
+    """The first weights alone, before any episode of the seed is seen."""
+
+    def first(seed):
+        plan = plan_of(seed=seed)
+        (ppo,) = Training(plan, make_task(plan.task, plan.task_config), Processes()).agents.values()
+        return ppo.get_policy().mlp[0].weight.detach()
+
+    assert torch.equal(first(3), first(3))
+    assert not torch.equal(first(3), first(4))

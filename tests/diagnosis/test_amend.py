@@ -1,5 +1,6 @@
 """`amend`: falls by hand, claims that hold, and every wrong turn in one line."""
 
+import copy
 import hashlib
 import json
 import re
@@ -13,8 +14,8 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import Fall, amend, fall_of
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.estimation.network import Retuned
-from surgisoft.diagnosis.residuals import held_out_rows, problem_of
+from surgisoft.diagnosis.estimation.network import Retuned, retune
+from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
@@ -273,3 +274,29 @@ def test_the_last_layer_is_tuned_on_training_rows_alone(lab, monkeypatch):
     assert table.held_out.sum() > 100
     assert np.isnan(table.measured_mm[table.held_out]).all()
     assert np.isfinite(table.measured_mm[~table.held_out]).any()
+
+
+def test_a_layer_that_held_out_motion_does_not_reward_is_not_changed():
+    """The model is the truth: what a new layer would gain is noise."""
+    arm = bare_arm()
+    problem = residual_table(arm, [measured_on(arm)]).training()
+    found = retune(arm, problem)
+    assert not found.kept
+    assert found.model is arm
+    assert found.gain < 0.05
+
+
+def test_a_tuned_layer_that_makes_held_out_rows_worse_is_not_kept(lab, monkeypatch):
+    """Whatever the tuning says of itself: the network's output is moved by 1 mm here."""
+
+    def worse(model, problem):
+        network = copy.deepcopy(model.network)
+        with torch.no_grad():
+            network.mean += 1.0
+        return Retuned(model.replace(network=network).eval(), True, 0.5)
+
+    monkeypatch.setattr("surgisoft.diagnosis.amend.retune", worse)
+    found = amend(lab / "arm", lab / "creep.parquet", "creep", refit="never")
+    assert not found.retuned
+    assert found.alone.claimed
+    assert found.held_out.after == pytest.approx(found.alone.after)

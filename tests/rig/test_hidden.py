@@ -256,3 +256,19 @@ def test_the_temperature_is_written_whatever_is_hidden(hidden):
     same, _ = plain.record(make_protocol("mixed", plain.limits, 600, seed=1))
     np.testing.assert_array_equal(made.temp_C, same.temp_C)
     assert np.ptp(made.temp_C) > 0.0
+
+
+@pytest.mark.parametrize("name", ["creep", "softening"])
+def test_venting_and_resting_undo_what_the_last_run_left(name):
+    """After a reset the arm is where a robot is that never moved."""
+    used, fresh = (VirtualRig(0, hidden=[(name, 1.0)], noise=0.0) for _ in range(2))
+    used.reset()
+    used.command(np.array([50.0, 0.0, 0.0]))
+    used.wait(60.0)
+    tips = []
+    for rig in (used, fresh):
+        rig.reset()
+        rig.command(np.array([20.0, 0.0, 0.0]))
+        rig.wait(5.0)
+        tips.append(rig.read_beside_truth()[1].noise_free_mm[0, -1])
+    np.testing.assert_allclose(*tips, atol=1e-6)

@@ -6,7 +6,7 @@ from surgisoft.agents.presets import RANDOMISED_WORLD
 from surgisoft.agents.training_request import TrainingRequest
 from surgisoft.tasks.track import TrackConfig
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.observer import Observer
+from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import WorldConfig, single_arm_world
 
@@ -29,7 +29,7 @@ def test_noise_is_lowered_as_much_as_an_alpha_filter_does():
     """Without drift gain and model error the variance is alpha / (2 - alpha) of the noise's."""
     plain = Randomisation(noise_mm=NOISE_MM)
     raw = errors_mm(WorldConfig(randomisation=plain)).square().mean().sqrt()
-    filtered = errors_mm(WorldConfig(randomisation=plain, observer=Observer(0.3)))[20:]
+    filtered = errors_mm(WorldConfig(randomisation=plain, observer=AlphaBetaFilter(0.3)))[20:]
     torch.testing.assert_close(raw, torch.tensor(NOISE_MM), rtol=0.02, atol=0.0)
     expected = torch.tensor(NOISE_MM * (0.3 / 1.7) ** 0.5)
     torch.testing.assert_close(filtered.square().mean().sqrt(), expected, rtol=0.05, atol=0.0)
@@ -37,8 +37,8 @@ def test_noise_is_lowered_as_much_as_an_alpha_filter_does():
 
 def test_the_estimate_follows_mounts_and_gains_that_the_model_does_not_know():
     vary = Randomisation(mount_mm=0.5, gain=0.02)
-    off = errors_mm(WorldConfig(randomisation=vary, observer=Observer(0.3, 0.01)))
-    nominal = errors_mm(WorldConfig(randomisation=vary, observer=Observer(0.0)))
+    off = errors_mm(WorldConfig(randomisation=vary, observer=AlphaBetaFilter(0.3, 0.01)))
+    nominal = errors_mm(WorldConfig(randomisation=vary, observer=AlphaBetaFilter(0.0)))
     assert off[20:].square().mean().sqrt() < 0.1
     assert off[20:].square().mean().sqrt() < 0.5 * nominal[20:].square().mean().sqrt()
 
@@ -50,9 +50,9 @@ def test_the_raw_measurement_is_the_default():
 def test_the_preset_randomised_sets_the_world_that_the_user_left_as_it_was():
     plan = TrainingRequest("track_circle", "randomised").plan()
     assert plan.task_config.world.randomisation == RANDOMISED_WORLD["randomisation"]
-    assert plan.task_config.world.observer == Observer(0.3, 0.01)
+    assert plan.task_config.world.observer == AlphaBetaFilter(0.3, 0.01)
     assert plan.preset == TrainingRequest("track_circle").plan().preset
     own = TrackConfig(world=WorldConfig(randomisation=Randomisation(noise_mm=0.2)))
     plan = TrainingRequest("track_circle", "randomised", config=own).plan()
     assert plan.task_config.world.randomisation == Randomisation(noise_mm=0.2)
-    assert plan.task_config.world.observer == Observer(0.3, 0.01)
+    assert plan.task_config.world.observer == AlphaBetaFilter(0.3, 0.01)

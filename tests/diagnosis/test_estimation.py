@@ -235,8 +235,10 @@ def test_amplitudes_of_an_effect_that_is_not_there_are_no_surprise():
     """The test's null: a network that is off, no effect. And its power: an effect that is there."""
     there = problem_of(bare_arm(), [measured_on(TRUTHS["gain_mismatch"])], part="training")
     assert fit_effects(there, ["gain_mismatch"]).p_value < 1e-3
-    off = bare_arm()
+    off, generator = bare_arm(), torch.Generator().manual_seed(0)
     with torch.no_grad():
-        off.network.layers[-1].weight *= 1.01
+        for layer in off.network.layers[::2]:
+            change = torch.randn(layer.weight.shape, generator=generator)
+            layer.weight.add_(0.01 * layer.weight.std() * change)
     absent = problem_of(off, [measured_on(bare_arm())], part="training")
     assert fit_effects(absent, ["gain_mismatch"]).p_value > 0.05

@@ -142,7 +142,10 @@ def collect(
         )
     save_recording(recording, output, force)
     minutes = recording.t_s[-1] / 60
-    secret = "".join(f", hidden {name} {size:g}" for name, size in effects)
+    secret = "".join(
+        f", hidden {name} {size:g}" + "".join(f" from {begins_s:g} s on" for begins_s in late)
+        for name, size, *late in effects
+    )
     print(
         f"wrote {output}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
@@ -150,8 +153,8 @@ def collect(
     )
 
 
-def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
-    """Hidden effects with their amplitudes; 1 where none is given."""
+def _pairs(given: list[str], strengths: list[float]) -> list:
+    """Hidden effects with their amplitudes, 1 where none is given, and times of beginning."""
     if len(strengths) not in (0, len(given)):
         raise InputError(
             f"{len(given)} --hidden and {len(strengths)} --strength, expected one for each"
@@ -161,9 +164,9 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
     from surgisoft.rig.trial import hidden_effects
 
     pairs = hidden_effects(given)
-    return (
-        [(name, x) for (name, _), x in zip(pairs, strengths, strict=True)] if strengths else pairs
-    )
+    if not strengths:
+        return pairs
+    return [(name, x, *late) for (name, _, *late), x in zip(pairs, strengths, strict=True)]
 
 
 def _check_output(path: Path, force: bool) -> None:

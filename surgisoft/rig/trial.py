@@ -29,6 +29,11 @@ def simulated_rig(name: str, seed: int, **fields: Any) -> Any:
     """The simulated rig of a name with the robot of a seed; fields: of its configuration."""
     if name == "virtual":
         return VirtualRig(seed, **fields)
+    if any(len(effect) == 3 for effect in fields.get("hidden", ())):
+        raise InputError(
+            f"a hidden effect with a time (NAME@SECONDS): the rig '{name}' has all its effects from "
+            "the start; use the rig 'virtual'"
+        )
     return _elastica(name).ElasticaRig(seed, **fields)
 
 
@@ -49,23 +54,33 @@ def _elastica(name: str) -> ModuleType:
     return importlib.import_module("surgisoft.rig.elastica")
 
 
-def hidden_effects(
-    given: Iterable[str | tuple[str, float]] | None,
-) -> list[tuple[str, float]]:
-    """Hidden effects as (name, amplitude), from text such as `creep:0.5`; default amplitude 1.
+HiddenEffect = tuple[str, float] | tuple[str, float, float]
+"""A hidden effect: name, amplitude and, where it begins later, the time [s] after the first reset."""
 
-    Raises InputError for an amplitude that is no number.
+
+def hidden_effects(
+    given: Iterable[str | HiddenEffect] | None,
+) -> list[HiddenEffect]:
+    """Hidden effects from text such as `creep`, `creep:0.5` or `payload:1@360`; amplitude 1.
+
+    `@360` lets the effect begin 360 s after the first reset. Raises InputError for an amplitude or
+    a time that is no number.
     """
-    found = []
+    found: list[HiddenEffect] = []
     for item in given or ():
         if not isinstance(item, str):
-            found.append((item[0], float(item[1])))
+            begins = [float(value) for value in item[1:]]
+            found.append((item[0], begins[0]) if len(begins) == 1 else (item[0], *begins[:2]))
             continue
-        name, colon, strength = item.partition(":")
+        effect, at, begins_s = item.partition("@")
+        name, colon, amplitude = effect.partition(":")
         try:
-            found.append((name, float(strength) if colon else 1.0))
+            size = float(amplitude) if colon else 1.0
+            found.append((name, size, float(begins_s)) if at else (name, size))
         except ValueError:
-            raise InputError(f"--hidden {item}: expected NAME or NAME:STRENGTH") from None
+            raise InputError(
+                f"--hidden {item}: expected NAME, NAME:STRENGTH or either with @SECONDS"
+            ) from None
     return found
 
 
@@ -76,7 +91,7 @@ def collect(
     seed: int = 0,
     trial: int = 0,
     points: int | None = None,
-    hidden: Iterable[str | tuple[str, float]] = (),
+    hidden: Iterable[str | HiddenEffect] = (),
     progress: Progress = silent,
     **mount: Any,
 ) -> Recording:
@@ -85,7 +100,8 @@ def collect(
     rig: the rig to record on: an object (`surgisoft.rig.interface.Rig`), or the name of a simulated
     rig, `virtual` (the default) or `elastica`, which these options describe:
     seed: seed of the robot. trial: number of the trial, with other noise and random schedule on the
-    same robot. hidden: hidden effects, by name or (name, amplitude). mount: `gravity`,
+    same robot. hidden: hidden effects, by name, (name, amplitude) or text such as `creep:0.5@60`,
+    which begins 60 s after the first reset. mount: `gravity`,
     `roll_deg`, `payload_g` and `noise` of the simulated rig.
     points: number of steady-state points, or of frames; default: by the protocol.
     """

@@ -30,6 +30,7 @@ COMMANDS = (
     "evaluate",
     "scene",
     "experiment",
+    "rig",
     "replay",
     "benchmark",
 )

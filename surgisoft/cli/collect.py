@@ -1,19 +1,25 @@
-"""`surgisoft collect`: record a protocol on a simulated rig."""
+"""`surgisoft collect`: record a protocol on a rig."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import SEED_MAX, Force, Hidden
+from surgisoft.cli.options import SEED_MAX, Force, Hidden, Rig
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+
+if TYPE_CHECKING:
+    from surgisoft.measurement.recordings import Recording
 
 
 def _list_hidden(context: typer.Context, value: bool) -> None:
     if value:
-        from surgisoft.rig.trial import hidden_of
+        from surgisoft.rig.registry import hidden_of
 
         for name, effect in hidden_of(context.params.get("rig", "virtual")).items():
             print(f"{name:18s}{effect.place:10s}{effect.about}")
@@ -41,26 +47,18 @@ def collect(
         Path,
         typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
     ],
-    rig: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            is_eager=True,
-            help="Simulated rig: virtual, or elastica (PyElastica's Cosserat rod; other robots, "
-            "other physics).",
-        ),
-    ] = "virtual",
+    rig: Rig = "virtual",
     seed: Annotated[
-        int,
+        int | None,
         typer.Option(
             "--seed",
             "--robot-seed",
             min=0,
             max=SEED_MAX,
-            help="Seed of the robot; another seed is another arm of the same design (elastica: "
-            "of another design).",
+            help="Seed of the random schedule, and of the robot on a simulated rig; another seed "
+            "is another arm of the same design (elastica: of another design). Default 0.",
         ),
-    ] = 0,
+    ] = None,
     trial: Annotated[
         int,
         typer.Option(
@@ -81,14 +79,14 @@ def collect(
         typer.Option(metavar="X...", help="Amplitudes of the hidden effects, in the same order."),
     ] = None,
     payload_g: Annotated[
-        float, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
-    ] = 0.0,
+        float | None, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
+    ] = None,
     gravity: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="Direction of gravity in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
-        float,
+        float | None,
         typer.Option(
             "--roll-deg",
             min=-360,
@@ -96,10 +94,11 @@ def collect(
             metavar="DEG",
             help="Rotation of the base about its axis, degrees.",
         ),
-    ] = 0.0,
+    ] = None,
     noise_scale: Annotated[
-        float, typer.Option(help="Factor on all sensor and camera noise.")
-    ] = 1.0,
+        float | None,
+        typer.Option(help="Factor on all sensor and camera noise of a simulated rig."),
+    ] = None,
     force: Force = False,
     list_hidden: Annotated[
         bool,
@@ -117,39 +116,45 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording on a simulated rig: the paper's arm, pumps and motion capture."""
+    """Collect a recording on a rig, by default the virtual one."""
     from surgisoft.measurement.recordings import save_recording
-    from surgisoft.rig.trial import collect as collect_recording
 
-    _check_output(output, force)
+    check_new_recording(output, force)
     effects = _pairs(hidden or [], strength or [])
-    mount: dict[str, Any] = {
+    mount = {
         "gravity": gravity,
         "roll_deg": roll_deg,
         "payload_g": payload_g,
         "noise": noise_scale,
     }
-    with progress(f"collect {protocol}") as report:
-        recording = collect_recording(
-            protocol,
-            rig,
-            seed=seed,
-            trial=trial,
-            points=points,
-            hidden=effects,
-            progress=report,
-            **{name: value for name, value in mount.items() if value is not None},
-        )
+    given = {name: value for name, value in mount.items() if value is not None}
+    recording = record_on(
+        protocol, rig, given, seed=seed, trial=trial, points=points, hidden=effects
+    )
     save_recording(recording, output, force)
+    print(written_line(output, recording, effects))
+
+
+def record_on(protocol: str | Path, rig: str, setup: dict[str, Any], **fields: Any) -> Recording:
+    """Record a protocol on a rig with a progress bar; fields: as for `surgisoft.collect`."""
+    from surgisoft.rig.trial import collect as collect_recording
+
+    with progress(f"collect {protocol}") as report:
+        return collect_recording(protocol, rig, progress=report, **fields, **setup)
+
+
+def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = ()) -> str:
+    """One line about a recording that was written."""
     minutes = recording.t_s[-1] / 60
+    noise = "" if recording.noise_mm is None else f", noise {recording.noise_mm:.3f} mm"
     secret = "".join(
         f", hidden {name} {size:g}" + "".join(f" from {begins_s:g} s on" for begins_s in late)
-        for name, size, *late in effects
+        for name, size, *late in hidden
     )
-    print(
-        f"wrote {output}: {recording.samples} {recording.kind} samples of {recording.chambers} "
+    return (
+        f"wrote {path}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
-        f"{minutes:.0f} min on the bench, noise {recording.noise_mm:.3f} mm{secret}"
+        f"{minutes:.0f} min on the bench{noise}{secret}"
     )
 
 
@@ -161,7 +166,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list:
         )
     if strengths and any(":" in text for text in given):
         raise InputError("--hidden NAME:X and --strength both give amplitudes; use one of them")
-    from surgisoft.rig.trial import hidden_effects
+    from surgisoft.rig.registry import hidden_effects
 
     pairs = hidden_effects(given)
     if not strengths:
@@ -169,7 +174,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list:
     return [(name, x, *late) for (name, _, *late), x in zip(pairs, strengths, strict=True)]
 
 
-def _check_output(path: Path, force: bool) -> None:
+def check_new_recording(path: Path, force: bool) -> None:
     """Raise InputError before the work starts, where its result could not be written."""
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.on_rig import RigConfig, on_rig, rigs_by_arm
 from surgisoft.config import Where, merged, to_table
 from surgisoft.errors import InputError
 from surgisoft.experiments.phases import PhasedTask
@@ -21,11 +21,15 @@ from surgisoft.experiments.spec import (
     task_config,
 )
 from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.registry import SIMULATED, hidden_of, parse_rig
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.registry import with_present_names
 
 Value = int | float | str
+
+ARMS = ("laser", "endoscope")
+"""The arms of an experiment."""
 
 
 @dataclass(frozen=True)
@@ -141,14 +145,16 @@ def rig_config(setting: Setting, place: Where) -> RigConfig | None:
     for field, value in varied.items():
         if field.startswith("hidden."):
             hidden[field.removeprefix("hidden.")] = float(value)
+    rigs = {parse_rig(rig).name for rig in rigs_by_arm(setting.case.rigs, ARMS).values()}
     for name in hidden:
-        if name not in HIDDEN:
-            raise (place / "cases").error(
-                f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
-            )
+        for rig in rigs.intersection(SIMULATED):
+            if name not in hidden_of(rig):
+                raise (place / "cases").error(
+                    f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(hidden_of(rig)))}"
+                )
     specimen = int(varied.get("rig.specimen", setting.case.specimen))
     pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
-    return RigConfig(seed=specimen, hidden=pairs)
+    return RigConfig(seed=specimen, hidden=pairs, rigs=setting.case.rigs)
 
 
 def scene_of(spec: Experiment, setting: Setting) -> Scene:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from surgisoft.agents.evaluate import episode_table
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks
+from surgisoft.agents.on_rig import at_benches, real_benches
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
 from surgisoft.errors import InputError
@@ -29,6 +30,7 @@ from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
 from surgisoft.experiments.spec import (
     EXPERIMENT_TASK,
     FILE,
+    Case,
     Experiment,
     load_experiment,
     save_experiment,
@@ -125,7 +127,7 @@ def check_playable(spec: Experiment) -> None:
     for setting in found:
         case = setting.case
         if (case.policy, case.arm) not in seen:
-            plain = replace(case, plant="simulation", hidden=(), specimen=0)
+            plain = replace(case, plant="simulation", hidden=(), specimen=0, rigs=Case.rigs)
             opened(spec, replace(setting, case=plain))
             seen.add((case.policy, case.arm))
 
@@ -214,7 +216,12 @@ def roll_out_block(
         checks(now)
         recorders(now)
 
-    result = rollout(task, controllers, count, spec.seed, count, progress, watch, first)
+    try:
+        with at_benches(task):
+            result = rollout(task, controllers, count, spec.seed, count, progress, watch, first)
+    finally:
+        if real_benches(task):  # they are closed now: the next block opens them anew
+            opened.cache_clear()
     rows = _rows(task, setting, first, result, checks.checks())
     worst = max(rows, key=EXPERIMENT_TASK.badness)["episode"]
     kept = {0, worst} & {row["episode"] for row in rows}

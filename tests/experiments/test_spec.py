@@ -87,7 +87,7 @@ def test_what_varies_makes_a_grid(tmp_path):
 
 def test_hidden_effects_are_for_the_rig(tmp_path):
     case = '[[cases]]\nname = "a"\nhidden = ["creep"]\n'
-    with pytest.raises(InputError, match=r"cases\[0\]: hidden or specimen in simulation"):
+    with pytest.raises(InputError, match=r"cases\[0\]: hidden, specimen or rigs in simulation"):
         load_experiment(write(tmp_path, TINY + case))
     text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
     with pytest.raises(InputError, match="unknown hidden effect 'grep'"):

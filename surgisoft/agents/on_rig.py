@@ -18,6 +18,7 @@ measurement.
 from __future__ import annotations
 
 import copy
+import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -88,6 +89,11 @@ def named_rig(config: RigConfig, trial: int = 0) -> Rig:
         if getattr(config, name) != getattr(plain, name)
     }
     return open_rig(text, {"seed": config.seed, "noise_seed": trial}, **changed)
+
+
+def rigs_in(text: str) -> tuple[str, ...]:
+    """The rigs of one text, as in `RigConfig.rigs`: `NAME[:...]`, or `ARM=NAME[:...] ARM=...`."""
+    return tuple(part for part in re.split(r"\s+(?=\w+=)", text.strip()) if part)
 
 
 def rigs_by_arm(rigs: Sequence[str], arms: Sequence[str]) -> dict[str, str]:

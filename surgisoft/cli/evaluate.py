@@ -143,7 +143,7 @@ def evaluate(
 
 def _rig_config(
     on: str,
-    rigs: list[str] | None,
+    rigs: str | None,
     robot_seed: int | None,
     hidden: list[str] | None,
     cameras: bool,
@@ -160,14 +160,14 @@ def _rig_config(
                 "--robot-seed, --hidden, --no-cameras and --observer-gain need --on rig"
             )
         return None
-    from surgisoft.agents.on_rig import RigConfig
+    from surgisoft.agents.on_rig import RigConfig, rigs_in
     from surgisoft.rig.registry import hidden_effects
 
     found = RigConfig(
         seed=robot_seed or 0,
         hidden=tuple(hidden_effects(hidden)),
         cameras=cameras,
-        rigs=tuple(rigs) if rigs else RigConfig().rigs,
+        rigs=rigs_in(rigs) if rigs else RigConfig().rigs,
     )
     return found if observer_gain is None else replace(found, observer_gain=observer_gain)
 

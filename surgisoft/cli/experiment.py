@@ -50,12 +50,13 @@ def run(
     effect_files: EffectFiles = None,
 ) -> None:
     """Run an experiment; write tables, logs, pictures, replays and one HTML report."""
+    from surgisoft.agents.on_rig import rigs_in
     from surgisoft.experiments.page import markdown
     from surgisoft.experiments.session import finish_experiment, start_experiment
 
     check_folder(output)
     spec, folder = start_experiment(
-        file, output, policy or (), repeats, rig or (), resume=resume, force=force
+        file, output, policy or (), repeats, rigs_in(rig or ""), resume=resume, force=force
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"

@@ -131,13 +131,13 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
 
     from surgisoft.rig.registry import parse_rig, rig_options
 
-    words = shlex.split(result.options)
-    starts = [i for i, word in enumerate(words) if word.startswith("--")]
-    setup: dict[str, object] = {}
-    for first, last in zip(starts, [*starts[1:], len(words)], strict=True):
-        values = [float(word) for word in words[first + 1 : last]]
-        name = words[first].removeprefix("--").replace("-", "_")
-        setup[name] = tuple(values) if len(values) > 1 else values[0]
+    options: dict[str, list[float]] = {}
+    for word in shlex.split(result.options):
+        if word.startswith("--"):
+            values = options[word.removeprefix("--").replace("-", "_")] = []
+        else:
+            values.append(float(word))
+    setup = {name: tuple(x) if len(x) > 1 else x[0] for name, x in options.items()}
     known = rig_options(parse_rig(rig).name)
     lacking = [name for name in setup if name not in known or name in parse_rig(rig).options]
     if result.by_hand or lacking:

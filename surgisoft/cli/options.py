@@ -102,20 +102,18 @@ Replay = Annotated[
 ]
 Force = Annotated[bool, Option("--force", help="Replace the output of an earlier call.")]
 
-RIG_HELP = (
+_RIG = (
     "Rig: a name with its options (virtual, elastica, those of other packages; 'surgisoft rig "
     "list' shows them), or package.module:object."
 )
-Rig = Annotated[
-    str, Option("--rig", metavar="NAME[:option=value,...]", is_eager=True, help=RIG_HELP)
-]
+Rig = Annotated[str, Option("--rig", metavar="NAME[:option=value,...]", is_eager=True, help=_RIG)]
 RigsOfArms = Annotated[
-    list[str] | None,
+    str | None,
     Option(
         "--rig",
-        metavar="[ARM=]NAME[:option=value,...]",
-        help=RIG_HELP + " One for all arms of the task, or ARM=NAME for single arms (repeat the "
-        "option), the others then being virtual.",
+        metavar="NAME[:option=value,...]",
+        help=_RIG + " One for all arms of the task, or ARM=NAME for single arms ('laser=NAME "
+        "endoscope=NAME'), the others then being virtual.",
     ),
 ]
 

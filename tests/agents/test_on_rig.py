@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from surgisoft.agents.on_rig import RigConfig, at_benches, named_rig, on_rig, real_benches
+from surgisoft.agents.on_rig import RigConfig, at_benches, named_rig, on_rig, real_benches, rigs_in
 from surgisoft.agents.policies import Random, Scripted
 from surgisoft.agents.rollout import rollout
 from surgisoft.agents.session import evaluate
@@ -231,6 +231,10 @@ def test_rigs_that_do_not_fit_the_arms_are_one_line(rigs, message):
 
 
 def test_one_arm_is_on_a_real_bench_and_the_other_on_a_virtual_one():
-    moved = on_rig(CircleAblation(), RigConfig(rigs=(f"laser={REAL}",), settle_s=0.05))
+    texts = rigs_in(f"laser={REAL} endoscope=virtual:seed=2")
+    moved = on_rig(CircleAblation(), RigConfig(rigs=texts, settle_s=0.05))
     assert list(real_benches(moved)) == ["laser"]
-    assert isinstance(moved.world.arms["endoscope"].build(RigConfig(), 0), VirtualRig)
+    endoscope = moved.world.arms["endoscope"]
+    assert endoscope.config.rigs == ("virtual:seed=2",)
+    assert isinstance(endoscope.build(endoscope.config, 0), VirtualRig)
+    assert rigs_in("virtual") == ("virtual",)

@@ -43,6 +43,7 @@ NO_MODEL = {
     "collect": "makes a recording of the virtual rig",
     "import": "reads raw files",
     "recording": "reads recordings",
+    "rig list": "lists rigs and their options",
     "replay": "shows what was recorded",
     "scene new": "places the default arm",
     "experiment list": "reads experiment files",

@@ -28,6 +28,7 @@ COMMANDS = (
     "improve",
     "train",
     "evaluate",
+    "run",
     "scene",
     "experiment",
     "rig",

@@ -122,9 +122,7 @@ class Whitening:
         return np.concatenate([self.worth, np.ones_like(self.worth)])
 
 
-def block_means(
-    t_s: np.ndarray, residual_mm: np.ndarray, block_s: float
-) -> np.ndarray:
+def block_means(t_s: np.ndarray, residual_mm: np.ndarray, block_s: float) -> np.ndarray:
     """(J, 3 n) means of residuals (T, n, 3) over whole blocks of time [mm]; t_s: (T,) of one run.
 
     A key point that is missing throughout a block keeps its last mean.
@@ -296,9 +294,7 @@ def resampled(squares: Sequence[np.ndarray], design: AlarmDesign) -> np.ndarray:
     starts = np.array(
         [
             first
-            for begin, run in zip(
-                np.cumsum([0, *map(len, squares[:-1])]), squares, strict=True
-            )
+            for begin, run in zip(np.cumsum([0, *map(len, squares[:-1])]), squares, strict=True)
             for first in range(begin, begin + max(1, len(run) - stretch + 1))
         ]
     )

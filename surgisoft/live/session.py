@@ -7,12 +7,13 @@ import math
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from surgisoft.agents.session import task_config
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import json_safe
 from surgisoft.live.change import (
+    LEAST_BLOCKS,
     Alarm,
     AlarmDesign,
     Charts,
@@ -47,6 +49,9 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import TASKS, make_task, with_fields
 
+if TYPE_CHECKING:
+    from surgisoft.replay.live_view import LiveView
+
 SLOWEST_HZ, FASTEST_HZ = 10.0, 50.0
 """Range of the rate of the loop [Hz]."""
 USUAL_HZ = 20.0
@@ -58,8 +63,8 @@ REFERENCE_S = 120.0
 CHECK_S = 5.0
 """Time of a run after which the model is checked against the arm [s]."""
 ANOTHER_ARM = 0.05
-"""Error of the model over the arm's length at which the model is that of another arm: in CHECK_S the
-error of a model of this arm, with an effect that it lacks, is a fifth of that."""
+"""Error of the model over the arm's length at which it counts as the model of another arm
+[-]: 3.5 mm at 70 mm, where hidden effects of the virtual rig at strength 1 move the tip by 1 mm."""
 SUSPICIOUS = 2.0
 """Error in the reference over the model's validated error from which on it is warned of."""
 LEAD_IN_S = 60.0
@@ -81,8 +86,8 @@ class RunRequest:
     rig: str | Rig = "virtual"
     """Text `NAME[:option=value,...]` (`surgisoft.rig.registry`), or a rig that is open."""
     model: str | Path | ArmModel | None = None
-    """Arm model that predicts the samples, and that the policy uses: a folder, `default` or a model;
-    None: that of the training run, else `default`."""
+    """Arm model that predicts the samples and that the policy uses: a folder, `default`, or a
+    model (with schedules only); None: that of the training run, else `default`."""
     task: str | None = None
     """Name of the task; None: that of the training run."""
     config: Any = None
@@ -98,7 +103,7 @@ class RunRequest:
     begin of the run."""
     reference_s: float = REFERENCE_S
     """Time at the begin of the run that is the reference without `before` [s]."""
-    alarm: AlarmDesign = AlarmDesign()
+    alarm: AlarmDesign = field(default_factory=AlarmDesign)
     """What the change detector is set for."""
     stop_on_alarm: bool = False
     """Whether the run ends with the first alarm."""
@@ -116,15 +121,16 @@ class RunRequest:
     def __post_init__(self):
         rate = self.rate_hz
         if rate is not None and not SLOWEST_HZ <= rate <= FASTEST_HZ:
-            raise InputError(
-                f"rate is {rate:g} Hz, expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz"
-            )
+            raise InputError(f"rate is {rate:g} Hz, expected {SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
         if self.minutes is not None and not (0.0 < self.minutes < math.inf):
             raise InputError(f"minutes is {self.minutes:g}, expected more than 0")
         if self.clock not in ("real", "simulated"):
             raise unknown_name("clock", self.clock, ("real", "simulated"))
-        if not self.reference_s > 0.0:
-            raise InputError(f"reference is {self.reference_s:g} s, expected more than 0 s")
+        least = LEAST_BLOCKS * self.alarm.block_s + 2.0
+        if not least <= self.reference_s < math.inf:
+            raise InputError(
+                f"reference is {self.reference_s:g} s, expected at least {least:g} s of clean run"
+            )
 
     @property
     def scheduled(self) -> bool:
@@ -208,20 +214,8 @@ class RunResult:
         )
 
 
-class Viewer:
-    """Shows a run while it lasts; this one shows nothing."""
-
-    def begin(self, rig: Rig, title: str) -> None:
-        """The run begins on a rig."""
-
-    def sample(self, now: Instant, statistic: float) -> None:
-        """Show a sample, and the detector's largest chart over its threshold (NaN: none yet)."""
-
-    def event(self, t_s: float, text: str, serious: bool = False) -> None:
-        """Show what happened at a time [s]."""
-
-    def tracking(self, t_s: float, error_mm: float) -> None:
-        """Show the error of the policy's task [mm]."""
+def print_nothing(text: str) -> None:
+    """Take a line of text and print nothing."""
 
 
 def run(
@@ -230,9 +224,12 @@ def run(
     model: str | Path | ArmModel | None = None,
     *,
     before: Iterable[str | Path | Recording] | str | Path | Recording = (),
-    viewer: Viewer | None = None,
-    on_event: Callable[[str], None] = lambda text: None,
-    on_warning: Callable[[str], None] = lambda text: None,
+    show: bool = False,
+    web: bool = False,
+    replay: str | Path | None = None,
+    on_address: Callable[[str], None] = print_nothing,
+    on_event: Callable[[str], None] = print_nothing,
+    on_warning: Callable[[str], None] = warnings.warn,
     progress: Progress = silent,
     stopped: Callable[[], bool] = lambda: False,
     **fields: Any,
@@ -241,7 +238,9 @@ def run(
 
     policy: see `RunRequest.policy`; rig: text as for `--rig`, or an open rig; model: the arm model
     that predicts every sample. before: recordings of the unchanged arm as the detector's reference.
-    viewer: shows the run while it lasts. on_event, on_warning: called with one line of text.
+    show, web, replay: show the run while it lasts in the native viewer, serve it to a browser on
+    this machine (`on_address` is called with the address), write it to this .rrd file.
+    on_event, on_warning: called with one line of text.
     progress: called with seconds done and to do. stopped: asked once a sample whether to end.
     fields: other fields of `RunRequest`, such as `task="track_circle"`, `minutes=10`,
     `clock="simulated"` or `output="run.parquet"`.
@@ -254,8 +253,27 @@ def run(
     if fields.get("output") is not None:
         fields["output"] = Path(fields["output"])
     request = RunRequest(str(policy), rig, model, before=tuple(before), **fields)
-    session = _Session(request, viewer or Viewer(), on_event, on_warning, progress, stopped)
-    return session.run()
+    sinks = Sinks(show, web, None if replay is None else Path(replay), on_address)
+    return _Session(request, sinks, on_event, on_warning, progress, stopped).run()
+
+
+@dataclass(frozen=True)
+class Sinks:
+    """Where a run is shown while it lasts."""
+
+    show: bool
+    """In the native viewer."""
+    web: bool
+    """In a browser."""
+    replay: Path | None
+    """In an .rrd file."""
+    on_address: Callable[[str], None]
+    """Called with the address for the browser."""
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one."""
+        return self.show or self.web or self.replay is not None
 
 
 class _Session:
@@ -264,13 +282,14 @@ class _Session:
     def __init__(
         self,
         request: RunRequest,
-        viewer: Viewer,
+        sinks: Sinks,
         on_event: Callable[[str], None],
         on_warning: Callable[[str], None],
         progress: Progress,
         stopped: Callable[[], bool],
     ):
-        self.request, self.viewer = request, viewer
+        self.request, self.sinks = request, sinks
+        self.view: LiveView | None = None
         self.on_event, self.on_warning, self.progress = on_event, on_warning, progress
         self._asked, self._ended = stopped, threading.Event()
         self.interrupted = False
@@ -319,9 +338,13 @@ class _Session:
             self.watched.watchers.append(self._sample)
             self.watched.on_reset.append(self._reset)
             drive = self._drive(protocol, place)
-            self.viewer.begin(rig, f"{Path(request.policy).name} on {self._rig_name}")
             self._seconds_to_do = seconds
-            with _real_time(), self._signals(), ThreadPoolExecutor(1) as self._worker:
+            with (
+                self._shown(rig),
+                _real_time(),
+                self._signals(),
+                ThreadPoolExecutor(1) as self._worker,
+            ):
                 try:
                     drive()
                 except Finished:
@@ -335,6 +358,38 @@ class _Session:
                 self.watched.flush()
                 self._late_detector(wait=True)
         return self._result(log, clock)
+
+    @contextmanager
+    def _shown(self, rig: Rig) -> Iterator[None]:
+        """The view of the run, where one was asked for."""
+        if not self.sinks.any:
+            yield
+            return
+        from surgisoft.replay.live_view import LiveBench, live_view
+
+        name = Path(self.request.policy).name
+        length = rig.arm.length_mm or self.model.spec.length_mm
+        if length is None:
+            rest = np.asarray(self.model.rest_mm)
+            length = float(np.linalg.norm(rest[-1] - rest[0]))
+        title = f"{name} on {self._rig_name}"
+        bench = LiveBench(rig.chambers, rig.key_planes, rig.unit, length, title)
+        sinks = self.sinks
+        with live_view(
+            bench,
+            window=sinks.show,
+            web=sinks.web,
+            file=sinks.replay,
+            on_address=sinks.on_address,
+            stay=lambda: not self.interrupted,
+        ) as self.view:
+            yield
+
+    def _event(self, t_s: float, text: str, serious: bool = False) -> None:
+        """Report what happened at a time [s]."""
+        self.on_event(text)
+        if self.view is not None:
+            self.view.event(t_s, text, serious)
 
     @property
     def _name(self) -> str:
@@ -465,8 +520,9 @@ class _Session:
             return lambda: self._follow_schedule(protocol)
         assert place is not None
         request, watched = self.request, self.watched
-        gain = {} if request.observer_gain is None else {"observer_gain": request.observer_gain}
-        config = RigConfig(cameras=request.cameras, **gain)
+        config = RigConfig(cameras=request.cameras)
+        if request.observer_gain is not None:
+            config = replace(config, observer_gain=request.observer_gain)
         task = on_rig(place, config, lambda config, trial: watched)
         policy = open_policy(request.policy, task)
         return lambda: self._follow_policy(task, policy)
@@ -493,7 +549,8 @@ class _Session:
             state, outcome = episodes.step(state, actions)
             error = _tracking_error(outcome.measures)
             self.tracking.append((self.watched.elapsed_s, error))
-            self.viewer.tracking(self.watched.elapsed_s, error)
+            if self.view is not None:
+                self.view.tracking(self.watched.elapsed_s, error)
             if bool(outcome.done):
                 state = _next_goal(task, state)
 
@@ -515,7 +572,16 @@ class _Session:
         elif not self.request.before and now.t_s >= self.request.reference_s:
             self._late_detector(wait=self.watched.clock.pace == "simulated")
         self.statistic.append(statistic)
-        self.viewer.sample(now, statistic)
+        if self.view is not None:
+            sample = now.sample
+            self.view.sample(
+                now.t_s,
+                sample.key_points_mm,
+                now.predicted_mm,
+                sample.measured,
+                sample.commanded,
+                statistic,
+            )
         if now.t_s - self._shown_s >= 1.0:
             self._shown_s = now.t_s
             note = "" if math.isnan(statistic) else f"alarm level {statistic:.2f}"
@@ -526,8 +592,7 @@ class _Session:
         assert self.charts is not None
         alarm = self.charts.update(now.t_s, now.residual_mm)
         if alarm is not None:
-            self.on_event(alarm.sentence)
-            self.viewer.event(alarm.at_s, alarm.sentence, serious=True)
+            self._event(alarm.at_s, alarm.sentence, serious=True)
             if self.request.stop_on_alarm:
                 self._ended.set()
         return self.charts.statistic
@@ -589,7 +654,7 @@ class _Session:
             with torch.inference_mode():
                 predicted = history.rows(self.model.predict(history)).double().numpy()
             residual = recording.key_points_mm - predicted
-            runs += residual_runs(recording.t_s, recording.run, residual)
+            runs += [(recording.t_s[part], residual[part]) for part in recording.runs]
         detector = fit_detector(runs, self.request.alarm)
         self._tell_reference(detector)
         return detector
@@ -601,8 +666,7 @@ class _Session:
             f"{detector.enlargement:.2f}, for one false alarm in "
             f"{detector.design.false_alarm_h:g} h"
         )
-        self.on_event(text)
-        self.viewer.event(0.0 if not self._early else self._early[-1].t_s, text)
+        self._event(self._early[-1].t_s if self._early else 0.0, text)
         rmse = self.model.validation.rmse_mm
         if rmse is not None and detector.reference_mm > SUSPICIOUS * rmse:
             self.on_warning(

@@ -120,8 +120,8 @@ def _elastica() -> ModuleType:
 
 
 HiddenEffect = tuple[str, float] | tuple[str, float, float]
-"""Name and amplitude of a hidden effect, and the time after the first reset at which it begins, [s],
-where it is not there from the start."""
+"""Name and amplitude of a hidden effect and, where it is not there from the start, the time after
+the first reset at which it begins [s]."""
 
 
 def hidden_effects(given: Iterable[str | HiddenEffect] | None) -> list[HiddenEffect]:

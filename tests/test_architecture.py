@@ -71,7 +71,7 @@ FLOORS = {
         ("frames",),
         ("mesh", "capsules", "camera"),
         ("meshio", "bvh", "rays", "plate"),
-        ("field", "inside", "render"),
+        ("field", "inside", "render", "segmentation"),
         ("distance", "torch_queries"),
         ("batched", "collision"),
         ("reach", "spec"),

@@ -30,8 +30,9 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.rig import Rig
-from surgisoft.rig.interface import close, is_simulated
+from surgisoft.rig.interface import is_simulated
 from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
+from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import Arm, ArmPart, ModelArm
@@ -164,7 +165,9 @@ class RigArm:
         """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
         self.config, self.build = config, build
         rig = build(config, 0)
-        self.real: Rig | None = None if is_simulated(rig) else rig
+        self.real: SafeRig | None = None
+        if not is_simulated(rig):
+            self.real = rig = rig if isinstance(rig, SafeRig) else SafeRig(rig)
         try:
             self._check(rig, arm, dt_s)
         except InputError:
@@ -201,7 +204,7 @@ class RigArm:
     def close(self) -> None:
         """Vent the real bench, where there is one, and give its devices back."""
         if self.real is not None:
-            close(self.real)
+            self.real.close()
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Rigs at rest that then went through random pressures, at the start of an episode."""
@@ -346,7 +349,7 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_
     return moved
 
 
-def real_benches(task: Task) -> dict[str, Rig]:
+def real_benches(task: Task) -> dict[str, SafeRig]:
     """Arm -> its real bench, for every arm of a task that is on one."""
     return {
         name: arm.real
@@ -360,6 +363,6 @@ def at_benches(task: Task) -> Iterator[None]:
     """Inside it the task's real benches are driven; at its end they are vented and given back."""
     with ExitStack() as opened:
         for arm in task.world.arms.values():
-            if isinstance(arm, RigArm):
-                opened.callback(arm.close)
+            if isinstance(arm, RigArm) and arm.real is not None:
+                opened.enter_context(arm.real)
         yield

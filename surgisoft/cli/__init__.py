@@ -130,6 +130,9 @@ def run(arguments: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         print("surgisoft: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except SystemExit as ended:  # such as `surgisoft.rig.safety.Terminated`
+        print(f"surgisoft: {ended}", file=sys.stderr)
+        return ended.code if isinstance(ended.code, int) else 1
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

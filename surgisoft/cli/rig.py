@@ -18,11 +18,27 @@ def list_(
     ] = None,
 ) -> None:
     """List the rigs and the options of each: NAME:option=value,..."""
-    from surgisoft.rig.registry import REQUIRED, describe_kind, rig_about, rig_names, rig_options
+    from surgisoft.rig.registry import (
+        SIMULATED,
+        rig_about,
+        rig_names,
+        rig_options,
+        safety_options,
+    )
 
-    for each in [name] if name else rig_names():
+    names = [name] if name else rig_names()
+    for each in names:
         print(f"{each}: {rig_about(each)}")
-        for option in rig_options(each).values():
-            default = "required" if option.default is REQUIRED else f"default {option.shown}"
-            about = f"{option.about}; " if option.about else ""
-            print(f"  {option.name:14s}{about}{describe_kind(option.kind)}, {default}")
+        _show(rig_options(each).values())
+    if set(names) - set(SIMULATED):
+        print("every rig that is not simulated also has the limits of the safety wrapper:")
+        _show(safety_options().values())
+
+
+def _show(options) -> None:
+    from surgisoft.rig.registry import REQUIRED, describe_kind
+
+    for option in options:
+        default = "required" if option.default is REQUIRED else f"default {option.shown}"
+        about = f"{option.about}; " if option.about else ""
+        print(f"  {option.name:14s}{about}{describe_kind(option.kind)}, {default}")

@@ -23,8 +23,9 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.rig.hidden import HIDDEN
-from surgisoft.rig.interface import Rig
+from surgisoft.rig.interface import Rig, is_simulated
 from surgisoft.rig.motion_capture import CameraDesign
+from surgisoft.rig.safety import SafeRig, Safety
 from surgisoft.rig.virtual import MOUNT, VirtualRig
 
 GROUP = "surgisoft.rigs"
@@ -258,13 +259,20 @@ def rig_about(name: str) -> str:
 def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any) -> Rig:
     """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names.
 
+    A real rig comes inside `SafeRig`, whose limits (`Safety`) are options of every real rig. Use it
+    in a block `with guarded(rig)` (`surgisoft.rig.safety`), which vents it at the end.
     fields: options that are given apart from the text, such as `payload_g=2.0`. defaults: options
     that count where the rig has them and nothing else gives them. Raises InputError for an unknown
     option, a value of another type, and what the rig itself refuses.
     """
     asked = parse_rig(text)
     factory = rig_factory(asked.name)
-    known = _options(asked.name, factory)
+    own = _options(asked.name, factory)
+    known = (
+        own
+        if asked.name in SIMULATED
+        else own | {name: option for name, option in safety_options().items() if name not in own}
+    )
     unknown = [name for name in (*asked.options, *fields) if name not in known]
     if unknown:
         has = ", ".join(known) or "none"
@@ -289,7 +297,28 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
             f"rig '{asked.name}': option '{missing[0]}' is missing; "
             f"expected {asked.name}:{','.join(f'{name}=...' for name in missing)}"
         )
-    return factory(**values)
+    limits = {option: values.pop(option) for option in list(values) if option not in own}
+    rig = factory(**values)
+    if not is_simulated(rig):
+        return SafeRig(rig, _safety(asked.name, limits))
+    if limits:
+        raise InputError(
+            f"rig '{asked.name}': option '{next(iter(limits))}' is a safety limit of real rigs, "
+            "and this one is simulated"
+        )
+    return rig
+
+
+def _safety(name: str, limits: dict[str, Any]) -> Safety:
+    try:
+        return Safety(**limits)
+    except InputError as error:
+        raise InputError(f"rig '{name}': {error}") from None
+
+
+def safety_options() -> dict[str, RigOption]:
+    """The options of the safety wrapper, which every real rig has beside its own."""
+    return _options("safety", Safety)
 
 
 def _offered() -> dict[str, EntryPoint]:
@@ -325,7 +354,7 @@ def _checked_factory(name: str, found: Any) -> Callable[..., Rig]:
     return found
 
 
-def _options(name: str, factory: Callable[..., Rig]) -> dict[str, RigOption]:
+def _options(name: str, factory: Callable[..., Any]) -> dict[str, RigOption]:
     target = factory.__init__ if inspect.isclass(factory) else factory
     try:
         hints = get_type_hints(target, include_extras=True)

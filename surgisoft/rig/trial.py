@@ -12,6 +12,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
 from surgisoft.rig.interface import Rig
 from surgisoft.rig.registry import open_rig, parse_rig, rig_options
+from surgisoft.rig.safety import guarded
 
 TRIAL_STEP = 1_000_003
 """Distance between the schedule seeds of two trials on one robot, larger than any robot seed."""
@@ -80,4 +81,5 @@ def collect(
     # A simulated rig records in compiled code; each sample is equal to that of `read`.
     if isinstance(rig, str | None) and hasattr(bench, "record"):
         return bench.record(protocol, progress)[0]
-    return collect_samples(bench, protocol, progress)
+    with guarded(bench) as driven:
+        return collect_samples(driven, protocol, progress)

@@ -189,7 +189,7 @@ def test_a_real_bench_runs_one_episode_after_the_other_and_is_scored_by_measurem
         sample = bench.read()
     measured = torch.tensor(sample.key_points_mm, dtype=torch.float32)
     assert (state.world.arms["arm"].points_mm[0] - measured).norm(dim=1).max() < 1.5
-    assert (bench.vents, bench.closes) == (1, 1), "left vented and given back"
+    assert (bench.rig.vents, bench.rig.closes) == (1, 1), "left vented and given back"
     found = evaluate("random", "track_circle", episodes=2, rig=config, config=short)
     assert found.measured_arms == ("arm",)
     assert found.to_json()["measured_arms"] == ["arm"]

@@ -10,7 +10,7 @@ import surgisoft
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recording
-from surgisoft.rig import VirtualRig, open_rig
+from surgisoft.rig import SafeRig, VirtualRig, open_rig
 from surgisoft.rig.interface import close, is_simulated, vent
 from surgisoft.rig.registry import RIGS, parse_rig, rig_names, rig_options
 from tests.rig.own_rig import OwnRig
@@ -27,7 +27,8 @@ def test_options_reach_the_rig_with_their_types():
 
 def test_an_object_of_a_users_module_is_opened_with_its_parameters():
     rig = open_rig(f"{OWN}:port=/dev/ttyUSB0,rate_hz=10")
-    assert (rig.port, rig.period_s) == ("/dev/ttyUSB0", 0.1)
+    assert isinstance(rig, SafeRig), "nothing real is driven without it"
+    assert (rig.rig.port, rig.period_s) == ("/dev/ttyUSB0", 0.1)
     assert not is_simulated(rig)
     assert is_simulated(open_rig("virtual"))
 
@@ -53,7 +54,7 @@ def test_a_rig_of_another_package(tmp_path, monkeypatch):
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     assert rig_names()[-3:] == ["lab", "absent", "number"]
-    assert open_rig("lab:port=COM3").port == "COM3"
+    assert open_rig("lab:port=COM3").rig.port == "COM3"
     with pytest.raises(InputError, match=r"rig 'absent'.*does not load.*No module named"):
         open_rig("absent")
     with pytest.raises(InputError, match="rig 'number': is a int; expected a class or a function"):
@@ -79,6 +80,10 @@ def test_a_rig_of_another_package(tmp_path, monkeypatch):
         (f"{OWN}", "option 'port' is missing; expected tests.rig.own_rig:OwnRig:port=..."),
         ("tests.rig.own_rig:Nothing", "'tests.rig.own_rig' has no 'Nothing'"),
         ("no_such_module:Rig", "module 'no_such_module' does not load"),
+        (f"{OWN}:port=x,rate=-1", "rate is -1.0, expected 0 or a number above 0"),
+        (f"{OWN}:port=x,highest=-2", "leave nothing of the rig's limits 0 to 40 kPa"),
+        (f"{OWN}:port=x,hold_ms=9e9", "expected 0 < hold_ms <= vent_ms"),
+        ("virtual:highest=20", "unknown option 'highest'"),
         ("/dev/ttyACM0", r"expected NAME\[:option=value"),
     ],
 )

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli import app
 from surgisoft.cli.files import check_free, check_replay
 from surgisoft.cli.inputs import check_model, warn
 from surgisoft.cli.options import (
@@ -168,8 +168,8 @@ def run(
         name = model or "default"
         past = f" --before {' '.join(map(str, before))}" if before else ""
         print(f"next: surgisoft diagnose {name} {found.written[-1]}{past}")
-    if found.interrupted:
-        raise typer.Exit(INTERRUPTED)
+    if found.ended_by is not None:
+        raise found.ended_by
 
 
 def _show(found) -> None:

@@ -63,7 +63,8 @@ class RunLog:
 
     def recording(self, name: str) -> Recording:
         """The samples so far as a recording."""
-        samples, rig = self.samples, self.rig
+        rig, count = self.rig, min(len(self.samples), len(self.runs))
+        samples = self.samples[:count]
         room = [sample.temp_C for sample in samples]
         payload = rig.payload_g
         return Recording(
@@ -72,7 +73,7 @@ class RunLog:
             measured=np.array([sample.measured for sample in samples]),
             key_points_mm=np.array([sample.key_points_mm for sample in samples]),
             commanded=np.array([sample.commanded for sample in samples]),
-            run=np.array(self.runs, np.int64),
+            run=np.array(self.runs[:count], np.int64),
             unit=rig.unit,
             temp_C=None if None in room else np.array(room, np.float64),
             payload_g=None if payload is None else np.full(len(samples), payload),

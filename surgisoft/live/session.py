@@ -44,6 +44,7 @@ from surgisoft.rig.collect import check_fits as check_protocol
 from surgisoft.rig.collect import runs_of
 from surgisoft.rig.interface import Rig, close, is_simulated
 from surgisoft.rig.registry import open_rig, parse_rig
+from surgisoft.rig.safety import SafeRig, Terminated
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.base import Episodes, Task, TaskState
@@ -161,6 +162,8 @@ class RunResult:
     measures none. Empty for schedules."""
     interrupted: bool
     """Whether it was asked to stop before its time was over."""
+    ended_by: BaseException | None
+    """Ctrl-C or the signal that ended it; a program raises it after it has reported."""
     written: tuple[Path, ...]
     """Files that were written."""
 
@@ -293,6 +296,7 @@ class _Session:
         self.on_event, self.on_warning, self.progress = on_event, on_warning, progress
         self._asked, self._ended = stopped, threading.Event()
         self.interrupted = False
+        self.ended_by: BaseException | None = None
         self.predicted: list[np.ndarray] = []
         self.statistic: list[float] = []
         self.tracking: list[tuple[float, float]] = []
@@ -313,8 +317,8 @@ class _Session:
         before = load_recordings(request.before, self.on_warning) if request.before else []
         check_fits(self.model.spec, before)
         rig = self._open_rig(rate_hz)
-        with ExitStack() as stack:
-            opened = stack.enter_context(_closing(rig))
+        with ExitStack() as opened:
+            opened.callback(close, rig)
             self._check_rig(rig, rate_hz)
             protocol = self._protocol(rig)
             place = self._place(task, config, rate_hz)
@@ -331,33 +335,51 @@ class _Session:
             note = f"run {Path(request.policy).name}"
             log = RunLog(rig, request.output, request.force, note)
             opened.callback(log.close)
-            kind = WatchedSimulation if is_simulated(rig) else WatchedRig
             seconds = self._seconds(protocol)
-            companion = Companion(self.model)
-            self.watched = kind(rig, companion, clock, log, seconds, self._stopped)
-            self.watched.watchers.append(self._sample)
-            self.watched.on_reset.append(self._reset)
-            drive = self._drive(protocol, place)
+            bench = self._watch(rig, Companion(self.model), clock, log, seconds)
+            drive = self._drive(bench, protocol, place)
             self._seconds_to_do = seconds
+            opened.pop_all()
             with (
                 self._shown(rig),
                 _real_time(),
-                self._signals(),
+                self._guarded(bench),
                 ThreadPoolExecutor(1) as self._worker,
             ):
                 try:
                     drive()
                 except Finished:
                     pass
+                except (KeyboardInterrupt, Terminated) as ended:
+                    self.interrupted, self.ended_by = True, ended
                 except InputError:
-                    if len(log.samples) < 2:
-                        log.discard()
-                    else:
-                        log.finish(self._name)
+                    self._keep(log)
                     raise
                 self.watched.flush()
                 self._late_detector(wait=True)
-        return self._result(log, clock)
+            return self._result(log, clock)
+
+    def _watch(
+        self, rig: Rig, companion: Companion, clock: Clock, log: RunLog, seconds: float | None
+    ) -> Rig:
+        """The rig that the loop drives: watched, and a real one inside its safety limits."""
+        safe = rig if isinstance(rig, SafeRig) else None
+        kind = WatchedSimulation if is_simulated(rig) else WatchedRig
+        inner = safe.rig if safe else rig
+        self.watched = kind(inner, companion, clock, log, seconds, self._stopped)
+        self.watched.watchers.append(self._sample)
+        self.watched.on_reset.append(self._reset)
+        if is_simulated(rig):
+            return self.watched
+        return SafeRig(self.watched, safe.safety if safe else None, safe.show if safe else None)
+
+    def _keep(self, log: RunLog) -> None:
+        """Write what was recorded before an error, where there is something."""
+        if len(log.samples) > 1:
+            log.finish(self._name)
+            self.on_warning(f"the {len(log.samples)} samples until then were written: {log.path}")
+        else:
+            log.discard()
 
     @contextmanager
     def _shown(self, rig: Rig) -> Iterator[None]:
@@ -514,29 +536,30 @@ class _Session:
 
     # The loop ----------------------------------------------------------------------------------
 
-    def _drive(self, protocol: Protocol | None, place: Task | None) -> Callable[[], None]:
-        """The loop that drives the watched rig."""
+    def _drive(
+        self, bench: Rig, protocol: Protocol | None, place: Task | None
+    ) -> Callable[[], None]:
+        """The loop that drives a watched rig."""
         if protocol is not None:
-            return lambda: self._follow_schedule(protocol)
+            return lambda: self._follow_schedule(bench, protocol)
         assert place is not None
-        request, watched = self.request, self.watched
+        request = self.request
         config = RigConfig(cameras=request.cameras)
         if request.observer_gain is not None:
             config = replace(config, observer_gain=request.observer_gain)
-        task = on_rig(place, config, lambda config, trial: watched)
+        task = on_rig(place, config, lambda config, trial: bench)
         policy = open_policy(request.policy, task)
         return lambda: self._follow_policy(task, policy)
 
-    def _follow_schedule(self, protocol: Protocol) -> None:
+    def _follow_schedule(self, bench: Rig, protocol: Protocol) -> None:
         """The commands of a schedule, again and again where the run is longer."""
-        watched = self.watched
         while True:
-            for _, commands in runs_of(protocol, watched.period_s):
-                watched.reset()
+            for _, commands in runs_of(protocol, bench.period_s):
+                bench.reset()
                 for row in commands:
-                    watched.command(row)
-                    watched.read()
-            if watched.seconds is None:
+                    bench.command(row)
+                    bench.read()
+            if self.watched.seconds is None:
                 return
 
     @torch.inference_mode()
@@ -684,8 +707,24 @@ class _Session:
         return self._ended.is_set()
 
     @contextmanager
+    def _guarded(self, bench: Rig) -> Iterator[None]:
+        """Vent and close the rig at the end, and let Ctrl-C and SIGTERM end the run.
+
+        On a simulated rig the run ends after the present sample, or at once with a second signal;
+        a real one is stopped by its safety wrapper.
+        """
+        if isinstance(bench, SafeRig):
+            with bench:
+                yield
+            return
+        with ExitStack() as stack:
+            stack.callback(close, bench)
+            stack.enter_context(self._signals())
+            yield
+
+    @contextmanager
     def _signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM end the run after the present sample; a second one at once."""
+        """Let a signal end the run after the present sample, a second one at once."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -694,6 +733,7 @@ class _Session:
             if self._ended.is_set():
                 raise KeyboardInterrupt
             self.interrupted = True
+            self.ended_by = KeyboardInterrupt() if number == signal.SIGINT else Terminated(number)
             self._ended.set()
 
         kept = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -705,7 +745,7 @@ class _Session:
 
     def _result(self, log: RunLog, clock: Clock) -> RunResult:
         """Write the recording and what belongs to it."""
-        recording = log.finish(self._name)
+        recording = log.finish(self._name) if log.samples else None
         if recording is None:
             raise InputError("the run ended before its first sample; nothing was recorded")
         charts = self.charts
@@ -721,13 +761,14 @@ class _Session:
         return RunResult(
             self.request,
             recording,
-            np.array(self.predicted),
-            np.array(self.statistic),
+            np.array(self.predicted)[: recording.samples],
+            np.array(self.statistic)[: recording.samples],
             None if charts is None else charts.detector,
             alarms,
             clock.timing(),
             np.array(self.tracking).reshape(-1, 2),
             self.interrupted,
+            self.ended_by,
             tuple(written),
         )
 
@@ -779,14 +820,6 @@ def _next_goal(task: Task, state: TaskState) -> TaskState:
     stream, goal = task.goal(state.world.stream)
     steps = torch.zeros_like(state.world.steps)
     return TaskState(replace(state.world, stream=stream, steps=steps), goal)
-
-
-@contextmanager
-def _closing(rig: Rig) -> Iterator[ExitStack]:
-    """Vent and close a rig at the end, whatever ends the block; yields a stack of further calls."""
-    with ExitStack() as stack:
-        stack.callback(close, rig)
-        yield stack
 
 
 @contextmanager

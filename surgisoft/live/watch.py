@@ -14,7 +14,7 @@ import torch
 
 from surgisoft.live.clock import Clock
 from surgisoft.live.log import RunLog
-from surgisoft.rig.interface import Rig, Sample, Truth, close, is_simulated, vent
+from surgisoft.rig.interface import Rig, Sample, Truth, is_simulated
 from surgisoft.surrogate.model import ArmModel
 
 
@@ -85,6 +85,10 @@ class WatchedRig:
         self.chambers, self.key_planes, self.unit = rig.chambers, rig.key_planes, rig.unit
         self.limits, self.period_s, self.arm = rig.limits, rig.period_s, rig.arm
         self.payload_g = rig.payload_g
+        for name in ("vent", "close"):  # offered where the rig offers them, see `Rig`
+            own = getattr(rig, name, None)
+            if callable(own):
+                setattr(self, name, own)
         self.watchers: list[Callable[[Instant], None]] = []
         self.on_reset: list[Callable[[], None]] = []
         self.elapsed_s = 0.0
@@ -120,14 +124,6 @@ class WatchedRig:
         """Wait for one period, then return what sensors and cameras measure."""
         self._before()
         return self._after(self.rig.read())
-
-    def vent(self) -> None:
-        """Let the air out of every chamber at once."""
-        vent(self.rig)
-
-    def close(self) -> None:
-        """Vent the rig and give its devices back."""
-        close(self.rig)
 
     def _before(self) -> None:
         self.flush()

@@ -163,8 +163,8 @@ def _curve(points_mm: np.ndarray) -> np.ndarray:
 def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
     """The layout: bodies, events and colours beside plots, of the last minute with `follow`."""
     length = bench.length_mm
-    middle = np.array([0.0, 0.0, 0.55 * length])
-    eye = middle + 1.9 * length * np.array([0.3, -0.85, 0.35])
+    middle = np.array([0.0, 0.0, 0.5 * length])
+    eye = middle + 1.45 * length * np.array([0.3, -0.85, 0.35])
     scene = rrb.Spatial3DView(
         origin="/",
         contents=["+ /body/**"],

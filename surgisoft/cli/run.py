@@ -105,6 +105,10 @@ def run(
             "adopts per step. Default 0.3.",
         ),
     ] = None,
+    any_model: Annotated[
+        bool,
+        typer.Option("--any-model", help="Go on although the model seems to be of another arm."),
+    ] = False,
     seed: Annotated[
         int, typer.Option(min=0, max=SEED_MAX, help="Seed of the goals and of random schedules.")
     ] = 0,
@@ -153,6 +157,7 @@ def run(
             stop_on_alarm=stop_on_alarm,
             cameras=cameras,
             observer_gain=observer_gain,
+            any_model=any_model,
             seed=seed,
             config=config,
             output=output,

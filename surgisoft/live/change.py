@@ -53,6 +53,10 @@ CONFIDENCE = 0.95
 """Level of the upper confidence bound of a variance (Chew 1966)."""
 ENLARGE = 1.1
 """Factor between two tried enlargements of the scale."""
+HIGHEST = 1.25
+"""Charts are held at this share of the threshold, so that they come back after a change is gone."""
+OVER = 0.25
+"""Share of the threshold below which a standing alarm is over."""
 LARGEST_SCALE = 10.0
 """Largest enlargement of the scale; a reference that needs more shows no stable error."""
 
@@ -213,12 +217,12 @@ def increments(
 ) -> np.ndarray:
     """Log-likelihood ratios of squares (..., K), times the weights (K,) of the charts.
 
-    None is above a third of `limit`, so that no single block, such as a marker's glitch, which
+    None is above a quarter of `limit`, so that no single block, such as a marker's glitch, which
     counts on its way out and on its way back, raises an alarm.
     """
     gain = 0.5 * (1.0 - design.scale**-2)
     ratio = weights * (gain * squares - np.log(design.scale))
-    return np.minimum(ratio, limit / 3.0)
+    return np.minimum(ratio, limit / 4.0)
 
 
 def fit_detector(
@@ -401,13 +405,12 @@ class Charts:
             self._charts = np.zeros_like(steps)
             self._zero_s = np.full_like(steps, t_s - detector.design.block_s)
         h = detector.threshold
-        # Held at twice the threshold, so that a chart comes back soon after a change has gone.
-        self._charts = np.clip(self._charts + steps, 0.0, 2.0 * h)
+        self._charts = np.clip(self._charts + steps, 0.0, HIGHEST * h)
         self._zero_s[self._charts == 0.0] = t_s
         self.statistic = float(self._charts.max() / h)
         if self.alarm is None and self.statistic > 1.0:
             return self._raise(t_s)
-        if self.alarm is not None and self.statistic == 0.0:
+        if self.alarm is not None and self.statistic < OVER:
             self.alarm = None
         if self.alarm is None:
             self._recent = self._recent[-round(120.0 / detector.design.block_s) :]

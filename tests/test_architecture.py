@@ -81,7 +81,7 @@ FLOORS = {
         ("author",),
     ),
     "replay": (
-        ("colours", "shapes", "surfaces"),
+        ("colours", "contents", "shapes", "surfaces"),
         ("plots",),
         ("recording",),
         ("arms", "endoscope"),

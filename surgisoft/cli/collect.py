@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import SEED_MAX, Force, Hidden, Rig
+from surgisoft.cli.inputs import check_model, warn
+from surgisoft.cli.options import SEED_MAX, Force, Hidden
+from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
 if TYPE_CHECKING:
     from surgisoft.measurement.recordings import Recording
+    from surgisoft.rig import Rig
+
+STOP_NOTE = "space bar, Esc or Ctrl-C: emergency stop; the rig is vented at the end"
+"""What a command says before it drives a real rig."""
 
 
 def _list_hidden(context: typer.Context, value: bool) -> None:
@@ -47,7 +53,7 @@ def collect(
         Path,
         typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
     ],
-    rig: Rig = "virtual",
+    rig: RigOption = "virtual",
     seed: Annotated[
         int | None,
         typer.Option(
@@ -99,6 +105,20 @@ def collect(
         float | None,
         typer.Option(help="Factor on all sensor and camera noise of a simulated rig."),
     ] = None,
+    preflight: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL",
+            help="On a real rig: first try each chamber alone, a little, and go on only if the arm "
+            "moves as this model of it predicts ('surgisoft rig check').",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="On a real rig: show what would be sent, send and write nothing."
+        ),
+    ] = False,
     force: Force = False,
     list_hidden: Annotated[
         bool,
@@ -128,19 +148,79 @@ def collect(
         "noise": noise_scale,
     }
     given = {name: value for name, value in mount.items() if value is not None}
+    fields: dict[str, Any] = {"seed": seed, "trial": trial, "points": points, **given}
+    if dry_run:
+        from surgisoft.rig.trial import dry_run as show_commands
+
+        show_commands(protocol, rig, print, **fields)
+        return
     recording = record_on(
-        protocol, rig, given, seed=seed, trial=trial, points=points, hidden=effects
+        protocol, rig, output, force, preflight=preflight, hidden=effects, **fields
     )
     save_recording(recording, output, force)
+    log_of(output).unlink(missing_ok=True)
     print(written_line(output, recording, effects))
 
 
-def record_on(protocol: str | Path, rig: str, setup: dict[str, Any], **fields: Any) -> Recording:
-    """Record a protocol on a rig with a progress bar; fields: as for `surgisoft.collect`."""
+def log_of(output: Path) -> Path:
+    """The log beside a recording, to which samples of a real rig are appended."""
+    return output.with_name(f"{output.stem}.log.jsonl")
+
+
+def record_on(
+    protocol: str | Path,
+    rig: str,
+    output: Path,
+    force: bool = False,
+    preflight: Path | None = None,
+    **fields: Any,
+) -> Recording:
+    """Record a protocol on a rig with a progress bar; fields: as for `surgisoft.collect`.
+
+    What a real rig measures goes to the log beside `output` at once, and stays there where the run
+    is interrupted. preflight: an arm model whose motions a real rig has to show first.
+    """
+    from surgisoft.rig.registry import SIMULATED, parse_rig
     from surgisoft.rig.trial import collect as collect_recording
 
-    with progress(f"collect {protocol}") as report:
-        return collect_recording(protocol, rig, progress=report, **fields, **setup)
+    simulated = parse_rig(rig).name in SIMULATED
+    if preflight and simulated:
+        raise InputError("--preflight is for real rigs, and this one is simulated")
+    log = log_of(output)
+    there = log.exists()
+    check = checked_by(preflight) if preflight else None
+    if not simulated:
+        warn(STOP_NOTE)
+    try:
+        with progress(f"collect {protocol}") as report:
+            return collect_recording(
+                protocol,
+                rig,
+                progress=report,
+                log=None if simulated else log,
+                force=force,
+                before=check,
+                **fields,
+            )
+    except BaseException:
+        if log.exists() and (force or not there):
+            warn(f"what was measured so far is in {log}, which every command opens as a recording")
+        raise
+
+
+def checked_by(model: Path) -> Callable[[Rig], None]:
+    """The pre-flight check of a rig against a model; it raises InputError where it fails."""
+    check_model(model)
+    from surgisoft.rig.preflight import preflight
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.reach import steady_key_points
+
+    arm = load_model(model)
+
+    def check(rig: Rig) -> None:
+        preflight(rig, lambda pressures: steady_key_points(arm, pressures)).require()
+
+    return check
 
 
 def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = ()) -> str:

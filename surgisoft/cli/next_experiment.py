@@ -1,12 +1,12 @@
 """`surgisoft next-experiment`: the schedule that best distinguishes competing effects."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.collect import check_new_recording, record_on, written_line
+from surgisoft.cli.collect import check_new_recording, log_of, record_on, written_line
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
@@ -137,7 +137,7 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
             values = options[word.removeprefix("--").replace("-", "_")] = []
         else:
             values.append(float(word))
-    setup = {name: tuple(x) if len(x) > 1 else x[0] for name, x in options.items()}
+    setup: dict[str, Any] = {name: tuple(x) if len(x) > 1 else x[0] for name, x in options.items()}
     known = rig_options(parse_rig(rig).name)
     lacking = [name for name in setup if name not in known or name in parse_rig(rig).options]
     if result.by_hand or lacking:
@@ -146,8 +146,9 @@ def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None
             f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands asks for no "
             "change of the experimental setup)"
         )
-    recording = record_on(schedule, rig, setup)
+    recording = record_on(schedule, rig, record, force, **setup)
     from surgisoft.measurement.recordings import save_recording
 
     save_recording(recording, record, force)
+    log_of(record).unlink(missing_ok=True)
     print(written_line(record, recording))

@@ -56,9 +56,9 @@ def new(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="LABEL:ROLE[:NAME]",
+            metavar="LABEL:ROLE[:NAME]...",
             help="A label of the segmented image, by value or name, and its role: organ, lesion, "
-            "keep-out, support. Can be repeated; without it the labels are listed.",
+            "keep-out, support. Without it the labels are listed.",
         ),
     ] = None,
     lesion: Annotated[
@@ -89,11 +89,11 @@ def new(
         typer.Option(metavar="MM", help="Least distance between an arm and anything else, mm."),
     ] = 1.0,
     arm: Annotated[
-        list[str] | None,
+        str | None,
         typer.Option(
-            metavar="[TOOL=]MODEL",
-            help="Arm model of both mounts, or of one: laser=MODEL, endoscope=MODEL. MODEL is "
-            "'default' or a fitted model's folder.",
+            metavar="MODEL",
+            help="Arm model of both mounts ('default' or a fitted model's folder), or of single "
+            "ones: laser=MODEL,endoscope=MODEL.",
         ),
     ] = None,
     effect_files: EffectFiles = None,
@@ -122,7 +122,7 @@ def new(
 
     from surgisoft.tasks.world.reach import blank_mounts, reach_of
 
-    mounts = blank_mounts(_arms(arm or []))
+    mounts = blank_mounts(_arms(arm))
     reaches = {tool: reach_of(mount) for tool, mount in mounts.items()}
     try:
         try:
@@ -220,20 +220,21 @@ def _check_meshes(meshes: list[str]) -> None:
             raise InputError(f"{path or text}: there is no such file; expected a mesh")
 
 
-def _arms(given: list[str]) -> dict[str, str]:
+def _arms(given: str | None) -> dict[str, str]:
     """The arm model of each tool; raises InputError for an unknown tool or one given twice."""
     from surgisoft.errors import unknown_name
     from surgisoft.scene.spec import TOOLS
 
+    if given is None or "=" not in given:
+        return {} if given is None else dict.fromkeys(TOOLS, given)
     models: dict[str, str] = {}
-    for text in given:
-        tool, equals, model = text.partition("=")
-        if equals and tool not in TOOLS:
+    for text in given.split(","):
+        tool, _, model = text.partition("=")
+        if tool not in TOOLS:
             raise unknown_name("tool", tool, TOOLS)
-        for name in (tool,) if equals else TOOLS:
-            if name in models:
-                raise InputError(f"--arm {text}: the {name} has an arm already; expected one")
-            models[name] = model if equals else text
+        if tool in models:
+            raise InputError(f"--arm {given}: two arms for the {tool}; expected one")
+        models[tool] = model
     return models
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.registry import with_present_names
 
 Value = int | float | str
+MOST_SETTINGS = 100_000
+"""Most settings of an experiment."""
 
 ARMS = ("laser", "endoscope")
 """The arms of an experiment."""
@@ -69,13 +73,17 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     place = where or Where(Path(spec.name))
     for i, vary in enumerate(spec.vary):
         _check_vary(spec, vary, place / "vary" / i)
+    count = math.prod([len(spec.cases), len(spec.lesions or (None,))])
+    count *= math.prod(len(vary.values) for vary in spec.vary)
+    if count > MOST_SETTINGS:
+        raise (place / "vary").error(f"{count} settings", f"at most {MOST_SETTINGS}")
     grid = [[(vary.field, value) for value in vary.values] for vary in spec.vary]
     every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
     found = [Setting(number, *parts) for number, parts in enumerate(every)]
     for setting in found:
         rig_config(setting, place)
     labels = [setting.label for setting in found]
-    if twice := {label for label in labels if labels.count(label) > 1}:
+    if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' comes twice", "values that differ")
     return found
 

@@ -1,7 +1,7 @@
 """`collect`: record a protocol on a rig that is given by name or as an object."""
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,10 @@ from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
+from surgisoft.rig.collect import show_commands
 from surgisoft.rig.interface import Rig
 from surgisoft.rig.registry import open_rig, parse_rig, rig_options
-from surgisoft.rig.safety import guarded
+from surgisoft.rig.safety import SafeRig, guarded
 
 TRIAL_STEP = 1_000_003
 """Distance between the schedule seeds of two trials on one robot, larger than any robot seed."""
@@ -49,23 +50,70 @@ def collect(
     points: int | None = None,
     hidden: Iterable[str | tuple[str, float]] = (),
     progress: Progress = silent,
+    log: str | Path | None = None,
+    force: bool = False,
+    before: Callable[[Rig], None] | None = None,
     **mount: Any,
 ) -> Recording:
     """Record a protocol: its name, a schedule file (.csv), or a `Protocol`.
 
     rig: the rig to record on: an object (`surgisoft.rig.interface.Rig`), or text
-    `NAME[:option=value,...]` (`surgisoft.rig.registry`); default: `virtual`.
+    `NAME[:option=value,...]` (`surgisoft.rig.registry`); default: `virtual`. A real rig runs inside
+    `SafeRig` and is vented at the end.
     seed: seed of the random schedule and, on a simulated rig, of the robot; default 0, or the
     option `seed` of the rig's text. trial: number of the trial, with other noise and random
     schedule on the same robot. hidden: hidden effects of a simulated rig, by name or (name,
     amplitude). mount: further options of the rig, such as `gravity`, `roll_deg`, `payload_g` and
     `noise` of a simulated one.
     points: number of steady-state points, or of frames; default: by the protocol.
+    log: on a real rig, file to which each sample is appended as it is measured; force: replace it.
+    before: is called with the rig before the protocol begins, such as a pre-flight check; an
+    exception from it ends the run.
     """
-    hidden = tuple(hidden)
+    bench, plan = _opened(protocol, rig, seed, trial, points, tuple(hidden), mount)
+    # A simulated rig records in compiled code; each sample is equal to that of `read`.
+    if isinstance(rig, str | None) and hasattr(bench, "record") and before is None:
+        return bench.record(plan, progress)[0]
+    with guarded(bench) as driven:
+        if before is not None:
+            before(driven)
+        return collect_samples(driven, plan, progress, log, force)
+
+
+def dry_run(
+    protocol: str | Path | Protocol,
+    rig: Rig | str,
+    show: Callable[[str], None],
+    *,
+    seed: int | None = None,
+    trial: int = 0,
+    points: int | None = None,
+    **mount: Any,
+) -> None:
+    """Show each command that `collect` would send to a real rig; nothing is sent.
+
+    show: is called with each command in words. Other arguments: as for `collect`.
+    """
+    bench, plan = _opened(protocol, rig, seed, trial, points, (), mount)
+    with guarded(bench) as driven:
+        if not isinstance(driven, SafeRig):
+            raise InputError("a dry run is for real rigs, and this one is simulated")
+        driven.show = show
+        show_commands(driven, plan)
+
+
+def _opened(
+    protocol: str | Path | Protocol,
+    rig: Rig | str | None,
+    seed: int | None,
+    trial: int,
+    points: int | None,
+    hidden: tuple[str | tuple[str, float], ...],
+    mount: dict[str, Any],
+) -> tuple[Rig, Protocol]:
+    """The rig and the protocol of the arguments of `collect`."""
     if rig is None or isinstance(rig, str):
-        text = rig or "virtual"
-        bench = rig_of_trial(text, protocol, seed, trial, hidden, **mount)
+        bench = rig_of_trial(rig or "virtual", protocol, seed, trial, hidden, **mount)
         if seed is None:
             seed = getattr(getattr(bench, "config", None), "seed", None)
     elif mount or hidden:
@@ -75,11 +123,12 @@ def collect(
         )
     else:
         bench = rig
-    if not isinstance(protocol, Protocol):
+    if isinstance(protocol, Protocol):
+        return bench, protocol
+    try:
         drawn = (seed or 0) + TRIAL_STEP * trial
-        protocol = make_protocol(protocol, bench.limits, points, seed=drawn)
-    # A simulated rig records in compiled code; each sample is equal to that of `read`.
-    if isinstance(rig, str | None) and hasattr(bench, "record"):
-        return bench.record(protocol, progress)[0]
-    with guarded(bench) as driven:
-        return collect_samples(driven, protocol, progress)
+        return bench, make_protocol(protocol, bench.limits, points, seed=drawn)
+    except InputError:
+        if isinstance(bench, SafeRig):
+            bench.close()
+        raise

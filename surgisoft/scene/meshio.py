@@ -1,5 +1,6 @@
 """Mesh files: read STL, OBJ, PLY, OFF and GLB, decide their unit of length, write exact PLY."""
 
+import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,8 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: the file is empty; expected a mesh")
     if path.suffix.lower() == ".stl":
         _check_stl(path)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        _check_gltf(path)
     pieces, points = _load(path)
     if not pieces and points:
         raise InputError(
@@ -88,6 +91,38 @@ def _check_text_stl(path: Path, size: int) -> None:
             f"{path}: the text STL ends with '{last}'; expected 'endsolid' at its end: it is cut "
             "off, export or copy it again"
         )
+
+
+def _check_gltf(path: Path) -> None:
+    """Raise for a glTF file whose parts claim more than the file holds, before memory is taken.
+
+    GLB: a header of 12 bytes (magic, version, length), then chunks, each with its length and type
+    before it; the first one is JSON (glTF 2.0 specification, sec. 4.4).
+    """
+    size, wanted = path.stat().st_size, "the file is damaged or has another type"
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        magic, _, length = struct.unpack("<4sII", content[:12].ljust(12, b"\0"))
+        if magic != b"glTF" or length != size:
+            raise InputError(f"{path}: cannot be read as GLB (its length is wrong); {wanted}")
+        at, chunks = 12, []
+        while at + 8 <= size:
+            length = struct.unpack("<I", content[at : at + 4])[0]
+            chunks.append(content[at + 8 : at + 8 + length])
+            at += 8 + length
+        if at != size or not chunks:
+            raise InputError(f"{path}: cannot be read as GLB (a chunk is cut off); {wanted}")
+        content = chunks[0]
+    try:
+        table = json.loads(content)
+        accessors = table.get("accessors", [])
+        counts = [accessor["count"] for accessor in accessors if "bufferView" not in accessor]
+        most = max([0, *counts])
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: cannot be read as glTF ({reason[:120]}); {wanted}") from None
+    if most > size:
+        raise InputError(f"{path}: claims {most} numbers in {size} bytes; {wanted}")
 
 
 def _load(path: Path) -> tuple[list[Part], int]:

@@ -58,6 +58,7 @@ COMMANDS = {
     "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
     "improve": "improve arm bench.parquet --max-effects 1 -o improved",
     "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
+    "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
     "evaluate": "evaluate scripted --task track_circle --arm arm --episodes 1",
     "scene new": "scene new ball.ply --unit mm --arm arm -o placed",

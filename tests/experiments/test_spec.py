@@ -101,6 +101,15 @@ def test_specs_are_values(tmp_path):
     assert spec != dataclasses.replace(spec, seed=4)
 
 
+def test_settings_without_bound_are_refused(tmp_path):
+    rows = "".join(
+        f"\n[[vary]]\nfield = '{name}'\nvalues = [{', '.join(map(str, range(1, 101)))}]\n"
+        for name in ("task.cut_s", "task.fire_mm", "task.far_mm")
+    )
+    with pytest.raises(InputError, match="1000000 settings; expected at most 100000"):
+        settings(load_experiment(write(tmp_path, TINY + rows)))
+
+
 def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
     text = TINY.replace("together = 1", "together = 3")
     text += '[[cases]]\nname = "a"\n[[cases]]\nname = "b"\nplant = "rig"\n'

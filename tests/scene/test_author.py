@@ -305,7 +305,7 @@ BAD = [
     (("ball.ply", "--label", "1"), "expected LABEL:ROLE[:NAME]"),
     (("ball.ply", "--margin", "-1"), "--margin is -1"),
     (("ball.ply", "--arm", "scope=default"), "unknown tool 'scope'"),
-    (("ball.ply", "--arm", "default", "--arm", "laser=default"), "the laser has an arm already"),
+    (("ball.ply", "--arm", "laser=default,laser=default"), "two arms for the laser"),
     (("ball.ply", "--arm", "nowhere"), "no arm model there"),
     (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; organs measure 20 to 600 mm"),
     (("ball.ply:knife",), "role 'knife'"),

@@ -1,5 +1,8 @@
 """Mesh files: one mesh from every format, no guess of the unit, one line for broken files."""
 
+import json
+import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +129,26 @@ def test_a_file_that_is_not_there_and_a_folder(tmp_path):
         read_parts(tmp_path / "a.stl")
     with pytest.raises(InputError, match="is a folder"):
         read_parts(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["chunk", "accessor", "json"])
+def test_a_glb_that_claims_more_than_it_holds_takes_no_memory(tmp_path, damage):
+    write(tmp_path / "a.glb", trimesh.creation.box())
+    content = bytearray((tmp_path / "a.glb").read_bytes())
+    length = struct.unpack("<I", content[12:16])[0]
+    table, rest = json.loads(content[20 : 20 + length]), content[20 + length :]
+    if damage == "accessor":
+        table["accessors"][0] = {"count": 10**9, "componentType": 5126, "type": "VEC3"}
+    text = b"[" * 10**5 if damage == "json" else json.dumps(table).encode()
+    text = text.ljust(-(-len(text) // 4) * 4)
+    body = bytearray(struct.pack("<I4s", len(text), b"JSON") + text + rest)
+    if damage == "chunk":
+        body[:4] = struct.pack("<I", 2**31)
+    head = struct.pack("<4sII", b"glTF", 2, 12 + len(body))
+    (tmp_path / "a.glb").write_bytes(head + body)
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"claims 1000000000|chunk is cut off|read as glTF"):
+        read_mesh(tmp_path / "a.glb")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6

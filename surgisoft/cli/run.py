@@ -189,6 +189,11 @@ def _show(found) -> None:
     if len(found.tracking) and not math.isnan(found.tracking_mm()):
         task = ", ".join(f"{name}{found.tracking_mm(a, b):.3f} mm" for name, a, b in stretches)
         print(f"error of the task: {task}")
+    if found.judged < 1.0:
+        print(
+            f"judged: {found.judged:.0%} of the time after the reference; the rest is motion that "
+            "the reference does not cover"
+        )
     if found.detector is None:
         print("no change detector: the run was shorter than its clean reference")
     elif not found.alarms:

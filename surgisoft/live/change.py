@@ -30,6 +30,10 @@ independent values counts with the upper end of its 95 % confidence interval. Th
 until resampled hours of the reference (moving blocks of 20 s; Künsch 1989), judged by statistics
 that were estimated without them, raise no more false alarms than wanted: errors of a network have
 heavier tails than a normal distribution.
+
+A reference says nothing about motions that are not in it: a network errs more in the corners of its
+range. A block counts only where some block of the reference has an actuation, and a change of it
+since the block before, within 15 % of the actuation's range; elsewhere the charts stand still.
 """
 
 from __future__ import annotations
@@ -37,12 +41,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from surgisoft.errors import InputError
 
+LIKE_SHARE = 0.15
+"""Largest difference in actuation, and in its change from block to block, at which a block of the
+reference covers one of a run, as a share of the actuation's range [-]."""
 LEAST_BLOCKS = 60
 """Fewest blocks of a reference: half a minute with the default block."""
 LARGEST_PHI = 0.98
@@ -127,9 +136,9 @@ class Whitening:
 
 
 def block_means(t_s: np.ndarray, residual_mm: np.ndarray, block_s: float) -> np.ndarray:
-    """(J, 3 n) means of residuals (T, n, 3) over whole blocks of time [mm]; t_s: (T,) of one run.
+    """(J, D) means of values (T, ...) over whole blocks of time; t_s: (T,) of one run.
 
-    A key point that is missing throughout a block keeps its last mean.
+    A key point of a residual that is missing throughout a block keeps its last mean.
     """
     flat = np.asarray(residual_mm, np.float64).reshape(len(t_s), -1)
     place = np.floor((t_s - t_s[0]) / block_s + 1e-6).astype(int)
@@ -188,6 +197,8 @@ class Detector:
     """What is to be detected."""
     whitening: Whitening
     """Statistics of the reference."""
+    coverage: Coverage
+    """The reference's motions."""
     enlargement: float
     """Factor on the reference's standard deviations [-]."""
     reference_mm: float
@@ -225,18 +236,73 @@ def increments(
     return np.minimum(ratio, limit / 4.0)
 
 
+class Stretch(NamedTuple):
+    """T samples of a run without a reset or a gap."""
+
+    t_s: np.ndarray
+    """(T,) times [s]."""
+    residual_mm: np.ndarray
+    """(T, n, 3) measured less predicted key points [mm]; NaN where missing."""
+    actuation: np.ndarray
+    """(T, m) actuation [unit of the arm]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """The motions of a reference."""
+
+    tree: cKDTree
+    """Blocks of the reference: actuation and its change, in tolerances."""
+    tolerance: np.ndarray
+    """(m,) largest difference that counts as alike [unit of the arm]."""
+
+    @classmethod
+    def of(cls, runs: Sequence[np.ndarray], span: np.ndarray) -> Coverage:
+        """The motions of runs of blocks with actuations (J, m); span: (m,) its range."""
+        tolerance = LIKE_SHARE * np.asarray(span, np.float64)
+        return cls(
+            cKDTree(np.concatenate([motion(run) / np.tile(tolerance, 2) for run in runs])),
+            tolerance,
+        )
+
+    def covers(self, moved: np.ndarray) -> np.ndarray:
+        """(...,) whether motions (..., 2 m), as `motion` gives them, are in the reference."""
+        return self.tree.query(moved / np.tile(self.tolerance, 2), p=np.inf)[0] <= 1.0
+
+
+def motion(actuation: np.ndarray) -> np.ndarray:
+    """(J - 1, 2 m) actuation of blocks (J, m) from the second on, and its change [unit]."""
+    return np.concatenate([actuation[1:], np.diff(actuation, axis=0)], axis=1)
+
+
+class _Run(NamedTuple):
+    """Blocks of one run."""
+
+    residual: np.ndarray
+    """(J, d) means of the residual [mm]."""
+    actuation: np.ndarray
+    """(J, m) means of the actuation [unit]."""
+
+
+def _blocks(stretch: Stretch, block_s: float) -> _Run:
+    return _Run(*(block_means(stretch.t_s, values, block_s) for values in stretch[1:]))
+
+
 def fit_detector(
-    reference: Sequence[tuple[np.ndarray, np.ndarray]],
+    reference: Sequence[Stretch],
+    span: np.ndarray,
     design: AlarmDesign | None = None,
     elsewhere_mm2: np.ndarray | None = None,
 ) -> Detector:
-    """The detector that a clean reference gives: (t_s (T,), residual_mm (T, n, 3)) of each run.
+    """The detector that a clean reference gives, one stretch for each run.
 
-    elsewhere_mm2: see `whitening`. Raises InputError where the reference is too short.
+    span: (m,) range of the actuation [unit]. elsewhere_mm2: see `whitening`. Raises InputError
+    where the reference is too short.
     """
     design = design or AlarmDesign()
-    runs = [block_means(t_s, residual, design.block_s) for t_s, residual in reference]
-    runs = [run for run in runs if len(run) > 1]
+    blocks = [_blocks(stretch, design.block_s) for stretch in reference]
+    blocks = [run for run in blocks if len(run.residual) > 1]
+    runs = [run.residual for run in blocks]
     count = sum(map(len, runs))
     if count < LEAST_BLOCKS:
         raise InputError(
@@ -244,38 +310,46 @@ def fit_detector(
             f"{LEAST_BLOCKS * design.block_s:g} s; record longer"
         )
     found = whitening(runs, design, elsewhere_mm2)
-    distance = np.concatenate([residual for _, residual in reference])
+    distance = np.concatenate([stretch.residual_mm for stretch in reference])
     reference_mm = float(np.sqrt(np.nanmean((distance**2).sum(-1))))
-    squares = _judged_by_others(runs, design, elsewhere_mm2)
+    squares = _judged_by_others(blocks, span, design, elsewhere_mm2)
     enlargement = _enlargement(squares, found.weights, design)
-    return Detector(design, found, enlargement, reference_mm, count * design.block_s)
+    coverage = Coverage.of([run.actuation for run in blocks], span)
+    return Detector(design, found, coverage, enlargement, reference_mm, count * design.block_s)
 
 
-def _judged_by_others(runs, design: AlarmDesign, elsewhere_mm2) -> list[np.ndarray]:
-    """Squares (J, 2 d) of each part of a reference with statistics of the other parts."""
-    folds = [[run] for run in runs] if len(runs) >= FOLDS else _fifths(runs)
+def _judged_by_others(blocks, span, design: AlarmDesign, elsewhere_mm2) -> list[np.ndarray]:
+    """Squares (J, 2 d) of each part of a reference with statistics of the other parts.
+
+    Blocks that the other parts do not cover are left out, as in a run.
+    """
+    folds = [[run] for run in blocks] if len(blocks) >= FOLDS else _fifths(blocks)
     judged = []
     for k, fold in enumerate(folds):
         others = [run for j, other in enumerate(folds) if j != k for run in other]
-        known = whitening(others, design, elsewhere_mm2)
+        known = whitening([run.residual for run in others], design, elsewhere_mm2)
+        coverage = Coverage.of([run.actuation for run in others], span)
         for run in fold:
-            part = known.components(run)
-            judged.append(known.squares(part[1:], part[:-1]))
-    return judged
+            part = known.components(run.residual)
+            covered = coverage.covers(motion(run.actuation))
+            judged.append(known.squares(part[1:], part[:-1])[covered])
+    return [squares for squares in judged if len(squares)]
 
 
-def _fifths(runs: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
+def _fifths(runs: Sequence[_Run]) -> list[list[_Run]]:
     """Five folds of consecutive blocks of a few runs."""
-    folds: list[list[np.ndarray]] = [[] for _ in range(FOLDS)]
+    folds: list[list[_Run]] = [[] for _ in range(FOLDS)]
     for run in runs:
-        for k, part in enumerate(np.array_split(run, FOLDS)):
-            if len(part) > 1:
-                folds[k].append(part)
+        for k, rows in enumerate(np.array_split(np.arange(len(run.residual)), FOLDS)):
+            if len(rows) > 1:
+                folds[k].append(_Run(run.residual[rows], run.actuation[rows]))
     return [fold for fold in folds if fold]
 
 
 def _enlargement(squares: list[np.ndarray], weights, design: AlarmDesign) -> float:
     """Smallest tried factor on the scale with few enough alarms on the resampled reference."""
+    if not squares:
+        return 1.0
     accepted = max(1.0, design.resample_h / design.false_alarm_h)
     draws = resampled(squares, design)
     h = threshold(design, len(weights) // 2)
@@ -358,16 +432,25 @@ class Charts:
     """The alarm that is standing, None where the model holds."""
     alarms: list[Alarm] = field(default_factory=list)
     """All alarms so far."""
+    judged: int = 0
+    """Blocks that the charts have taken."""
+    left_out: int = 0
+    """Blocks whose motion is not in the reference."""
     _charts: np.ndarray | None = None
     _zero_s: np.ndarray | None = None
     _before: np.ndarray | None = None
     _mean: np.ndarray | None = None
+    _moved: np.ndarray | None = None
     _rows: list[np.ndarray] = field(default_factory=list)
+    _actuations: list[np.ndarray] = field(default_factory=list)
     _begin_s: float | None = None
     _recent: list[tuple[float, float]] = field(default_factory=list)
 
-    def update(self, t_s: float, residual_mm: np.ndarray) -> Alarm | None:
-        """Take the residual (n, 3) [mm] of a time [s]; returns an alarm where one begins."""
+    def update(self, t_s: float, residual_mm: np.ndarray, actuation: np.ndarray) -> Alarm | None:
+        """Take the residual (n, 3) [mm] and the actuation (m,) of a time [s].
+
+        Returns an alarm where one begins.
+        """
         block_s = self.detector.design.block_s
         if self._begin_s is None or t_s - self._begin_s > 4.0 * block_s or t_s < self._begin_s:
             self.pause()
@@ -377,15 +460,18 @@ class Charts:
             begun = self._close(t_s)
             self._begin_s += block_s
         self._rows.append(np.asarray(residual_mm, np.float64).reshape(-1))
+        self._actuations.append(np.asarray(actuation, np.float64))
         return begun
 
     def pause(self) -> None:
         """The samples that follow do not continue those before: a reset, or a gap in time."""
-        self._rows, self._before, self._begin_s = [], None, None
+        self._rows, self._actuations = [], []
+        self._before = self._moved = self._begin_s = None
 
     def _close(self, t_s: float) -> Alarm | None:
         """Let the charts take the block that ends at t_s."""
         rows, self._rows = np.array(self._rows), []
+        actuations, self._actuations = np.array(self._actuations), []
         if not len(rows):
             return None
         mean = _mean(rows)
@@ -398,8 +484,13 @@ class Charts:
         detector = self.detector
         now = detector.whitening.components(self._mean)
         before, self._before = self._before, now
-        if before is None:
+        moved, self._moved = self._moved, actuations.mean(axis=0)
+        if before is None or moved is None:
             return None
+        if not detector.coverage.covers(motion(np.array([moved, self._moved])))[0]:
+            self.left_out += 1
+            return None
+        self.judged += 1
         steps = detector.increments(detector.whitening.squares(now, before))
         if self._charts is None or self._zero_s is None:
             self._charts = np.zeros_like(steps)
@@ -430,9 +521,11 @@ class Charts:
         return self.alarm
 
 
-def residual_runs(
-    t_s: np.ndarray, run: np.ndarray, residual_mm: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times and residuals of each run of a recording, as `fit_detector` takes them."""
+def stretches(
+    t_s: np.ndarray, run: np.ndarray, residual_mm: np.ndarray, actuation: np.ndarray
+) -> list[Stretch]:
+    """The runs of a recording, as `fit_detector` takes them; run: (T,) its number."""
     edges = [0, *(np.flatnonzero(np.diff(run)) + 1).tolist(), len(run)]
-    return [(t_s[a:b], residual_mm[a:b]) for a, b in itertools.pairwise(edges)]
+    return [
+        Stretch(t_s[a:b], residual_mm[a:b], actuation[a:b]) for a, b in itertools.pairwise(edges)
+    ]

@@ -30,13 +30,14 @@ from surgisoft.live.change import (
     AlarmDesign,
     Charts,
     Detector,
+    Stretch,
     fit_detector,
-    residual_runs,
+    stretches,
 )
 from surgisoft.live.clock import Clock, Pace, Timing
 from surgisoft.live.log import RunLog
 from surgisoft.live.watch import Companion, Finished, Instant, WatchedRig, WatchedSimulation
-from surgisoft.measurement.histories import check_fits, history_of
+from surgisoft.measurement.histories import actuation_of, check_fits, history_of
 from surgisoft.measurement.protocols import PROTOCOLS, Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording, load_recordings, save_recording
 from surgisoft.progress import Progress, silent
@@ -162,6 +163,8 @@ class RunResult:
     """The detector; None where the run was shorter than its reference."""
     alarms: tuple[Alarm, ...]
     """When the model stopped holding."""
+    judged: float
+    """Share of the run behind the reference whose motion the reference covers; nan without one."""
     timing: Timing
     """How the clock was kept."""
     tracking: np.ndarray
@@ -209,6 +212,7 @@ class RunResult:
                 "threshold": None if detector is None else detector.threshold,
                 "enlargement": None if detector is None else detector.enlargement,
                 "alarms": [vars(alarm) for alarm in self.alarms],
+                "judged": self.judged,
                 "error_mm": {
                     "whole": self.rms_mm(),
                     "before": self.rms_mm(end_s=change),
@@ -343,7 +347,8 @@ class _Session:
             log = RunLog(rig, request.output, request.force, note)
             opened.callback(log.close)
             seconds = self._seconds(protocol)
-            bench = self._watch(rig, Companion(self.model), clock, log, seconds)
+            self.companion = Companion(self.model)
+            bench = self._watch(rig, self.companion, clock, log, seconds)
             drive = self._drive(bench, protocol, place)
             self._seconds_to_do = seconds
             opened.pop_all()
@@ -620,7 +625,8 @@ class _Session:
 
     def _judge(self, now: Instant) -> float:
         assert self.charts is not None
-        alarm = self.charts.update(now.t_s, now.residual_mm)
+        actuation = self.companion.actuation(now.sample)
+        alarm = self.charts.update(now.t_s, now.residual_mm, actuation)
         if alarm is not None:
             self._event(alarm.at_s, alarm.sentence, serious=True)
             if self.request.stop_on_alarm:
@@ -659,13 +665,14 @@ class _Session:
             if self._early[-1].t_s < reference_s:
                 return
             rows = [now for now in self._early if now.t_s < reference_s]
-            runs = residual_runs(
+            runs = stretches(
                 np.array([now.t_s for now in rows]),
                 np.array([now.run for now in rows]),
                 np.array([now.residual_mm for now in rows]),
+                np.array([self.companion.actuation(now.sample) for now in rows]),
             )
-            elsewhere = _elsewhere(self.model)
-            self._fit = self._worker.submit(fit_detector, runs, self.request.alarm, elsewhere)
+            known, span = elsewhere(self.model), np.array(self.model.spec.span)
+            self._fit = self._worker.submit(fit_detector, runs, span, self.request.alarm, known)
         if not (wait or self._fit.done()):
             return
         detector = self._fit.result()
@@ -683,14 +690,9 @@ class _Session:
 
     def _detector(self, before: list[Recording]) -> Detector:
         """The detector from recordings of the unchanged arm."""
-        runs = []
-        for recording in before:
-            history = history_of([recording], self.model.spec.actuation)
-            with torch.inference_mode():
-                predicted = history.rows(self.model.predict(history)).double().numpy()
-            residual = recording.key_points_mm - predicted
-            runs += [(recording.t_s[part], residual[part]) for part in recording.runs]
-        detector = fit_detector(runs, self.request.alarm)
+        runs = [run for recording in before for run in residual_runs(self.model, recording)]
+        span = np.array(self.model.spec.span)
+        detector = fit_detector(runs, span, self.request.alarm, elsewhere(self.model))
         self._tell_reference(detector)
         return detector
 
@@ -777,6 +779,7 @@ class _Session:
             np.array(self.statistic)[: recording.samples],
             None if charts is None else charts.detector,
             alarms,
+            _judged(charts),
             clock.timing(),
             np.array(self.tracking).reshape(-1, 2),
             self.interrupted,
@@ -811,7 +814,17 @@ def since(recording: Recording, begin_s: float, name: str) -> Recording:
     )
 
 
-def _elsewhere(model: ArmModel) -> np.ndarray | None:
+@torch.inference_mode()
+def residual_runs(model: ArmModel, recording: Recording) -> list[Stretch]:
+    """The residual of a model on each run of a recording."""
+    history = history_of([recording], model.spec.actuation)
+    predicted = history.rows(model.predict(history)).double().numpy()
+    residual = recording.key_points_mm - predicted
+    actuation = actuation_of(recording, model.spec.actuation)
+    return [Stretch(recording.t_s[r], residual[r], actuation[r]) for r in recording.runs]
+
+
+def elsewhere(model: ArmModel) -> np.ndarray | None:
     """(d, d) covariance of a model's known error over its whole range [mm^2]; None: not known."""
     known = model.training_residuals
     if known is None:
@@ -819,6 +832,12 @@ def _elsewhere(model: ArmModel) -> np.ndarray | None:
     residual = known.residual_mm.double().numpy().reshape(len(known.residual_mm), -1)
     residual = residual[np.isfinite(residual).all(axis=1)]
     return residual.T @ residual / len(residual) if len(residual) else None
+
+
+def _judged(charts: Charts | None) -> float:
+    """Share of blocks that the charts have taken; nan without any block."""
+    count = 0 if charts is None else charts.judged + charts.left_out
+    return charts.judged / count if charts is not None and count else math.nan
 
 
 def _tracking_error(measures: dict[str, torch.Tensor]) -> float:

@@ -34,12 +34,15 @@ class Companion:
         self._state = self.model.initial_state(1)
         self._last_s: float | None = None
 
+    def actuation(self, sample: Sample) -> np.ndarray:
+        """(m,) the model's input in a sample: measured or commanded actuation [unit]."""
+        measured = self.model.spec.actuation == "measured"
+        return np.asarray(sample.measured if measured else sample.commanded, np.float64)
+
     @torch.inference_mode()
     def predict(self, sample: Sample) -> np.ndarray:
         """(n, 3) predicted key points at a sample [mm], arm base frame."""
-        measured = self.model.spec.actuation == "measured"
-        actuation = sample.measured if measured else sample.commanded
-        pressure = torch.tensor(np.asarray(actuation), dtype=torch.float32)[None]
+        pressure = torch.tensor(self.actuation(sample), dtype=torch.float32)[None]
         dt_s = 0.0 if self._last_s is None else sample.t_s - self._last_s
         self._last_s = sample.t_s
         room = None if sample.temp_C is None else torch.tensor([sample.temp_C]).float()

@@ -5,11 +5,24 @@ import pytest
 from scipy.signal import lfilter
 
 from surgisoft.errors import InputError
-from surgisoft.live.change import AlarmDesign, Charts, block_means, fit_detector
+from surgisoft.live.change import AlarmDesign, Charts, Stretch, block_means
+from surgisoft.live.change import fit_detector as fit
 
 RATE_HZ = 20.0
 N = 3
 """Key points of the made-up arm."""
+SPAN = np.array([50.0, 60.0])
+"""Range of its two chambers, kPa."""
+
+
+def waves(t_s):
+    """Actuation (T, 2) along which the arm moves, kPa."""
+    return 25.0 + 10.0 * np.stack([np.sin(t_s), np.cos(t_s)], axis=1)
+
+
+def fit_detector(reference, design=None):
+    """The detector of runs (t_s, residual) along the waves."""
+    return fit([Stretch(t_s, values, waves(t_s)) for t_s, values in reference], SPAN, design)
 
 
 def residual(seconds, seed, sd_mm=0.1, correlation_s=3.0, noise_mm=0.03):
@@ -27,7 +40,7 @@ def fed(detector, t_s, values):
     charts = Charts(detector)
     levels = []
     for at_s, value in zip(t_s, values, strict=True):
-        charts.update(at_s, value)
+        charts.update(at_s, value, waves(np.array([at_s]))[0])
         levels.append(charts.statistic)
     return charts, np.array(levels)
 
@@ -121,3 +134,18 @@ def test_heavy_tails_of_the_reference_enlarge_the_scale():
 def test_a_short_reference_is_refused():
     with pytest.raises(InputError, match=r"has 19\.5 s, expected at least 30 s"):
         fit_detector([residual(20, 1)])
+
+
+def test_motion_that_the_reference_lacks_is_not_judged(detector):
+    """An error outside the reference's range of actuation says nothing about a change."""
+    t_s, values = residual(120, 10)
+    away = (t_s >= 40.0) & (t_s < 80.0)
+    values[away, -1] += 1.0
+    actuation = waves(t_s)
+    actuation[away] += 0.3 * SPAN
+    for here, alarms in ((actuation, 0), (waves(t_s), 1)):
+        charts = Charts(detector)
+        for each in zip(t_s, values, here, strict=True):
+            charts.update(*each)
+        assert len(charts.alarms) == alarms
+        assert charts.left_out == (82 if alarms == 0 else 0)

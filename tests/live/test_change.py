@@ -142,10 +142,10 @@ def test_motion_that_the_reference_lacks_is_not_judged(detector):
     away = (t_s >= 40.0) & (t_s < 80.0)
     values[away, -1] += 1.0
     actuation = waves(t_s)
-    actuation[away] += 0.3 * SPAN
+    actuation[away] += 0.7 * SPAN
     for here, alarms in ((actuation, 0), (waves(t_s), 1)):
         charts = Charts(detector)
         for each in zip(t_s, values, here, strict=True):
             charts.update(*each)
         assert len(charts.alarms) == alarms
-        assert charts.left_out == (82 if alarms == 0 else 0)
+        assert charts.left_out in ((80, 81) if alarms == 0 else (0,))

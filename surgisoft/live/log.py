@@ -7,8 +7,10 @@ reads. `finish` replaces it by the whole recording in its final form.
 from __future__ import annotations
 
 import os
+import threading
 import time
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from surgisoft.measurement.recordings import Recording, check_writable, save_rec
 from surgisoft.rig.interface import Rig, Sample
 
 FLUSH_S = 1.0
-"""Time after which written rows are handed to the disk [s]."""
+"""Time within which rows are on the disk [s]."""
 
 
 class RunLog:
@@ -28,8 +30,10 @@ class RunLog:
         self.rig, self.path, self.force, self.note = rig, None, force, note
         self.samples: list[Sample] = []
         self.runs: list[int] = []
-        self._file = None
+        self._file: TextIO | None = None
         self._flushed = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._sync, daemon=True)
         if path is None:
             return
         self.path = Path(path)
@@ -44,6 +48,7 @@ class RunLog:
         names = ["t_s", *(f"{letter}{i + 1}_{unit}" for letter in "pc" for i in range(m))]
         names += [f"k{j}_{axis}_mm" for j in range(n) for axis in "xyz"]
         self._file.write(",".join([*names, "run", "temp_C"]) + "\n")
+        self._thread.start()
 
     def write(self, sample: Sample, run: int) -> None:
         """Append a sample of a run."""
@@ -57,9 +62,14 @@ class RunLog:
         temperature = "" if sample.temp_C is None else repr(float(sample.temp_C))
         self._file.write(",".join([*cells, str(run), temperature]) + "\n")
         now = time.monotonic()
-        if now - self._flushed > FLUSH_S:
+        if now - self._flushed > FLUSH_S / 2:
             self._flushed = now
             self._file.flush()
+
+    def _sync(self) -> None:
+        """Write what was flushed to the disk, beside the loop, which must not wait for it."""
+        while self._file is not None and not self._over.wait(FLUSH_S / 2):
+            os.fsync(self._file.fileno())
 
     def recording(self, name: str) -> Recording:
         """The samples so far as a recording."""
@@ -95,6 +105,8 @@ class RunLog:
     def close(self) -> None:
         """Hand all rows to the disk."""
         if self._file is not None and not self._file.closed:
+            self._over.set()
+            self._thread.join()
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()

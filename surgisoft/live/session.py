@@ -407,7 +407,8 @@ class _Session:
             rest = np.asarray(self.model.rest_mm)
             length = float(np.linalg.norm(rest[-1] - rest[0]))
         title = f"{name} on {self._rig_name}"
-        bench = LiveBench(rig.chambers, rig.key_planes, rig.unit, length, title)
+        tracks = not self.request.scheduled
+        bench = LiveBench(rig.chambers, rig.key_planes, rig.unit, length, title, tracks)
         sinks = self.sinks
         with live_view(
             bench,

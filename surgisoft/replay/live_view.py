@@ -72,6 +72,8 @@ class LiveBench:
     """Length of the arm (mm)."""
     title: str
     """What runs on which rig."""
+    tracks: bool
+    """Whether a policy does a task, whose error is shown."""
 
 
 class LiveView:
@@ -88,15 +90,16 @@ class LiveView:
             recording.log(f"/body/{entity}", style, static=True)
         recording.log("/body/points", rr.Points3D.from_fields(radii=1.3), static=True)
         recording.log("/body/residual", rr.Arrows3D.from_fields(radii=0.3), static=True)
-        for number in range(bench.chambers):
-            colour = series_colour(number)
-            self._line(f"pressure/c{number + 1}", f"command {number + 1}", paler(colour), 1.0)
-            self._line(f"pressure/p{number + 1}", f"chamber {number + 1}", colour)
-        for number in range(bench.key_points):
-            self._line(f"residual/k{number}", f"k{number}", series_colour(number))
-        self._line("alarm/level", "alarm level", REAL_COLOUR)
-        self._line("alarm/threshold", "alarm", LIMIT_COLOUR, 1.0)
-        self._line("tracking/error", "error", PLAN_COLOUR)
+        chambers, points = range(bench.chambers), range(bench.key_points)
+        colours = [series_colour(i) for i in chambers]
+        names = [f"command {i + 1}" for i in chambers]
+        self._lines("pressure/command", names, [paler(colour) for colour in colours], 1.0)
+        self._lines("pressure/measured", [f"chamber {i + 1}" for i in chambers], colours)
+        colours = [series_colour(i) for i in points]
+        self._lines("residual/key_points", [f"k{i}" for i in points], colours)
+        self._lines("alarm/level", ["alarm level"], [REAL_COLOUR])
+        self._lines("alarm/threshold", ["alarm"], [LIMIT_COLOUR], 1.0)
+        self._lines("tracking/error", ["error"], [PLAN_COLOUR])
         text = rr.TextDocument(LEGEND_TEXT, media_type="text/markdown")
         recording.log(LEGEND, text, static=True)
 
@@ -127,11 +130,9 @@ class LiveView:
             arrows = STRETCH * residual[known]
             drawn = rr.Arrows3D(origins=measured_mm[known], vectors=arrows, colors=colours)
             log("/body/residual", drawn)
-        for number, (has, asked) in enumerate(zip(pressure, command, strict=True)):
-            log(f"/plots/pressure/p{number + 1}", rr.Scalars(has))
-            log(f"/plots/pressure/c{number + 1}", rr.Scalars(asked))
-        for number in np.flatnonzero(known).tolist():
-            log(f"/plots/residual/k{number}", rr.Scalars(size[number]))
+        log("/plots/pressure/measured", rr.Scalars(pressure))
+        log("/plots/pressure/command", rr.Scalars(command))
+        log("/plots/residual/key_points", rr.Scalars(size))
         if not math.isnan(statistic):
             log("/plots/alarm/level", rr.Scalars(statistic))
             log("/plots/alarm/threshold", rr.Scalars(1.0))
@@ -148,8 +149,8 @@ class LiveView:
         level = "ERROR" if serious else "INFO"
         self.recording.log(EVENTS, rr.TextLog(f"{t_s:6.1f} s  {text}", level=level))
 
-    def _line(self, place: str, name: str, colour, width: float = 1.6) -> None:
-        style = rr.SeriesLines(names=name, colors=colour, widths=width)
+    def _lines(self, place: str, names: list[str], colours: list, width: float = 1.6) -> None:
+        style = rr.SeriesLines(names=names, colors=colours, widths=[width] * len(names))
         self.recording.log(f"/plots/{place}", style, static=True)
 
 
@@ -185,13 +186,14 @@ def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
             origin=f"/plots/{place}", name=title, plot_legend=legend, time_ranges=span
         )
 
-    plots = rrb.Vertical(
+    plots = [
         plot("residual", "Residual of each key point (mm)", "lefttop"),
         plot("alarm", "Alarm level; 1: the model stopped holding", None),
         plot("pressure", f"Pressure ({bench.unit}); darker: command", "lefttop"),
-        plot("tracking", "Error of the task (mm)", None),
-        row_shares=[3, 2, 3, 2],
-    )
+    ]
+    if bench.tracks:
+        plots.append(plot("tracking", "Error of the task (mm)", None))
+    right = rrb.Vertical(*plots, row_shares=[3, 2, 3, 2][: len(plots)])
     hidden = rrb.encodings.TimelineColumn(TIME, visible=False)
     shown = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
     below = rrb.Horizontal(
@@ -201,7 +203,7 @@ def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
     )
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, below, row_shares=[4, 1]), plots, column_shares=[1.1, 1.0]
+            rrb.Vertical(scene, below, row_shares=[4, 1]), right, column_shares=[1.1, 1.0]
         ),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),

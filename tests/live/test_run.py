@@ -127,9 +127,9 @@ def test_what_came_after_the_change_is_a_recording_of_its_own(changed):
 def test_the_view_holds_every_sample(changed, tmp_path):
     found, _ = changed
     file = found.written[0].with_suffix(".rrd")
-    drawn = column(file, "/plots/pressure/p1", "Scalars:scalars", "time")
-    values = [value[0] for place, value in sorted(drawn.items()) if place >= 0]
-    np.testing.assert_allclose(values, found.recording.measured[:, 0])
+    drawn = column(file, "/plots/pressure/measured", "Scalars:scalars", "time")
+    values = [value for place, value in sorted(drawn.items()) if place >= 0]
+    np.testing.assert_allclose(values, found.recording.measured)
     level = column(file, "/plots/alarm/level", "Scalars:scalars", "time")
     assert len(level) == np.isfinite(found.statistic).sum()
     texts = column(file, "/events", "TextLog:text", "time").values()

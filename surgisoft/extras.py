@@ -19,6 +19,7 @@ EXTRA_OF = {
     "rerun": "replay",
     "rerun_cli": "replay",
     "elastica": "elastica",
+    "serial": "serial",
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",

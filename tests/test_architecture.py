@@ -117,6 +117,7 @@ ONLY_IN = {
     "rsl_rl": "agents",
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
+    "serial": "rig/drivers/serial_controller",
 }
 
 

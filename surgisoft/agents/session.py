@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
 from surgisoft.agents.on_rig import RigConfig, at_benches, on_rig, real_benches
-from surgisoft.agents.policies import POLICIES, check_policy, open_policy
+from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
-from surgisoft.tasks.base import Task
+from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
     TASKS,
@@ -161,12 +163,27 @@ def evaluate(
         return _evaluated(request, plain, place, config, progress)
 
 
+def _warm_up(task: Task, policy: Policy) -> None:
+    """Let a policy act once in simulation.
+
+    The first action takes seconds where code is compiled or read from the disk, for which no real
+    bench should wait under pressure.
+    """
+    with torch.inference_mode():
+        runner = Episodes(task)
+        state = runner.seeded(0, 1)
+        runner.step(state, policy.act(task, state, runner.observe(state)))
+
+
 def _evaluated(
     request: EvaluationRequest, plain: Task, place: Task, config: Any, progress: Progress
 ) -> Evaluations:
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
     measured = tuple(real_benches(place))
     opened = {name: open_policy(name, place) for name in request.policies}
+    if measured:
+        for policy in opened.values():
+            _warm_up(plain, policy)
     logs = {
         name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
         for name in request.log

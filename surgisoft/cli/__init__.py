@@ -27,6 +27,7 @@ COMMANDS = (
     "amend",
     "improve",
     "train",
+    "export",
     "evaluate",
     "run",
     "scene",

@@ -189,8 +189,12 @@ def record_on(
     log = log_of(output)
     there = log.exists()
     check = checked_by(preflight) if preflight else None
-    if not simulated:
+
+    def before(rig: Rig) -> None:
         warn(STOP_NOTE)
+        if check:
+            check(rig)
+
     try:
         with progress(f"collect {protocol}") as report:
             return collect_recording(
@@ -199,7 +203,7 @@ def record_on(
                 progress=report,
                 log=None if simulated else log,
                 force=force,
-                before=check,
+                before=None if simulated else before,
                 **fields,
             )
     except BaseException:

@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.rig.drivers.serial_rig import SerialRig
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.rig.interface import Rig, is_simulated
 from surgisoft.rig.motion_capture import CameraDesign
@@ -92,7 +93,11 @@ def elastica(
     )
 
 
-RIGS: dict[str, Callable[..., Rig]] = {"virtual": virtual, "elastica": elastica}
+RIGS: dict[str, Callable[..., Rig]] = {
+    "virtual": virtual,
+    "elastica": elastica,
+    "serial": SerialRig,
+}
 """The rigs of this package by name."""
 SIMULATED = ("virtual", "elastica")
 """Those of them that are simulated, with hidden effects."""

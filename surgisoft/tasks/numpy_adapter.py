@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.random_streams import joined, streams
 
 Bounds = tuple[Any, Any, tuple[int, ...], Any]

@@ -238,3 +238,40 @@ def test_one_arm_is_on_a_real_bench_and_the_other_on_a_virtual_one():
     assert endoscope.config.rigs == ("virtual:seed=2",)
     assert isinstance(endoscope.build(endoscope.config, 0), VirtualRig)
     assert rigs_in("virtual") == ("virtual",)
+
+
+def seen_after(task, gain, steps=4):
+    """(steps, n, 3) mm: key points as observed, and as they truly are, of one rig."""
+    config = RigConfig(settle_s=0.5, observer_gain=gain, drift_gain=0.0)
+    play = Episodes(on_rig(task, config))
+    state, seen, true = play.seeded(3, 1), [], []
+    for _ in range(steps):
+        state, _ = play.step(state, {"arm": torch.ones(1, 3)})
+        part = state.world.arms["arm"]
+        seen.append(part.seen_mm[0])
+        true.append(part.points_mm[0])
+    return torch.stack(seen), torch.stack(true)
+
+
+def test_the_observer_gain_decides_how_far_the_cameras_are_followed(task):
+    """With gain 1 the estimate is the measurement, whose noise it keeps; with 0 the model's."""
+    (raw, true), (held, again), (some, _) = (seen_after(task, gain) for gain in (1.0, 0.0, 0.3))
+    assert torch.equal(true, again), "the rig does not depend on the observer"
+    noise = (raw - true).norm(dim=2).mean()
+    assert 0.01 < noise < 0.3, "policies observe measurements, not the truth"
+    assert not torch.allclose(some, raw, atol=1e-4)
+    assert not torch.allclose(some, held, atol=1e-4)
+    torch.testing.assert_close(some[0], held[0] + 0.3 * (raw[0] - held[0]), atol=1e-4, rtol=0)
+
+
+def test_the_rig_is_reset_before_an_episode(task):
+    class Counted(VirtualRig):
+        resets = 0
+
+        def reset(self):
+            super().reset()
+            self.resets += 1
+
+    play = Episodes(on_rig(task, RigConfig(settle_s=0.5), lambda config, _: Counted(config.seed)))
+    (rig,) = play.seeded(3, 1).world.arms["arm"].plant.rigs.items
+    assert rig.resets == 1

@@ -20,6 +20,7 @@ Surgical tasks:
     make, parallel_env           Gymnasium and PettingZoo environments
     batched_env                  thousands of episodes, tensors in and out
     train, evaluate              policies (PPO, centralised training, decentralised execution)
+    run                          a policy or a schedule on a rig, with a model beside it
     open_scene, open_replay      scenes and episodes
 """
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from surgisoft.diagnosis.design.next_experiment import next_experiment
     from surgisoft.diagnosis.diagnose import diagnose
     from surgisoft.diagnosis.improve import improve
+    from surgisoft.live.session import run
     from surgisoft.measurement.fitting import fit
     from surgisoft.measurement.recordings import (
         load_recording,
@@ -73,6 +75,7 @@ _PLACES = {
     "open_scene": "scene.folder",
     "parallel_env": "tasks.parallel",
     "register_effect_file": "surrogate.effects",
+    "run": "live.session",
     "save_model": "surrogate.checkpoint",
     "save_recording": "measurement.recordings",
     "train": "agents.training_request",
@@ -101,6 +104,7 @@ __all__ = [
     "open_scene",
     "parallel_env",
     "register_effect_file",
+    "run",
     "save_model",
     "save_recording",
     "train",

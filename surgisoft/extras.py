@@ -34,6 +34,7 @@ EXTRA_OF_USE = {
     "evaluate": "train",
     "export": "train",
     "make": "train",
+    "batched_env": "scene",
     "parallel_env": "train",
     "experiment": "all",
 }

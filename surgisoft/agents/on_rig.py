@@ -30,7 +30,7 @@ from surgisoft.agents.observer import Observer, ObserverGains
 from surgisoft.errors import InputError
 from surgisoft.rig import Rig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.rig.registry import open_rig, parse_rig
+from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
 from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
@@ -45,8 +45,8 @@ class RigConfig:
 
     seed: int = 0
     """Seed of the robot of a simulated rig; the default arm model was fitted to robot 0."""
-    hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects of a simulated rig: (name, amplitude)."""
+    hidden: tuple[HiddenEffect, ...] = ()
+    """Hidden effects of a simulated rig: (name, amplitude) or (name, amplitude, seconds)."""
     noise: float = 1.0
     """Factor on all sensor and camera noise of a simulated rig."""
     cameras: bool = True

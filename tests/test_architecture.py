@@ -27,11 +27,13 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
         "agents",
         "experiments",
+        "live",
         "tasks",
         "scene",
         "surrogate",
@@ -85,6 +87,7 @@ FLOORS = {
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
+        ("live_view",),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),
@@ -115,6 +118,8 @@ ONLY_IN = {
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
     "serial": "rig/drivers/serial_controller",
+    "mcap": "measurement/importing/readers/mcap",
+    "mcap_ros2": "measurement/importing/readers/mcap",
 }
 
 

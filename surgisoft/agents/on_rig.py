@@ -30,7 +30,7 @@ from surgisoft.agents.observer import Observer, ObserverGains
 from surgisoft.errors import InputError
 from surgisoft.rig import Rig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.rig.registry import open_rig, parse_rig
+from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
 from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
@@ -45,8 +45,8 @@ class RigConfig:
 
     seed: int = 0
     """Seed of the robot of a simulated rig; the default arm model was fitted to robot 0."""
-    hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects of a simulated rig: (name, amplitude)."""
+    hidden: tuple[HiddenEffect, ...] = ()
+    """Hidden effects of a simulated rig: (name, amplitude) or (name, amplitude, seconds)."""
     noise: float = 1.0
     """Factor on all sensor and camera noise of a simulated rig."""
     cameras: bool = True
@@ -73,6 +73,12 @@ class RigConfig:
         """The gains of the observer."""
         return ObserverGains(self.cameras, self.observer_gain, self.drift_gain, self.pump_gain)
 
+
+FOREIGN_RATIO = 5.0
+"""Ratio of a model's error on a rig to its validated error from which the model is reported: far
+above what noise and the history of the same arm explain."""
+FOREIGN_LEAST_mm = 0.5
+"""Error below which no model is reported [mm]."""
 
 BuildRig = Callable[[RigConfig, int], Rig]
 """Makes the rig of one arm of one episode from the configuration and the number of its trial.
@@ -161,9 +167,20 @@ class RigArm:
     is there once; simulated rigs are in `ArmPart.plant`.
     """
 
-    def __init__(self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = named_rig):
-        """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
+    def __init__(
+        self,
+        arm: ModelArm,
+        config: RigConfig,
+        dt_s: float,
+        build: BuildRig = named_rig,
+        on_warning: Callable[[str], None] | None = None,
+    ):
+        """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s.
+
+        on_warning: is called once where the arm model does not predict the first measured poses.
+        """
         self.config, self.build = config, build
+        self.on_warning = on_warning
         rig = build(config, 0)
         self.real: SafeRig | None = None
         if not is_simulated(rig):
@@ -229,9 +246,12 @@ class RigArm:
             belief=None,
             plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
         )
+        off_mm = []
         for target in (*passed, first):
-            for _ in range(round(self.config.settle_s / self.period_s)):
+            for _ in range(max(1, round(self.config.settle_s / self.period_s))):
                 part, reading = self._read(part, target)
+            off_mm.append(frames.apply(part.mount, reading.points_mm) - part.points_mm)
+        self._compare(torch.stack(off_mm))
         part = self.observer.begun(part, reading.pressure, reading.points_mm)
         return stream, self._true(part, reading)
 
@@ -271,6 +291,26 @@ class RigArm:
         rig.reset()
         return rig
 
+    def _compare(self, off_mm: Tensor) -> None:
+        """Report a model that does not predict the first poses: (P, B, n, 3) mm, measured minus it.
+
+        The error is the root mean square of the distance of a key point, as the validated one.
+        """
+        if self.on_warning is None:
+            return
+        report, self.on_warning = self.on_warning, None
+        error_mm = float(off_mm.norm(dim=-1).square().nanmean().sqrt())
+        validated_mm = self.model.validation.rmse_mm
+        if validated_mm is None or not validated_mm > 0.0:
+            return
+        if error_mm > max(FOREIGN_RATIO * validated_mm, FOREIGN_LEAST_mm):
+            report(
+                f"arm '{self.name}': its model is {error_mm:.1f} mm off the first "
+                f"{len(off_mm) * off_mm.shape[1]} poses measured on the rig, and was validated at "
+                f"{validated_mm:.2g} mm: it is a model of another robot, or the robot has changed "
+                "('surgisoft diagnose' finds out what; --arm names another model)"
+            )
+
     def _read(self, part: ArmPart, target: Tensor) -> tuple[ArmPart, Reading]:
         """One period of the rigs towards pressures (B, m) kPa; the model goes along."""
         rows = []
@@ -298,11 +338,17 @@ class RigArm:
         return self.simulated.posed(part, body)
 
 
-def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_rig) -> Task:
+def on_rig(
+    task: Task,
+    config: RigConfig | None = None,
+    build: BuildRig = named_rig,
+    on_warning: Callable[[str], None] | None = None,
+) -> Task:
     """The task with every arm on a rig; the given task stays as it is.
 
     Tasks ask their world for its arms, so that this exchanges the world only. Real benches are open
-    from here on: run the task inside `at_benches`.
+    from here on: run the task inside `at_benches`. on_warning: is called once for each arm whose
+    model does not predict the first poses that are measured on its rig.
     """
     config = config or RigConfig()
     world, moved = copy.copy(task.world), copy.copy(task)
@@ -313,7 +359,7 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_
         for name, arm in world.arms.items():
             if not isinstance(arm, ModelArm):
                 raise InputError(f"arm '{name}' is on a rig already, expected a simulated arm")
-            placed = RigArm(arm, replace(config, rigs=(texts[name],)), dt_s, build)
+            placed = RigArm(arm, replace(config, rigs=(texts[name],)), dt_s, build, on_warning)
             opened.callback(placed.close)
             arms[name] = placed
             if placed.real is not None and list(texts.values()).count(texts[name]) > 1:

@@ -20,6 +20,7 @@ from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Task
+from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
     TASKS,
@@ -118,6 +119,8 @@ class Evaluations:
     measured_arms: tuple[str, ...] = ()
     """Arms on a real bench: their errors are those of the measured key points, camera noise
     included."""
+    success_rule: str = ""
+    """What an episode needs to be a success, in words; empty for a task without success."""
 
     def to_json(self) -> dict:
         """Plain values, as `evaluate --json` writes them."""
@@ -128,6 +131,7 @@ class Evaluations:
             "on": asked.place,
             "rig": asked.rig and to_table(asked.rig),
             "measured_arms": list(self.measured_arms),
+            "success_rule": self.success_rule or None,
             "seed": asked.seed,
             "episodes": asked.episodes,
             "dt_s": self.dt_s,
@@ -158,7 +162,7 @@ def evaluate(
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields)
     plain, config = request.resolved(on_warning)
-    place = plain if request.rig is None else on_rig(plain, request.rig)
+    place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
     with at_benches(place):
         return _evaluated(request, plain, place, config, progress)
 
@@ -216,4 +220,5 @@ def _evaluated(
         tuple(results),
         {name: each.log(0) for name, each in logs.items()},
         measured,
+        success_rule(config) if isinstance(config, CircleAblationConfig) else "",
     )

@@ -29,6 +29,7 @@ COMMANDS = (
     "train",
     "export",
     "evaluate",
+    "run",
     "scene",
     "experiment",
     "rig",

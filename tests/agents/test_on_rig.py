@@ -1,6 +1,7 @@
 """Tasks on the virtual rig: measurements, the truth beside them, and what feedback is worth."""
 
 import gc
+import re
 import weakref
 from dataclasses import replace
 
@@ -238,6 +239,31 @@ def test_one_arm_is_on_a_real_bench_and_the_other_on_a_virtual_one():
     assert endoscope.config.rigs == ("virtual:seed=2",)
     assert isinstance(endoscope.build(endoscope.config, 0), VirtualRig)
     assert rigs_in("virtual") == ("virtual",)
+
+
+def test_a_model_of_another_robot_is_warned_of_once():
+    brief = track_circle(TrackConfig(FollowConfig(loop_s=0.2, approach_s=0.1)))
+    for seed, said in ((0, 0), (1, 1)):
+        warned = []
+        moved = on_rig(brief, RigConfig(seed=seed, settle_s=1.0), on_warning=warned.append)
+        rollout(moved, Random(), 2, seed=0, batch=1)
+        assert len(warned) == said
+    assert re.match(r"arm 'arm': its model is [12]\.\d mm off the first 4 poses", warned[0])
+    assert "validated at 0.1 mm: it is a model of another robot, or the robot has" in warned[0]
+
+
+def test_evaluate_passes_the_warning_on():
+    warned = []
+    short = TrackConfig(FollowConfig(loop_s=0.2, approach_s=0.1))
+    evaluate(
+        "random",
+        "track_circle",
+        episodes=1,
+        rig=RigConfig(seed=3, settle_s=1.0),
+        config=short,
+        on_warning=warned.append,
+    )
+    assert len(warned) == 1
 
 
 def seen_after(task, gain, steps=4):

@@ -27,6 +27,7 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
     "demo": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
@@ -34,6 +35,7 @@ MAY_IMPORT = {
         "agents",
         "demo",
         "experiments",
+        "live",
         "tasks",
         "scene",
         "surrogate",
@@ -87,6 +89,7 @@ FLOORS = {
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
+        ("live_view",),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),
@@ -116,6 +119,9 @@ ONLY_IN = {
     "rsl_rl": "agents",
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
+    "serial": "rig/drivers/serial_controller",
+    "mcap": "measurement/importing/readers/mcap",
+    "mcap_ros2": "measurement/importing/readers/mcap",
 }
 
 

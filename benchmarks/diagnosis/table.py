@@ -51,7 +51,7 @@ def first_right(outcome: Outcome, among: int = 1) -> bool:
 
 
 def statement_right(outcome: Outcome) -> bool:
-    """Whether what is stated is right: the effect is hidden, all of several are, or one of a set."""
+    """Whether what is stated is right: the effect is hidden, all of several, or one of a set."""
     hits = [name in outcome.case.truth for name in outcome.effects]
     return bool(hits) and (any(hits) if outcome.kind == "ambiguous" else all(hits))
 

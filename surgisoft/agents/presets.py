@@ -10,7 +10,7 @@ from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.registry import spec_of
 from surgisoft.tasks.world.arm import Randomisation
-from surgisoft.tasks.world.observer import Observer
+from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.world import WorldConfig
 
 ACTIVATIONS: tuple[str, ...] = (
@@ -125,7 +125,7 @@ et al. (2025, sec. IV-A): 4096 steps an update, discount 0.99, lambda 0.95, entr
 
 RANDOMISED_WORLD = {
     "randomisation": Randomisation(mount_mm=0.5, gain=0.02, noise_mm=0.05),
-    "observer": Observer(gain=0.3, drift_gain=0.01),
+    "observer": AlphaBetaFilter(gain=0.3, drift_gain=0.01),
 }
 """Fields of `WorldConfig` with the preset `randomised`: bases that are mounted half a millimetre
 off, chambers that push 2 % more or less, cameras with twice the noise of the virtual rig's

@@ -104,10 +104,16 @@ class Fitted:
 
     fit: Fit
     """The fit."""
-    covariance: np.ndarray
-    """(P, P) of the values."""
-    blocks: int
-    """B, blocks of time of the fitted rows."""
+    curvature: np.ndarray
+    """(P, P) H, half the second derivative of the misfit and of what holds the values, mm^2."""
+    meat: np.ndarray
+    """(P, P) covariance of e_1 + e_2 + e_3, mm^4."""
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(P, P) of the values."""
+        inverse = np.linalg.inv(self.curvature)
+        return inverse @ self.meat @ inverse.T
 
     def draws(self, number: int, rng: np.random.Generator) -> np.ndarray:
         """(number, P) draws of the values."""
@@ -130,21 +136,21 @@ def with_covariance(fit: Fit, problem: Problem) -> Fitted:
     meat += fit.hold @ (fit.prior_variance[:, None] * fit.hold)
     curvature = grams.sum(0) + fit.hold
     curvature += 1e-9 * np.diag(curvature).max() * np.eye(len(curvature))
-    inverse = np.linalg.inv(curvature)
-    return Fitted(fit, inverse @ meat @ inverse.T, blocks)
+    return Fitted(fit, curvature, meat)
 
 
 def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:
     """Probability of so large amplitudes if there were no effect (Wald 1943).
 
-    amplitudes: (P,) bool. Without an effect its nonlinear parameters are free to fit anything
-    (Davies 1977), so that all free values count as degrees of freedom.
+    amplitudes: (P,) bool. Without an effect its nonlinear parameters mean nothing, and a fit
+    chooses those with which the amplitudes are largest (Davies 1977). So they are tested at the
+    fitted nonlinear parameters, and all free values count as degrees of freedom.
     """
-    values = fitted.fit.values[amplitudes]
-    covariance = fitted.covariance[np.ix_(amplitudes, amplitudes)]
-    covariance = covariance + 1e-12 * np.trace(covariance) * np.eye(len(covariance))
-    statistic = float(values @ np.linalg.solve(covariance, values))
-    return float(stats.chi2.sf(statistic, len(amplitudes)))
+    among = np.ix_(amplitudes, amplitudes)
+    pull = fitted.curvature[among] @ fitted.fit.values[amplitudes]
+    meat = fitted.meat[among]
+    meat = meat + 1e-12 * np.trace(meat) * np.eye(len(meat))
+    return float(stats.chi2.sf(float(pull @ np.linalg.solve(meat, pull)), len(amplitudes)))
 
 
 def intervals(

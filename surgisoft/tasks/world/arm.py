@@ -18,7 +18,7 @@ from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.tasks.world.observer import Belief, Observer
+from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_streams import Stream
 
 
@@ -230,7 +230,7 @@ class ModelArm:
         randomisation: Randomisation,
         samples: int,
         device: torch.device,
-        observer: Observer | None = None,
+        observer: AlphaBetaFilter | None = None,
     ):
         """`samples` is the number K of centreline points."""
         spec = mounted.model.spec
@@ -242,7 +242,7 @@ class ModelArm:
                 f"arm '{name}': {len(start)} pressures to start with, expected {spec.chambers}"
             )
         self.name, self.device, self.vary = name, device, randomisation
-        self.observer = observer or Observer()
+        self.observer = observer or AlphaBetaFilter()
         self.chambers, self.key_points = spec.chambers, spec.key_points
         self.model = mounted.model.to(device)
         self.backbone = self.model.backbone(samples)
@@ -326,7 +326,9 @@ class ModelArm:
         _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
         return frames.apply(self.pose, points)
 
-    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
+    def bent(
+        self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
+    ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
         state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
         return state, frames.apply(part.mount, points)

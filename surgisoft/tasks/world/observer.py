@@ -3,7 +3,7 @@
 The nominal model runs beside the arm, driven by the measured pressures, and its output is corrected
 by a filtered output disturbance, as in offset-free model predictive control (Pannocchia & Rawlings
 2003). The disturbance is estimated by an alpha-beta filter (Kalata 1984), which follows a steady
-drift without lag. On virtual rigs (`agents.on_rig`) and on simulated arms it is the same filter.
+drift without lag. Simulated arms use it here, rigs and exported controllers in `agents.observer`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from surgisoft.surrogate.arm import ArmState
 
 
 @dataclass(frozen=True)
-class Observer:
-    """Gains of the state observer; a gain of 1 without drift gain is the raw measurement."""
+class AlphaBetaFilter:
+    """Gains of an arm's state observer; a gain of 1 without drift gain is the raw measurement."""
 
     gain: float = 1.0
     """Share of the innovation (cameras minus estimate) that the estimate adopts in a step, 0..1:

@@ -29,7 +29,7 @@ from surgisoft.tasks.world.arm import (
     Pneumatics,
     Randomisation,
 )
-from surgisoft.tasks.world.observer import Observer
+from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import (
@@ -56,7 +56,7 @@ class WorldConfig:
     """The pumps."""
     randomisation: Randomisation = field(default_factory=Randomisation)
     """Domain randomization: what differs between episodes."""
-    observer: Observer = field(default_factory=Observer)
+    observer: AlphaBetaFilter = field(default_factory=AlphaBetaFilter)
     """The state observer of every simulated arm; on a rig the rig's own takes its place."""
     scene_engine: SceneEngineConfig = field(default_factory=SceneEngineConfig)
     """Resolution of the scene and its collision engine."""

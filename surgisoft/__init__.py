@@ -18,6 +18,7 @@ System identification of an arm:
 Surgical tasks:
 
     make, parallel_env           Gymnasium and PettingZoo environments
+    batched_env                  thousands of episodes, tensors in and out
     train, evaluate              policies (PPO, centralised training, decentralised execution)
     run                          a policy or a schedule on a rig, with a model beside it
     open_scene, open_replay      scenes and episodes
@@ -52,11 +53,13 @@ if TYPE_CHECKING:
     from surgisoft.surrogate.checkpoint import load_model, save_model
     from surgisoft.surrogate.checkpoint import load_model as load
     from surgisoft.surrogate.effects import register_effect_file
+    from surgisoft.tasks.batched import batched_env
     from surgisoft.tasks.make import make
     from surgisoft.tasks.parallel import parallel_env
 
 _PLACES = {
     "amend": "diagnosis.amend",
+    "batched_env": "tasks.batched",
     "collect": "rig.trial",
     "compare": "diagnosis.compare",
     "diagnose": "diagnosis.diagnose",
@@ -84,6 +87,7 @@ _OTHER_NAMES = {"load": "load_model"}
 __all__ = [
     "__version__",
     "amend",
+    "batched_env",
     "collect",
     "compare",
     "diagnose",

@@ -20,6 +20,8 @@ EXTRA_OF = {
     "rerun_cli": "replay",
     "elastica": "elastica",
     "serial": "serial",
+    "mcap": "mcap",
+    "mcap_ros2": "mcap",
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",
@@ -32,6 +34,7 @@ EXTRA_OF_USE = {
     "evaluate": "train",
     "export": "train",
     "make": "train",
+    "batched_env": "scene",
     "parallel_env": "train",
     "experiment": "all",
 }

@@ -37,7 +37,7 @@ COMMANDS = (
 
 MANY = {
     *("--before", "--between", "--data", "--effect", "--effect-file", "--effects", "--hidden"),
-    *("--policy", "--strength", "--valid", "--without"),
+    *("--model-code", "--policy", "--predictions", "--strength", "--valid", "--without"),
 }
 """Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
 

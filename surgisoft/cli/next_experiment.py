@@ -8,7 +8,15 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
-from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
+from surgisoft.cli.options import (
+    AnyModel,
+    EffectFiles,
+    Force,
+    JsonFile,
+    ModelError,
+    Predictions,
+    model_options,
+)
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
 
@@ -20,7 +28,7 @@ SHOWN_PAIRS = 10
 
 @app.command("next-experiment")
 def next_experiment(
-    model: Model,
+    model: AnyModel,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC", help="Recordings so far; may be left out."),
@@ -42,6 +50,8 @@ def next_experiment(
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
     ] = False,
+    predictions: Predictions = None,
+    model_error: ModelError = None,
     json_file: JsonFile = None,
     effect_files: EffectFiles = None,
     force: Force = False,
@@ -55,32 +65,39 @@ def next_experiment(
         raise InputError(f"{output}: exists already; choose another name or use --force")
     check_folder(output.absolute().parent)
     check_free(json_file, "separates")
-    check_model(model)
+    check_model(model, predictions)
     measured = read_recordings(recordings) if recordings else []
 
     from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
     from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
     competing = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
-    result = find_experiment(arm, measured, competing, minutes, settings)
+    result = find_experiment(
+        model,
+        measured,
+        competing,
+        minutes,
+        settings,
+        predictions=predictions,
+        error_mm=model_error,
+    )
     warn_all(result.notes)
     write_atomically(output, schedule_text(result.protocol))
     if json_file:
         write_json(json_file, result.to_json())
-    _show(result, arm.spec, model, recordings or [], output)
+    later = [*(predictions or []), Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
+    _show(result, model, recordings or [], output, model_options(later, model_error))
 
 
-def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> None:
+def _show(result, model: Path, recordings: list[Path], output: Path, of_model: str) -> None:
     from surgisoft.diagnosis.design.isolability import SURE
 
     print(f"next experiment: {result.name}, {result.minutes:g} min on the bench")
     print(f"why: {result.why}")
     for number, step in enumerate(result.steps, 1):
         print(f"  {number}. {step}")
-    on_rig = (spec.chambers, spec.unit) == ON_RIG
+    on_rig = (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG
     if result.by_hand and on_rig:
         print("  the virtual rig has no option for that change: --as-it-stands asks for none")
     elif on_rig:
@@ -89,7 +106,7 @@ def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> No
     # After a change that removes an effect, only the new recording counts.
     old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
-    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}")
+    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}{of_model}")
     pairs = sorted(result.pairs, key=lambda pair: pair.after)
     open_ = [pair for pair in pairs if pair.effects not in result.separates]
     shown = max(SHOWN_PAIRS, len(open_))

@@ -51,6 +51,12 @@ def load_recordings(
     return [load_recording(file, on_warning) for file in files]
 
 
+def recording_files(paths: Iterable[str | Path] | str | Path) -> list[Path]:
+    """The files that files and folders name, folders in the order of their files' names."""
+    given = [paths] if isinstance(paths, str | Path) else paths
+    return _find([Path(p) for p in given], _warn)
+
+
 def _warn(message: str) -> None:
     warnings.warn(message, stacklevel=2)
 
@@ -90,7 +96,7 @@ def _in_folder(folder: Path) -> list[Path]:
 
 def _read(path: Path, warn: Warn) -> Recording:
     """One recording with every check of the format."""
-    table = _open(path)
+    table = open_table(path)
     header = f"{path}, line 1" if path.suffix == ".csv" else f"{path}"
     layout = parse_header(table.names, header)
     for name in layout.ignored:
@@ -107,7 +113,7 @@ def _read(path: Path, warn: Warn) -> Recording:
     return recording
 
 
-def _open(path: Path) -> DelimitedText | ParquetTable:
+def open_table(path: Path) -> DelimitedText | ParquetTable:
     """The table of a file; its columns are not read yet."""
     if path.suffix not in SUFFIXES and path.exists() and not path.is_dir():
         raise InputError(

@@ -215,8 +215,8 @@ def diagnose(
     """Name the effects that a model is missing on recordings of its own arm.
 
     Model and recordings may be given by their paths; a model of other origin as for `compare`.
-    Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
-    recordings.
+    Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is
+    looked for: `Diagnosis.setup` mends the recordings.
 
     Only the training rows are looked at: the view of the residual table that is worked on holds no
     other key points. before: recordings from before a change in question. Where they were made with

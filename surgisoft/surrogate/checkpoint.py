@@ -51,8 +51,8 @@ NETWORKS = {
 
 
 SAME_MM = 0.01
-"""Largest distance of a key point at rest, mm, between a saved callable model and the callable as it
-is now: effects that were fitted around another callable do not belong to this one."""
+"""Largest distance of a key point at rest, mm, between a saved callable model and the callable as
+it is now: effects that were fitted around another callable do not belong to this one."""
 
 
 def _network_config(network) -> dict:
@@ -233,14 +233,14 @@ def load_model(
 
 
 def _check_same_callable(model: ArmModel, label: str) -> None:
-    """Raise InputError where a callable is not the one that the saved effects were fitted around."""
+    """Raise InputError where a callable is not the one that effects were fitted around."""
     with torch.no_grad():
         now = model.network(model.rest[None], torch.zeros_like(model.rest)[None])[0]
     off = float((now - model.rest_mm).norm(dim=-1).max())
     if off > SAME_MM:
         raise InputError(
-            f"{label}: {model.network.name} puts a key point at rest {off:.3g} mm from where it was "
-            "when the effects were fitted; name the callable as it was, or amend it again"
+            f"{label}: {model.network.name} puts a key point at rest {off:.3g} mm from where it "
+            "was when the effects were fitted; name the callable as it was, or amend it again"
         )
 
 

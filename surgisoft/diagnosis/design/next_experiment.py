@@ -619,7 +619,8 @@ def next_experiment(
     """The experiment that best distinguishes competing effects.
 
     Model and recordings may be given by their paths; a model of other origin as for `compare`.
-    The recordings are looked at as `diagnose` does: the training part, the direction of gravity, the residuals of the model's fit.
+    The recordings are looked at as `diagnose` does: the training part, the
+    direction of gravity, the residuals of the model's fit.
 
     between: the competing effects; without them those that explain the recordings best, and
     without recordings all known ones.

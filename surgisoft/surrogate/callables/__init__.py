@@ -1,1 +1,1 @@
-"""Models of other origin in the place of the network: Python callables, and files of predictions."""
+"""Models of other origin in the place of the network: callables, and files of predictions."""

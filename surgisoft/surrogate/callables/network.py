@@ -20,9 +20,9 @@ from surgisoft.surrogate.callables.named import Named, checked_points, raised_by
 from surgisoft.surrogate.history import History
 
 DIFFERENCE = 5e-3
-"""Half width of a central difference, as a share of a chamber's range: the error of a smooth model's
-slope is of the order of its square, and a solver that is right to 1e-3 mm is off by 0.1 mm in the
-motion over the whole range."""
+"""Half width of a central difference, as a share of a chamber's range: the error of a smooth
+model's slope is of the order of its square, and a solver that is right to 1e-3 mm is off by 0.1 mm
+in the motion over the whole range."""
 CACHED = 64
 """Runs whose key points are cached, for callables of whole runs (a count)."""
 
@@ -157,7 +157,7 @@ class CallableNetwork(nn.Module):
     def slope_along(
         self, actuation: Tensor, history: History, memory: Tensor | None, rows: Callable
     ) -> Tensor:
-        """(S, n, 3, m) derivative of the key points by a constant offset of each chamber, mm a unit.
+        """(S, n, 3, m) derivative of key points by a constant offset of each chamber, mm a unit.
 
         The offset holds for the whole run, so the callable's own memory follows it. rows: picks the
         rows (S, ...) of a (R, T, ...) tensor.

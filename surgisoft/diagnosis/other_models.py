@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.history_features import features, memory_of
+from surgisoft.diagnosis.history_features import RADII, TIMES_S, memory_of
 from surgisoft.diagnosis.residuals import blocks, folds, half_range, motions
 from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, history_of
@@ -37,6 +37,7 @@ from surgisoft.surrogate.callables.named import (
 from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.callables.predicted import PredictedNetwork, monomials, powers
 from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel, Validation
 
 FIT_ROWS = 4000
@@ -45,6 +46,11 @@ DEGREES = (1, 2, 3, 4, 5)
 """Total degrees of the polynomial that are tried; held-out blocks choose."""
 RIDGES = (1e-8, 1e-6, 1e-4, 1e-2)
 """Ridges that are tried, on columns of unit variance, as a share of the rows."""
+LARGEST_PLAY = 0.25
+"""Largest radius of a play operator beside the polynomial, in half ranges; with a larger one, play
+and actuation differ by nearly the actuation itself, whose slope it would take."""
+LONGEST_S = 1.5
+"""Longest time constant of a low pass beside it, s, for the same reason."""
 ROWS_A_TERM = 4
 """Fewest rows for each term of the polynomial and each feature."""
 LEAST_REPRODUCED = 0.9
@@ -241,10 +247,9 @@ def polynomial_of(recordings: Sequence[Recording], spec: ArmSpec, name: str) -> 
     low, high = np.array(spec.low), np.array(spec.high)
     x = history.rows(history.pressure).double().numpy()
     x = (x - (low + high) / 2) / half_range(spec)
-    timed = bool((history.dt_s > 0).any())
-    past = features(memory_of(history, spec), spec, None, timed)[:, spec.chambers :]
+    past = _past(history, spec)
     x, past, y = x[::step], past[::step], target[::step].reshape(-1, target[0].size)
-    past = past - past.mean(0)
+    # Zero at rest without a past, so that the polynomial's constant is the body at rest.
     past = past[:, past.std(0) > 1e-9]
     motion = float(np.square(y - y.mean(0)).sum())
     best: tuple[float, int, float] | None = None
@@ -275,6 +280,19 @@ def polynomial_of(recordings: Sequence[Recording], spec: ArmSpec, name: str) -> 
         name,
         1.0 if motion <= 0 else max(0.0, 1.0 - left / motion),
     )
+
+
+def _past(history: History, spec: ArmSpec) -> np.ndarray:
+    """(N, P) directions of change, and how far play operators and low passes lag behind, in half
+    ranges: loops and lags of the model. An offset of the whole actuation changes none of them."""
+    memory, half = memory_of(history, spec), half_range(spec)
+    parts = [memory.direction]
+    plays = [k for k, radius in enumerate(RADII) if radius <= LARGEST_PLAY]
+    parts += [(memory.play[..., k] - memory.pressure) / half for k in plays]
+    if bool((history.dt_s > 0).any()):
+        passes = [k for k, time_s in enumerate(TIMES_S) if time_s <= LONGEST_S]
+        parts += [(memory.low_pass[..., k] - memory.pressure) / half for k in passes]
+    return np.concatenate(parts, axis=1)
 
 
 def _columns(x: np.ndarray, past: np.ndarray, exponents: np.ndarray) -> np.ndarray:

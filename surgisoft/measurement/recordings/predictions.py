@@ -102,7 +102,7 @@ def _rows(
     own = recording.run if "run" in table.names else np.zeros(recording.samples, np.int64)
     if "run" in table.names:
         run = table.numbers([table.names.index("run")])[:, 0]
-    elif len(recording.runs) > 1 and count != recording.samples:
+    elif count != recording.samples and len(np.unique(recording.t_s)) < recording.samples:
         raise InputError(
             f"{path}: {count} rows, but {recording.label} has {recording.samples} in "
             f"{len(recording.runs)} runs; expected a column 'run' to match them by"

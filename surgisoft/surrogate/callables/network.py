@@ -121,14 +121,7 @@ class CallableNetwork(nn.Module):
 
         def evaluate(actuation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             copies = len(actuation) // len(before)
-            old, time = np.tile(before, (copies, 1)), np.tile(dt_s, copies)
-            result = self._call("step", old, actuation, time)
-            if not (isinstance(result, tuple | list) and len(result) == 2):
-                came = type(result).__name__
-                raise InputError(f"{self.name}: step returned {came}, expected (state, key points)")
-            state = self._state(result[0], len(actuation), before.shape[1])
-            shape = ((len(actuation),), actuation.shape[1], self.key_points)
-            return state, checked_points(self.name, result[1], *shape)
+            return self._step(np.tile(before, (copies, 1)), actuation, np.tile(dt_s, copies))
 
         state, known = evaluate(_numbers(pressure))
         points = self._differentiable(lambda moved: evaluate(moved)[1], pressure, known)
@@ -147,12 +140,12 @@ class CallableNetwork(nn.Module):
             return torch.from_numpy(points).to(actuation)
         if memory is None:
             memory = self.rest(actuation[:, 0])
-        dt_s, rows = history.dt_s.double(), []
-        with torch.no_grad():
-            for row in range(actuation.shape[1]):
-                memory = self.advance(memory, actuation[:, row], actuation[:, row], dt_s[:, row])
-                rows.append(self(actuation[:, row], actuation[:, row], memory))
-        return torch.stack(rows, 1)
+        state = _numbers(memory[:, : memory.shape[1] - 3 * self.key_points])
+        moved, dt_s = _numbers(actuation), _numbers(history.dt_s)
+        points = np.empty((*moved.shape[:2], self.key_points, 3))
+        for row in range(moved.shape[1]):
+            state, points[:, row] = self._step(state, moved[:, row], dt_s[:, row])
+        return torch.from_numpy(points).to(actuation)
 
     def slope_along(
         self, actuation: Tensor, history: History, memory: Tensor | None, rows: Callable
@@ -194,6 +187,18 @@ class CallableNetwork(nn.Module):
         slope = torch.from_numpy(np.moveaxis(up - down, 0, -1) / (2.0 * step)).to(actuation)
         away = actuation - actuation.detach()
         return value + torch.einsum("...njm,...m->...nj", slope.view(*shape, len(step)), away)
+
+    def _step(
+        self, state: np.ndarray, actuation: np.ndarray, dt_s: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """State (B, k) and key points (B, n, 3) after actuation (B, m) was held for dt_s (B,)."""
+        result = self._call("step", state, actuation, dt_s)
+        if not (isinstance(result, tuple | list) and len(result) == 2):
+            came = type(result).__name__
+            raise InputError(f"{self.name}: step returned {came}, expected (state, key points)")
+        fresh = self._state(result[0], len(actuation), state.shape[1])
+        shape = ((len(actuation),), actuation.shape[1], self.key_points)
+        return fresh, checked_points(self.name, result[1], *shape)
 
     def _static(self, actuation: np.ndarray) -> np.ndarray:
         """(S, n, 3) key points of rows (S, m) of a static callable."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from surgisoft.cli import run
+from surgisoft.diagnosis.other_models import open_model
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.rig import VirtualRig
@@ -61,7 +62,7 @@ BAD = {
     "compare nowhere bench.parquet": "no arm model there",
     "compare lab bench.parquet --predictions short.csv": "595 rows",
     "compare lab bench.parquet --predictions few.csv": "4 key points, expected 5",
-    "compare lab bench.parquet --predictions lab.csv lab.csv": "given twice",
+    "compare lab bench.parquet --predictions lab.csv lab.csv": "2 files of predictions for 1",
     "compare lab bench.parquet --predictions no.csv": "no such file",
     "compare default bench.parquet --predictions lab.csv": "takes the place of one",
     "compare default bench.parquet --model-error 0.5": "only with a callable",
@@ -85,7 +86,7 @@ def test_bad_input_is_one_line(command, bench, capsys):
 
 
 def test_a_callable_and_its_predictions_give_one_comparison(capsys, tmp_path):
-    """RMSE as NumPy computes it; the predictions as a name with a file, and as the model."""
+    """RMSE as NumPy computes it; the predictions as a name with a file, or as the model itself."""
     recording = load_recording("bench.parquet")
     points = np.loadtxt("lab.csv", delimiter=",", skiprows=1).reshape(recording.samples, 5, 3)
     square = np.square(recording.key_points_mm - points).sum(-1)
@@ -94,7 +95,6 @@ def test_a_callable_and_its_predictions_give_one_comparison(capsys, tmp_path):
     for model, more in (
         ("my_arm.py:arm", ""),
         ("lab", "--predictions lab.csv --model-error 1.5"),
-        ("lab.csv", "--model-error 1.5"),
     ):
         file = tmp_path / f"{len(told)}.json"
         view = tmp_path / "view.rrd"
@@ -103,11 +103,13 @@ def test_a_callable_and_its_predictions_give_one_comparison(capsys, tmp_path):
         assert view.stat().st_size > 10_000
         found = json.loads(file.read_text())
         assert found["rmse_mm"] == pytest.approx(truth, abs=1e-5)
-        told.append([found["rmse_mm"], found["ceiling_mm"]])
+        told.append(found["axes"][0]["axis"])
         printed = capsys.readouterr().out
-        expected = f"surgisoft diagnose {model} bench.parquet {more.replace('--model', '--model')}"
-        assert expected.strip() in printed
-    assert told[1] == told[2]
+        assert f"surgisoft diagnose {model} bench.parquet {more}".strip() in printed
+    assert told[0] == told[1]
+    short = open_model("lab.csv", "bench.parquet")
+    np.testing.assert_array_equal(short.recordings[0].predicted_mm, points)
+    assert short.model.network.name == "lab"
 
 
 def test_an_amended_callable_is_a_model_folder(capsys, tmp_path):

@@ -54,9 +54,13 @@ def load_recordings(
 
 
 def recording_files(paths: Iterable[str | Path] | str | Path) -> list[Path]:
-    """The files that files and folders name, folders in the order of their files' names."""
+    """The files that files and folders name, folders in the order of their files' names.
+
+    A file that is named twice counts twice.
+    """
     given = [paths] if isinstance(paths, str | Path) else paths
-    return _find([Path(p) for p in given], _warn)
+    each = (_in_folder(Path(p)) if Path(p).is_dir() else [Path(p)] for p in given)
+    return [file for part in each for file in part]
 
 
 def _warn(message: str) -> None:

@@ -31,7 +31,7 @@ def test_the_snippets_run_as_they_stand(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.chdir(tmp_path)
     rig = VirtualRig(0, take=7, hidden=(("payload", 1.0),))
-    save_recording(rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0], "bench.parquet")
+    save_recording(rig.record(make_protocol("mixed", rig.limits, 400, seed=2))[0], "bench.parquet")
     parts = blocks()
     assert {"my_arm.py", "lagging.py"} <= set(parts)
     for name, text in parts.items():

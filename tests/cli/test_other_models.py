@@ -24,7 +24,7 @@ def bench(tmp_path_factory):
             (folder / name).write_text(text)
     rig = VirtualRig(0, take=7, hidden=(("payload", 1.0),))
     save_recording(
-        rig.record(make_protocol("mixed", rig.limits, 600, seed=2))[0], folder / "bench.parquet"
+        rig.record(make_protocol("mixed", rig.limits, 400, seed=2))[0], folder / "bench.parquet"
     )
     recording = load_recording(folder / "bench.parquet")
     spec: dict = {}
@@ -60,7 +60,7 @@ BAD = {
     "compare bad.py:none bench.parquet": "there is no 'none'",
     "diagnose nowhere.model:arm bench.parquet": "cannot be imported",
     "compare nowhere bench.parquet": "no arm model there",
-    "compare lab bench.parquet --predictions short.csv": "595 rows",
+    "compare lab bench.parquet --predictions short.csv": "395 rows",
     "compare lab bench.parquet --predictions few.csv": "4 key points, expected 5",
     "compare lab bench.parquet --predictions lab.csv lab.csv": "2 files of predictions for 1",
     "compare lab bench.parquet --predictions no.csv": "no such file",

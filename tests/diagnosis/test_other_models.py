@@ -8,7 +8,6 @@ import torch
 
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.compare import compare
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.other_models import (
     callable_arm,
@@ -67,13 +66,13 @@ def table_of(path, points, **columns):
     return path
 
 
-def test_a_comparison_is_that_of_the_arm(loaded, with_file):
-    truth, _ = compare(ARM, loaded, part="training")
-    for model, recording in ((whole_runs, loaded), (by_file(with_file), with_file)):
-        found, _ = compare(model, recording, part="training")
-        assert found.rmse_mm == pytest.approx(truth.rmse_mm, abs=1e-5)
-        assert found.per_key_point_mm == pytest.approx(truth.per_key_point_mm, abs=1e-5)
-        assert found.axes[0].axis == truth.axes[0].axis
+def test_the_residuals_are_those_of_the_arm(loaded, with_file):
+    truth = residual_table(ARM, [loaded])
+    called = callable_arm(given_callable(whole_runs), [loaded])
+    for model, recording in ((called, loaded), (by_file(with_file), with_file)):
+        found = residual_table(model, [recording])
+        np.testing.assert_allclose(found.residual_mm, truth.residual_mm, atol=1e-4)
+        assert np.nanmax(np.abs(found.residual_mm)) > 1
 
 
 def test_sensitivities_from_predictions_are_those_of_the_arm(loaded, with_file):
@@ -109,7 +108,7 @@ def test_amend_puts_an_effect_behind_a_callable(loaded):
     truth = amend(ARM, loaded, "payload", retune_network=False, refit="never")
     found = amend(model, loaded, "payload", refit="never")
     assert found.claimed
-    assert found.held_out.after == pytest.approx(truth.held_out.after, rel=0.05)
+    assert found.held_out.after == pytest.approx(truth.held_out.after, rel=0.15)
     assert found.model.network.named.model is whole_runs
     values = {each.name: each.value for each in truth.parameters}
     for each in found.parameters:

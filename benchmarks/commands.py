@@ -264,6 +264,38 @@ def control(
 
 
 @app.command()
+def live(
+    robots: Annotated[
+        str, typer.Option(help="Seeds of the robots, with commas.")
+    ] = "204,205,206,207",
+    hours: Annotated[
+        float, typer.Option(min=0.2, help="Hours of clean rig for each robot and motion.")
+    ] = 5.0,
+    models: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
+    ] = Path("runs/benchmark-live"),
+    processes: Annotated[int, typer.Option(min=1, help="Number of recordings in parallel.")] = 2,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """False alarms of the change detector on a clean rig, and its delay after a change."""
+    from dataclasses import asdict
+
+    from benchmarks.live import markdown, run
+
+    check_free(json_file, "clean")
+    check_folder(models)
+    numbers = _numbers("--robots", robots)
+    with progress("live") as report:
+        clean, changes = run(numbers, hours, models, processes, report)
+    if json_file:
+        both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
+        write_json(json_file, both)
+    command = f"surgisoft benchmark live --robots {robots} --hours {hours:g}"
+    _show("Live: false alarms and delays", command, markdown(clean, changes), output)
+
+
+@app.command()
 def real(
     entries: Annotated[
         list[Path] | None,

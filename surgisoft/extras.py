@@ -19,6 +19,7 @@ EXTRA_OF = {
     "rerun": "replay",
     "rerun_cli": "replay",
     "elastica": "elastica",
+    "serial": "serial",
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",
@@ -31,6 +32,7 @@ EXTRA_OF_USE = {
     "evaluate": "train",
     "export": "train",
     "make": "train",
+    "batched_env": "scene",
     "parallel_env": "train",
     "experiment": "all",
 }

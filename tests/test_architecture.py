@@ -27,11 +27,13 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
     "cli": {
         "agents",
         "experiments",
+        "live",
         "tasks",
         "scene",
         "surrogate",
@@ -86,6 +88,7 @@ FLOORS = {
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
+        ("live_view",),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),
@@ -115,6 +118,7 @@ ONLY_IN = {
     "rsl_rl": "agents",
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
+    "serial": "rig/drivers/serial_controller",
 }
 
 

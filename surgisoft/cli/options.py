@@ -166,8 +166,9 @@ Hidden = Annotated[
     list[str] | None,
     Option(
         "--hidden",
-        metavar="NAME[:X]...",
-        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1.",
+        metavar="NAME[:X][@S]...",
+        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1. "
+        "On the virtual rig @S lets one begin S seconds after the first reset.",
     ),
 ]
 Arm = Annotated[

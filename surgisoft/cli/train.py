@@ -1,4 +1,4 @@
-"""`surgisoft train` and `surgisoft export`: train policies, and write them for other programs."""
+"""`surgisoft train`: train the agents of a task."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +10,6 @@ from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
     EffectFiles,
-    Run,
     SceneFolder,
     TaskConfig,
     Threads,
@@ -123,17 +122,3 @@ def _summary(folder: Path, result) -> str:
         f"wrote {folder}: {result.steps:,} steps in {result.wall_s:.0f} s "
         f"({result.cpu_s:.0f} s of processor), best {_measures(result.best)}"
     )
-
-
-@app.command()
-def export(
-    run: Run,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
-    which: Annotated[str, typer.Option(metavar="best|last", help="Checkpoint.")] = "best",
-) -> None:
-    """Write a run's policies as ONNX and TorchScript, one file of each for every agent."""
-    from surgisoft.agents.export import export as export_policy
-    from surgisoft.agents.learned import LearnedPolicy
-
-    for file in export_policy(LearnedPolicy(run, which=which), output):
-        print(f"wrote {file}")

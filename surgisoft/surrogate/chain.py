@@ -142,8 +142,12 @@ class Standing(Stepping):
     """
 
     def __init__(self, state: ArmState):
-        """state: arms at rest, before they are held at another actuation."""
-        super().__init__(state, Context(state.pressure.new_full((len(state.pressure),), STOOD_S)))
+        """state: arms at rest, before they are held at another actuation.
+
+        The recording begins afterwards, so that no time has elapsed in it yet.
+        """
+        held = torch.full_like(state.pressure[:, 0], STOOD_S)
+        super().__init__(state, Context(held, torch.zeros_like(held)))
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
         """Signal behind an effect: a material effect has followed, any other has reached steady

@@ -139,6 +139,11 @@ class ArmModel(nn.Module):
         """The chain of this model's links."""
         return Chain(self.network, self.effects, self.rest, self.band, self.still, self.idle)
 
+    def freeze(self) -> None:
+        """Fix what the network's program takes from its parameters, so that it can be a graph."""
+        if isinstance(self.network, ConstantCurvature):
+            self.network.fix_sections()
+
     @property
     def facts(self) -> ArmFacts:
         """The properties of this arm that effects may use, on the CPU."""

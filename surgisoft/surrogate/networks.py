@@ -256,6 +256,7 @@ class ConstantCurvature(nn.Module):
         if key_points < 2:
             raise InputError("constant curvature needs at least 2 key points; this arm has 1")
         self.key_points, self.sections = key_points, sections
+        self._on: list[int] | None = None
         centre, half = centre_and_half(low, high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
@@ -264,6 +265,15 @@ class ConstantCurvature(nn.Module):
         self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))
         self.base_turn = nn.Parameter(torch.zeros(3))
         self.base_mm = nn.Parameter(torch.zeros(3))
+
+    def _sections_of_points(self) -> list[int]:
+        """The section that each key point is on."""
+        place = (self.fraction.detach() * self.sections).floor()
+        return place.clamp(0, self.sections - 1).long().tolist()
+
+    def fix_sections(self) -> None:
+        """Keep each key point on its section from now on, whatever becomes of the spacing."""
+        self._on = self._sections_of_points()
 
     def set_rest(self, rest: Tensor) -> None:
         """Set base, length and spacing from the key points at rest, (n, 3) in mm, base frame."""
@@ -282,13 +292,13 @@ class ConstantCurvature(nn.Module):
         turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         start = self.base_mm.expand(*x.shape[:-1], 3)
         points = [start] * self.key_points
+        on = self._sections_of_points() if self._on is None else self._on
         for section in range(self.sections):
             bend = values[..., section, :2]
             length = self.length / self.sections * values[..., section, 2].exp()
             for k in range(self.key_points):
                 share = self.fraction[k] * self.sections - section
-                last = section == self.sections - 1
-                if (share >= 0 or section == 0) and (share < 1 or last):
+                if on[k] == section:
                     local = arc_point(bend * share, length * share)
                     points[k] = start + (turn @ local[..., None])[..., 0]
             start = start + (turn @ arc_point(bend, length)[..., None])[..., 0]
@@ -395,8 +405,9 @@ class RecurrentArm(nn.Module):
 
         dt_s (B,) does not count: a recurrent unit takes row by row.
         """
-        x = self._inputs(pressure, direction).unsqueeze(1)
-        return self.cell(x, memory.unsqueeze(0))[1].squeeze(0)
+        cell = self.cell
+        weights = (cell.weight_ih_l0, cell.weight_hh_l0, cell.bias_ih_l0, cell.bias_hh_l0)
+        return torch.gru_cell(self._inputs(pressure, direction), memory, *weights)
 
     def scan(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
         """(R, T, width) hidden states along pressure and direction, each (R, T, m)."""

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.observations import (
     TIME,
@@ -26,7 +26,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut, point_on_closed
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.scene import PHANTOM
+from surgisoft.tasks.world.scene import PHANTOM, SceneState, measured_view
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 BEAM_ERROR = Block(
@@ -35,16 +35,20 @@ BEAM_ERROR = Block(
     "mm",
     "asinh(x / 1 mm)",
 )
-RING_PLACE = Block("ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)")
-RING_DIRECTION = Block("ring_direction", "direction of travel along the ring, +1 or -1", "-", "x")
+RING_PLACE = Block(
+    "ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)", -1.0, 1.0
+)
+RING_DIRECTION = Block(
+    "ring_direction", "direction of travel along the ring, +1 or -1", "-", "x", -1.0, 1.0
+)
 VIEW_ERROR = Block(
     "view_error",
     "perpendicular offset of the lesion's centre from the measured axis of the camera",
     "mm",
     "asinh(x / 1 mm)",
 )
-VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x")
-FIRED = Block("fired", "1 if the beam was on in the last step, else 0", "-", "x")
+VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x", 0.0, 1.0)
+FIRED = Block("fired", "1 if the beam was on in the last step, else 0", "-", "x", 0.0, 1.0)
 APART = Block("apart", "measured tip of the laser arm minus that of the endoscope", "mm", "x / 50")
 
 
@@ -126,10 +130,22 @@ class CircleAblationConfig:
         check_weights("circle_ablation: endoscope", self.weights.endoscope)
 
 
+def success_rule(config: CircleAblationConfig) -> str:
+    """What an episode needs to be a success, in words; `measures` computes it."""
+    return (
+        f"the whole ring is cut, without contact; the beam is on only within {config.fire_mm:g} mm "
+        f"of its target (fire_mm), which goes once around in {config.cut_s:g} s (cut_s)"
+    )
+
+
 class CircleAblation:
     """The two arms of a scene: agents `laser` and `endoscope`."""
 
     name, agents = "circle_ablation", ("laser", "endoscope")
+    signals = (
+        Signal("view_fraction", "share of the ring that the endoscope sees", "-", 0.0, 1.0),
+        Signal("beam_on", "1 if the beam was on since the last decision, else 0", "-", 0.0, 1.0),
+    )
 
     def __init__(
         self, config: CircleAblationConfig | None = None, device: str | torch.device = "cpu"
@@ -186,6 +202,26 @@ class CircleAblation:
         fired = self.fires(state) if fired is None else fired
         world = self.world.step(state.world, actions, fired * self.spec.laser.power_w)
         return TaskState(world, state.goal.after(fired))
+
+    def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
+        """The view of the ring; see `MeasuredTask.measured_scene`."""
+        return replace(measured_view(signals["view_fraction"]), lesion=lesion)
+
+    def true_signals(
+        self, before: TaskState[RingCut] | None, after: TaskState[RingCut]
+    ) -> dict[str, Tensor]:
+        """The signals of a simulated step; see `MeasuredTask.true_signals`."""
+        return {
+            "view_fraction": after.world.scene.view.fraction,
+            "beam_on": after.goal.fired.float(),
+        }
+
+    def advance_measured(
+        self, state: TaskState[RingCut], signals: Mapping[str, Tensor]
+    ) -> TaskState[RingCut]:
+        """Advance where the beam was on or off as measured; see `MeasuredTask`."""
+        none = {name: arm.low.new_zeros(1, arm.chambers) for name, arm in self.world.arms.items()}
+        return self.advance(state, none, signals["beam_on"] > 0.5)
 
     def blocks(self, state: TaskState[RingCut]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body and pointing error of each arm, and the state of the cut."""

@@ -32,7 +32,7 @@ STUCK_MM = 0.02
 
 SHAPE = Block("shape", "measured key points relative to their rest positions", "mm", "x / 10")
 ERROR = Block("error", "target minus measured key points, base excluded", "mm", "asinh(x / 1 mm)")
-TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1")
+TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1", -1.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -211,3 +211,64 @@ def test_impossible_lesions_are_one_line():
     vary = Randomisation(lesion_mm=400.0, lesions=3)
     with pytest.raises(InputError, match="up to 400 mm; expected at most"):
         CircleAblation(CircleAblationConfig(world=WorldConfig(randomisation=vary)))
+
+
+def with_scene(state, **parts):
+    """The state with fields of its scene replaced."""
+    scene = replace(state.world.scene, **parts)
+    return replace(state, world=replace(state.world, scene=scene))
+
+
+def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
+    """The formulas of `LaserWeights` and `EndoscopeWeights`, term by term."""
+    state = cut[0][5]
+    on = torch.tensor([True, False])
+    reward = quick.rewards(replace(state, goal=replace(state.goal, fired=on)))
+    for agent in quick.agents:
+        assert reward[agent]["cut"].tolist() == [1.0, 0.0]
+    error = quick.beam_error_mm(state)
+    torch.testing.assert_close(reward["laser"]["far"], 10.0 / (10.0 + error))
+    torch.testing.assert_close(reward["laser"]["aim"], torch.exp(-error))
+    torch.testing.assert_close(reward["laser"]["fine"], torch.exp(-error / 0.1))
+    view = replace(
+        state.world.scene.view,
+        axis_error_mm=torch.tensor([0.0, 10.0]),
+        fraction=torch.tensor([0.25, 1.0]),
+    )
+    looks = quick.rewards(with_scene(state, view=view))["endoscope"]
+    assert looks["look"].tolist() == [1.0, 0.5]
+    assert looks["view"].tolist() == [0.25, 1.0]
+
+
+def test_contact_costs_from_the_scenes_clearance_on(quick, cut):
+    state, limit = cut[0][0], quick.spec.limits.clearance_mm
+    clearance = state.world.scene.clearance
+    near = torch.full_like(clearance.bodies_mm, limit - 0.01)
+    near[1] = limit + 0.01
+    far = torch.full_like(clearance.arms_mm, 50.0)
+    close = with_scene(state, clearance=replace(clearance, bodies_mm=near, arms_mm=far))
+    for terms in quick.rewards(close).values():
+        assert terms["contact"].tolist() == [-1.0, 0.0]
+
+
+def test_an_arm_in_front_of_the_camera_or_the_beam_hides_what_is_behind(quick, cut):
+    """The other arm lies straight across the line from the tool's tip to the lesion's centre."""
+    state = cut[0][40]
+    world, engine = state.world, quick.scene
+    assert (world.scene.view.fraction == 1.0).all()
+    assert world.scene.hit.on_organ.all()
+    for tool, other in (("endoscope", "laser"), ("laser", "endoscope")):
+        tip, target = world.arms[tool].tip_mm, quick.centre_mm(state)
+        if tool == "laser":
+            target = world.scene.hit.point_mm
+        towards = torch.nn.functional.normalize(target - tip, dim=1)
+        across = torch.linalg.cross(towards, torch.tensor([[0.0, 0.0, 1.0]]).expand_as(towards))
+        across = torch.nn.functional.normalize(across, dim=1)[:, None]
+        along = torch.linspace(-60.0, 60.0, world.arms[other].line_mm.shape[1])[None, :, None]
+        line = 0.5 * (tip + target)[:, None] + along * across
+        parts = {**world.arms, other: replace(world.arms[other], line_mm=line)}
+        seen = engine.step(world.scene, parts, 0.0, quick.dt_s)
+        if tool == "endoscope":
+            assert (seen.view.fraction < 0.7).all()
+        else:
+            assert not seen.hit.on_organ.any()

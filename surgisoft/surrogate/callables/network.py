@@ -165,6 +165,13 @@ class CallableNetwork(nn.Module):
             slopes.append((ends[0] - ends[1]) / (2.0 * size))
         return torch.stack(slopes, -1).to(actuation.dtype)
 
+    def no_graph(self) -> InputError:
+        """The InputError for an export: what the callable computes is not in PyTorch's graph."""
+        return InputError(
+            f"{self.name} is a Python callable, which cannot be written as a graph: expected a "
+            "model that 'surgisoft fit' made; use the callable itself where you need its graph"
+        )
+
     # The callable -------------------------------------------------------------------------
 
     def _differentiable(
@@ -229,6 +236,8 @@ class CallableNetwork(nn.Module):
 
     def _call(self, part: str, *arguments: np.ndarray) -> Any:
         """Call a method of the callable; whatever it raises becomes an InputError."""
+        if torch.jit.is_tracing() or torch.compiler.is_compiling():
+            raise self.no_graph()
         model = self.named.model
         method = model if part == "__call__" else getattr(model, part)
         try:

@@ -305,7 +305,9 @@ class ModelArm:
         _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
         return frames.apply(self.pose, points)
 
-    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
+    def bent(
+        self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
+    ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
         state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
         return state, frames.apply(part.mount, points)

@@ -57,6 +57,19 @@ class SceneState:
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
 
 
+def measured_view(fraction: Tensor) -> SceneState:
+    """A scene of which only the share (B,) of the ring that the endoscope sees is known."""
+    unknown = torch.full_like(fraction, torch.nan)
+    points = unknown[:, None].isfinite()
+    return SceneState(view=View(points, points, fraction, unknown, unknown, unknown))
+
+
+def measured_clearance(least_mm: Tensor) -> SceneState:
+    """A scene of which only one arm's least clearance (B,) mm to the bodies is known."""
+    least = least_mm[:, None]
+    return SceneState(BatchClearance(least[:, None], least[:, :0], torch.full_like(least, 1.0)))
+
+
 @dataclass(frozen=True)
 class SceneEngineConfig:
     """Resolution of the scene's computations, and the collision engine."""

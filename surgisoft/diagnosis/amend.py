@@ -16,6 +16,7 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
@@ -190,10 +191,12 @@ def amend(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    error_mm: float | None = None,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths; a callable, or its name, is a model too, with
+    error_mm as its validated error, mm (docs/your_model.md).
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
@@ -207,6 +210,8 @@ def amend(
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    refuse_predictions(model)
+    model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
     plain = table = residual_table(model, recordings)

@@ -29,6 +29,7 @@ from surgisoft.graphs import (
     write_torch_script_of,
 )
 from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.chain import STOOD_S, Signal, Standing, Stepping
 from surgisoft.surrogate.effects import EFFECTS, Context, Effect
 from surgisoft.surrogate.effects.user_defined import kind_of
@@ -39,7 +40,7 @@ FORMAT = 1
 """Version of `arm.json`."""
 TOLERANCE_MM = 1e-5
 """Largest accepted difference of any coordinate from `ArmModel.predict` over CHECKED rows, mm."""
-CHECKED = 200
+CHECKED = 100
 """Rows of the synthetic recording on which the files are compared."""
 ROOM_C = (15.0, 30.0)
 """Temperatures of the room in that recording, degrees Celsius."""
@@ -72,6 +73,8 @@ class ArmGraph(nn.Module):
 
     def __init__(self, model: ArmModel):
         super().__init__()
+        if isinstance(model.network, CallableNetwork):
+            raise model.network.no_graph()
         self.model = copy.deepcopy(model).double().eval().requires_grad_(False)
         self.model.freeze()
         with torch.no_grad():

@@ -66,18 +66,31 @@ def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
         assert load_recording(log).samples == 2
 
 
+SAMPLE = '{head}\n{"row":0,"run":RUN,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n'
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ("", "is empty, expected a surgisoft recording log"),
         ('{"a": 1}\n', "line 1: no surgisoft recording log"),
         ('{"format": "surgisoft recording log", "version": 9}\n', "line 1: version 9, expected 1"),
-        ('{"format": "surgisoft recording log", "version": 1}\n', "line 1: not a whole header"),
+        ('{"format": "surgisoft recording log", "version": 1}\n', "name: missing; expected text"),
+        (
+            '{head}\n{"row":0,"run":1e400,"t_s":0,"p":[1],"k":[[0,0,0]]}\n{}\n',
+            "'run' is number inf",
+        ),
+        (
+            '{head}\n{"row":0,"run":0,"t_s":0,"p":[9' + "9" * 400 + '],"k":[[0,0,0]]}\n{}\n',
+            "'p' is",
+        ),
+        ('{"a":' * 100_000 + "\n{}\n", "line 1: not a line of"),
+        ("{head}" + "\n" + "[" * 100_000 + "\n{}\n", "line 2: not a line of"),
         ("{head}\n", "the log has no sample yet"),
-        ('{head}\n{"row": 0}\n{"row": 1}\n', "line 2: 'run' is None, expected numbers of shape"),
+        ('{head}\n{"row": 0}\n{"row": 1}\n', "line 2: 'run' is value None, expected"),
         (
             '{head}\n{"row":0,"run":0,"t_s":0,"p":[1,2],"k":[[0,0,0]]}\n{}\n',
-            r"line 2: 'p' is \[1, 2\], expected numbers of shape \(1,\)",
+            r"line 2: 'p' is a list \[1, 2\], expected numbers of shape \(1,\)",
         ),
         ("{head}\nx\n{}\n", "line 2: not a line of a surgisoft recording log"),
     ],

@@ -53,6 +53,7 @@ FLOORS = {
     "diagnosis": (
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
+        ("other_models",),
         ("discrepancy", "data_quality", "error_axes", "inputs"),
         ("pairs",),
         ("cross_validation",),

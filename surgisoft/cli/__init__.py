@@ -48,8 +48,9 @@ MANY = {
         "--effects",
         "--hidden",
         "--label",
+        "--model-code",
     ),
-    *("--policy", "--strength", "--valid", "--without"),
+    *("--policy", "--predictions", "--strength", "--valid", "--without"),
 }
 """Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
 

@@ -18,6 +18,7 @@ from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
+from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
@@ -221,10 +222,12 @@ def amend(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    error_mm: float | None = None,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths; a callable, or its name, is a model too, with
+    error_mm as its validated error, mm (docs/your_model.md).
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
     retune_network: also re-tune the network's last layer, where the effects alone make the error of
@@ -239,6 +242,8 @@ def amend(
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    refuse_predictions(model)
+    model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
     sealed = Sealed(recordings)
@@ -282,10 +287,8 @@ def amend(
             # Tuned to what was measured: the network's own error is not in a paired difference.
             rows = plain.training()
             tried = retune(better, rows)
-            if (
-                tried.kept
-                and fall_of(rows.with_model(better), rows.with_model(tried.model)).claimed
-            ):
+            pair = rows.with_model(better), rows.with_model(tried.model)
+            if tried.kept and fall_of(*pair).claimed:
                 better, retuned = tried.model, True
         tell("evaluating on the held-out part")
         held_out = whole = (opened := sealed.opened(plain)).final_check()

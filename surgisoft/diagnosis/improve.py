@@ -16,6 +16,7 @@ from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plau
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.refit import JointFit, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
@@ -125,10 +126,12 @@ def improve(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    error_mm: float | None = None,
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths; a callable, or its name, is a model too, with
+    error_mm as its validated error, mm (docs/your_model.md).
 
     reference, refit, refit_progress, processes: as for `diagnose`. An effect that a refit names is
     fitted together with the whole network.
@@ -137,6 +140,8 @@ def improve(
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
+    refuse_predictions(model)
+    model, recordings, _ = open_model(model, recordings, None, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     known, sealed = model.training_residuals, Sealed(recordings)
     recordings = sealed.training

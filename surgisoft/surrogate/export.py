@@ -29,6 +29,7 @@ from surgisoft.graphs import (
     write_torch_script_of,
 )
 from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.chain import STOOD_S, Signal, Standing, Stepping
 from surgisoft.surrogate.effects import EFFECTS, Context, Effect
 from surgisoft.surrogate.effects.user_defined import kind_of
@@ -72,6 +73,8 @@ class ArmGraph(nn.Module):
 
     def __init__(self, model: ArmModel):
         super().__init__()
+        if isinstance(model.network, CallableNetwork):
+            raise model.network.no_graph()
         self.model = copy.deepcopy(model).double().eval().requires_grad_(False)
         self.model.freeze()
         with torch.no_grad():

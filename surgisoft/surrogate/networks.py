@@ -35,6 +35,8 @@ class HawNN(nn.Module):
     its activation; SiLU (Elfwing et al. 2018) is smooth, so that Jacobians are too, and fast.
     """
 
+    remembers = whole_runs = runs_only = False
+
     def __init__(
         self,
         low: Tensor,
@@ -109,6 +111,8 @@ class HawEnsemble(nn.Module):
     part of the error that differs between them (Breiman 1996; Lakshminarayanan et al. 2017). All
     K are evaluated by one batched product a layer.
     """
+
+    remembers = whole_runs = runs_only = False
 
     def __init__(
         self,
@@ -242,6 +246,7 @@ class ConstantCurvature(nn.Module):
     """Key points on constant-curvature arcs; ignores directions (Webster & Jones 2010)."""
 
     directions = False
+    remembers = whole_runs = runs_only = False
 
     def __init__(self, low: Tensor, high: Tensor, key_points: int, sections: int = 0):
         """Pressure range (m,) in the arm's unit; `sections` 0 means one for every 3 chambers."""
@@ -368,7 +373,8 @@ class ArcChain(nn.Module):
 class RecurrentArm(nn.Module):
     """Gated recurrent unit (Cho et al. 2014) from pressures and directions to key points."""
 
-    directions = True
+    directions = remembers = True
+    whole_runs = runs_only = False
 
     def __init__(self, low: Tensor, high: Tensor, key_points: int, width: int = 64):
         """Pressure range low, high (m,) in the arm's unit; `width` of the hidden state."""
@@ -392,8 +398,13 @@ class RecurrentArm(nn.Module):
         """(B, width) hidden state of an arm without history, for pressure (B, m)."""
         return pressure.new_zeros(len(pressure), self.width)
 
-    def advance(self, memory: Tensor, pressure: Tensor, direction: Tensor) -> Tensor:
-        """(B, width) hidden state after one row of pressure and direction, each (B, m)."""
+    def advance(
+        self, memory: Tensor, pressure: Tensor, direction: Tensor, dt_s: Tensor | None = None
+    ) -> Tensor:
+        """(B, width) hidden state after one row of pressure and direction, each (B, m).
+
+        dt_s (B,) does not count: a recurrent unit takes row by row.
+        """
         cell = self.cell
         weights = (cell.weight_ih_l0, cell.weight_hh_l0, cell.bias_ih_l0, cell.bias_hh_l0)
         return torch.gru_cell(self._inputs(pressure, direction), memory, *weights)

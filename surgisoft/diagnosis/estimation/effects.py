@@ -63,7 +63,7 @@ class Fitted:
 def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     """Fit the named effects in a problem's model; one that it lacks is added first."""
     model = copy.deepcopy(problem.model)
-    if model.remembers:
+    if not model.takes_effects:
         raise InputError(
             "effects are for models with a static network; the recurrent baseline takes none"
         )

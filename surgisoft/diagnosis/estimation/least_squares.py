@@ -288,7 +288,7 @@ def amplitude_sensitivities(model: ArmModel, forward: RepeatedScan, key: str) ->
     slope = None
     if effect.stage in ("line", "material"):
         taps = model.chain.scan(forward.history, forward.first_pressure, model.chain.inner)
-        slope = model.chain.network_slope(rows(taps.behind["material"]), rows(taps.direction))
+        slope = model.chain.slope(forward.history, forward.first_pressure, taps, rows)
     changes = model.chain.sensitivities(effect, rows(signal.value), memory, slope)
     return changes.movedim(0, -1).numpy()
 

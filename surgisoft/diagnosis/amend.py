@@ -285,8 +285,11 @@ def amend(
         if retune_network and shown_by_training:
             tell("re-tuning the network")
             # Tuned to what was measured: the network's own error is not in a paired difference.
-            tried = retune(better, plain.training())
-            better, retuned = tried.model, tried.kept
+            rows = plain.training()
+            tried = retune(better, rows)
+            pair = rows.with_model(better), rows.with_model(tried.model)
+            if tried.kept and fall_of(*pair).claimed:
+                better, retuned = tried.model, True
         tell("evaluating on the held-out part")
         held_out = whole = (opened := sealed.opened(plain)).final_check()
         if both is not None and both.used:

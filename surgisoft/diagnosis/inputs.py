@@ -12,11 +12,11 @@ from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
-Model = ArmModel | str | Path | Callable
-"""A model, its folder, a callable, the name of one, or a file of predictions (`open_model`)."""
 LEAST_KNOWN = 0.02
 """Least share of a recording's rows in the fit of a model that is reported."""
 
+Model = ArmModel | str | Path | Callable
+"""A model, its folder, a callable, the name of one, or a file of predictions (`open_model`)."""
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
 
@@ -35,8 +35,8 @@ def open_inputs(
     check_fits(arm.spec, measured, sized)
     turned, notes = under_weight(arm, measured)
     taken_part = part_in_fit(arm, measured)
-    every = (*notes_of(arm), *notes, *outside_range(arm.spec, measured), *taken_part)
-    return turned, measured, every
+    notes = (*notes_of(arm), *notes, *outside_range(arm.spec, measured), *taken_part)
+    return turned, measured, notes
 
 
 def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]:

@@ -90,7 +90,7 @@ def test_sensitivities_from_predictions_are_those_of_the_arm(loaded, with_file):
 
 
 def test_an_effect_in_front_of_predictions_moves_them_as_in_front_of_the_arm(loaded, with_file):
-    """A fifth more pressure in the chamber that moved most: the whole change, not to first order."""
+    """A fifth more pressure in the chamber that moved most: the whole change, not its slope."""
     most = int(np.ptp(loaded.measured, axis=0).argmax())
     changes = []
     for model, recording in ((ARM, loaded), (by_file(with_file), with_file)):

@@ -22,7 +22,8 @@ INSTALLED = packages()
 @pytest.mark.parametrize("package", INSTALLED, ids=lambda package: package.name)
 def test_a_dependency_is_compatible_with_mit(package):
     assert package.compatible, f"{package.name} {package.version}: {package.licence}"
-    assert f"| {package.name} |" in (ROOT / "docs" / "licences.md").read_text()
+    listed = f"| {package.name} |" in (ROOT / "docs" / "licences.md").read_text()
+    assert listed, "python -m benchmarks.supply_chain licences > docs/licences.md"
 
 
 def test_dependencies_of_dependencies_are_among_them():
@@ -70,4 +71,5 @@ def test_every_locked_package_has_a_hash_and_the_version_of_the_constraints():
     for name, version in locked.items():
         assert pinned.get(name, version) == version, name
     missing = {re.sub(r"[-_.]+", "-", one.name).lower() for one in project_requirements()}
-    assert missing - set(locked) == {UNHASHED}
+    how = "python -m benchmarks.supply_chain lock > requirements.lock"
+    assert missing - set(locked) == {UNHASHED}, how

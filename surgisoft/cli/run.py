@@ -54,7 +54,7 @@ def run(
     minutes: Annotated[
         float | None,
         typer.Option(
-            metavar="M", help="Length of the run; default: 10, or a schedule's own length."
+            metavar="MIN", help="Length of the run; default: 10, or a schedule's own length."
         ),
     ] = None,
     rate: Annotated[

@@ -20,6 +20,8 @@ EXTRA_OF = {
     "rerun_cli": "replay",
     "elastica": "elastica",
     "serial": "serial",
+    "mcap": "mcap",
+    "mcap_ros2": "mcap",
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",

@@ -118,6 +118,8 @@ ONLY_IN = {
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
     "serial": "rig/drivers/serial_controller",
+    "mcap": "measurement/importing/readers/mcap",
+    "mcap_ros2": "measurement/importing/readers/mcap",
 }
 
 

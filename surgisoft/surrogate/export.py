@@ -39,7 +39,7 @@ FORMAT = 1
 """Version of `arm.json`."""
 TOLERANCE_MM = 1e-5
 """Largest accepted difference of any coordinate from `ArmModel.predict` over CHECKED rows, mm."""
-CHECKED = 200
+CHECKED = 100
 """Rows of the synthetic recording on which the files are compared."""
 ROOM_C = (15.0, 30.0)
 """Temperatures of the room in that recording, degrees Celsius."""

@@ -25,6 +25,7 @@ from surgisoft.measurement.recordings import Recording, with_predictions
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables.named import given_callable
 from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.effects import make_effect
 from surgisoft.surrogate.history import pack
 
 ARM = default_arm()
@@ -86,6 +87,24 @@ def test_sensitivities_from_predictions_are_those_of_the_arm(loaded, with_file):
             x, y = a.sensitivities.ravel(), b.sensitivities.ravel()
             assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.9
             assert np.sqrt((y @ y) / (x @ x)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_effect_in_front_of_predictions_moves_them_as_in_front_of_the_arm(loaded, with_file):
+    """A fifth more pressure in the chamber that moved most: the whole change, not its slope."""
+    most = int(np.ptp(loaded.measured, axis=0).argmax())
+    changes = []
+    for model, recording in ((ARM, loaded), (by_file(with_file), with_file)):
+        gain = make_effect("gain_mismatch", ARM.facts)
+        gain.gain.data[most] = 0.2
+        history = history_of([recording])
+        after = model.replace(effects={**model.effects, "gain_mismatch": gain})
+        with torch.no_grad():
+            change = after.predict(history) - model.predict(history)
+        changes.append(history.rows(change).flatten().double().numpy())
+    x, y = changes
+    assert np.abs(x).max() > 2
+    assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.97
+    assert np.sqrt((y @ y) / (x @ x)) == pytest.approx(1.0, abs=0.15)
 
 
 def test_the_diagnosis_is_that_of_the_arm(loaded, with_file):

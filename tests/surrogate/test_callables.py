@@ -187,19 +187,21 @@ def test_a_stepped_callable_steps_as_the_arm_does():
         torch.testing.assert_close(second, first, atol=1e-4, rtol=0)
 
 
+class Late:
+    """A model that follows its actuation late: x by two, y by three times the pressure."""
+
+    low, high = (0.0, 0.0), (10.0, 10.0)
+
+    def initial_state(self, actuation):
+        return actuation.copy()
+
+    def step(self, state, actuation, dt_s):
+        state = state + 0.3 * (actuation - state)
+        return state, np.stack([2 * state[:, :1], 3 * state[:, 1:], 0 * state[:, :1]], -1)
+
+
 def test_the_slope_of_a_callable_with_memory_is_that_of_an_offset():
-    """A model that follows its actuation late: an offset of the whole run moves it by its gain."""
-
-    class Late:
-        low, high = (0.0, 0.0), (10.0, 10.0)
-
-        def initial_state(self, actuation):
-            return actuation.copy()
-
-        def step(self, state, actuation, dt_s):
-            state = state + 0.3 * (actuation - state)
-            return state, np.stack([2 * state[:, :1], 3 * state[:, 1:], 0 * state[:, :1]], -1)
-
+    """An offset of the whole run moves the late model by its gain."""
     model = around(Late())
     pressure = torch.rand(200, 2) * 10
     history = pack([torch.arange(200.0)], [pressure], [torch.full((200, 1, 3), torch.nan)])
@@ -208,6 +210,15 @@ def test_the_slope_of_a_callable_with_memory_is_that_of_an_offset():
     slope = model.chain.slope(history, first, taps, history.rows)[100:]
     expected = torch.tensor([[2.0, 0.0], [0.0, 3.0], [0.0, 0.0]]).expand(100, 1, 3, 2)
     torch.testing.assert_close(slope, expected, atol=1e-4, rtol=0)
+
+
+def test_a_run_that_begins_away_from_rest_begins_there():
+    """A hold at 8 and 4 from the first row on: nothing is left to follow."""
+    pressure = torch.tensor([[8.0, 4.0]]).expand(20, 2)
+    void = torch.full((20, 1, 3), torch.nan)
+    history = pack([torch.arange(20.0)], [pressure], [void], stood=[pressure[0]])
+    points = around(Late()).predict(history)[0]
+    torch.testing.assert_close(points, torch.tensor([16.0, 12.0, 0.0]).expand(20, 1, 3))
 
 
 ARM = """

@@ -22,6 +22,7 @@ Surgical tasks:
     train, evaluate              policies (PPO, centralised training, decentralised execution)
     run                          a policy or a schedule on a rig, with a model beside it
     open_scene, open_replay      scenes and episodes
+    demo                         the demonstration in five steps
 """
 
 from importlib import import_module
@@ -35,6 +36,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from surgisoft.agents.session import evaluate
     from surgisoft.agents.training_request import train
+    from surgisoft.demo.story import demo
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
     from surgisoft.diagnosis.design.next_experiment import next_experiment
@@ -62,6 +64,7 @@ _PLACES = {
     "batched_env": "tasks.batched",
     "collect": "rig.trial",
     "compare": "diagnosis.compare",
+    "demo": "demo.story",
     "diagnose": "diagnosis.diagnose",
     "evaluate": "agents.session",
     "fit": "measurement.fitting",
@@ -90,6 +93,7 @@ __all__ = [
     "batched_env",
     "collect",
     "compare",
+    "demo",
     "diagnose",
     "evaluate",
     "fit",

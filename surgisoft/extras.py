@@ -37,6 +37,7 @@ EXTRA_OF_USE = {
     "batched_env": "scene",
     "parallel_env": "train",
     "experiment": "all",
+    "demo": "all",
 }
 """The extra that a command or function needs in whole, by its name."""
 

@@ -18,6 +18,7 @@ app = typer.Typer(
 )
 
 COMMANDS = (
+    "demo",
     "collect",
     "import_",
     "fit",

@@ -207,6 +207,17 @@ REFIT_PROCESSES = min(2, os.cpu_count() or 1)
 """Processes that a refit trains in; the result does not depend on them."""
 
 Web = Annotated[bool, Option("--web", help="Show it in a browser; served to this machine only.")]
+Port = Annotated[
+    int | None,
+    Option(
+        "--port",
+        metavar="N",
+        min=1,
+        max=65534,
+        help="With --web: port of the page; the data take the next one. To look from another "
+        "machine: ssh -L N:localhost:N -L N+1:localhost:N+1.",
+    ),
+]
 Screenshot = Annotated[
     Path | None,
     Option(

@@ -189,7 +189,7 @@ def _show(found) -> None:
     if len(found.tracking) and not math.isnan(found.tracking_mm()):
         task = ", ".join(f"{name}{found.tracking_mm(a, b):.3f} mm" for name, a, b in stretches)
         print(f"error of the task: {task}")
-    if found.judged < 1.0:
+    if found.judged < 0.995:
         print(
             f"judged: {found.judged:.0%} of the time after the reference; the rest is motion that "
             "the reference does not cover"

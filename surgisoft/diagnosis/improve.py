@@ -256,7 +256,7 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     """Why an effect is not added, whatever the diagnosis says; empty where it may be."""
     if not fall.claimed:
         return f"{name}, fitted through the whole model, does not lower the error"
-    wrong = [p for p in parameters if p.effect == name and not p.plausible]
+    wrong = [p for p in parameters if p.effect == name and not p.may_be_plausible]
     if not wrong:
         return ""
     low, high = wrong[0].plausible_range

@@ -1,75 +1,68 @@
-"""The log of a run: a recording in CSV that grows while the run lasts.
+"""The samples of a run, in memory and in a log that grows while the run lasts.
 
-A power cut loses at most the last second, and what is there is a recording that every command
-reads. `finish` replaces it by the whole recording in its final form.
+A power cut loses less than the last second (`surgisoft.measurement.recordings.log`); `finish`
+replaces the log by the recording in its final form.
 """
 
 from __future__ import annotations
 
-import os
-import threading
-import time
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
-from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording, check_writable, save_recording
+from surgisoft.measurement.recordings.log import LogHeader, RecordingLog, recording_log
 from surgisoft.rig.interface import Rig, Sample
-
-FLUSH_S = 1.0
-"""Time within which rows are on the disk [s]."""
 
 
 class RunLog:
-    """Samples of a rig, kept in memory and written to `NAME.log.csv` as they come."""
+    """Samples of a rig, kept in memory and written to `NAME.log.jsonl` as they come."""
 
     def __init__(self, rig: Rig, path: str | Path | None, force: bool = False, note: str = ""):
-        """path: the recording that the log becomes (.parquet or .csv); None: in memory only."""
+        """path: the recording that the log becomes (.parquet or .csv); None: in memory only.
+
+        Raises InputError where the recording or the log of an interrupted one is there, unless
+        `force` is set.
+        """
         self.rig, self.path, self.force, self.note = rig, None, force, note
         self.samples: list[Sample] = []
         self.runs: list[int] = []
-        self._file: TextIO | None = None
-        self._flushed = 0.0
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._sync, daemon=True)
+        self._writer: RecordingLog | None = None
+        self._open = ExitStack()
         if path is None:
             return
         self.path = Path(path)
         check_writable(self.path, force)
-        self.growing = self.path.with_name(f"{self.path.stem}.log.csv")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.growing.open("w", encoding="utf-8")
-        except OSError as error:
-            raise InputError(f"{self.growing}: cannot be written ({error.strerror})") from error
-        m, n, unit = rig.chambers, rig.key_planes, rig.unit
-        names = ["t_s", *(f"{letter}{i + 1}_{unit}" for letter in "pc" for i in range(m))]
-        names += [f"k{j}_{axis}_mm" for j in range(n) for axis in "xyz"]
-        self._file.write(",".join([*names, "run", "temp_C"]) + "\n")
-        self._thread.start()
+        self.growing = self.path.with_name(f"{self.path.stem}.log.jsonl")
+        gravity = None if rig.gravity is None else np.asarray(rig.gravity).tolist()
+        header = LogHeader(
+            self.path.stem,
+            "continuous",
+            rig.unit,
+            rig.chambers,
+            rig.key_planes,
+            rig.arm,
+            gravity,
+            rig.payload_g,
+            note,
+        )
+        self._writer = self._open.enter_context(recording_log(self.growing, header, force))
 
     def write(self, sample: Sample, run: int) -> None:
         """Append a sample of a run."""
         self.samples.append(sample)
         self.runs.append(run)
-        if self._file is None:
-            return
-        values = [sample.t_s - self.samples[0].t_s, *sample.measured, *sample.commanded]
-        values += [*sample.key_points_mm.reshape(-1)]
-        cells = ["" if np.isnan(v) else repr(float(v)) for v in values]
-        temperature = "" if sample.temp_C is None else repr(float(sample.temp_C))
-        self._file.write(",".join([*cells, str(run), temperature]) + "\n")
-        now = time.monotonic()
-        if now - self._flushed > FLUSH_S / 2:
-            self._flushed = now
-            self._file.flush()
-
-    def _sync(self) -> None:
-        """Write what was flushed to the disk, beside the loop, which must not wait for it."""
-        while self._file is not None and not self._over.wait(FLUSH_S / 2):
-            os.fsync(self._file.fileno())
+        if self._writer is not None:
+            self._writer.sample(
+                len(self.samples) - 1,
+                run,
+                sample.t_s - self.samples[0].t_s,
+                sample.measured,
+                sample.key_points_mm,
+                sample.commanded,
+                sample.temp_C,
+            )
 
     def recording(self, name: str) -> Recording:
         """The samples so far as a recording."""
@@ -104,12 +97,7 @@ class RunLog:
 
     def close(self) -> None:
         """Hand all rows to the disk."""
-        if self._file is not None and not self._file.closed:
-            self._over.set()
-            self._thread.join()
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
+        self._open.close()
 
     def discard(self) -> None:
         """Remove the growing file."""

@@ -98,7 +98,7 @@ def test_a_run_records_what_collect_records(schedule, changed):
     with torch.inference_mode():
         whole = history.rows(load_model("default").predict(history)).numpy()
     np.testing.assert_allclose(found.predicted_mm, whole, atol=1e-4)
-    assert not found.written[0].with_name("run.log.csv").exists()
+    assert not found.written[0].with_name("run.log.jsonl").exists()
 
 
 def test_the_payload_is_found_in_seconds(changed):
@@ -202,17 +202,23 @@ def test_the_log_of_a_run_that_never_ends_is_a_recording(schedule, tmp_path):
     output, seen = tmp_path / "cut.parquet", []
 
     def cut():
-        file = tmp_path / "cut.log.csv"
-        if file.exists() and not seen and file.stat().st_size > 20_000:
-            complete = file.read_text().rpartition("\n")[0] + "\n"
-            (tmp_path / "left.csv").write_text(complete)
-            seen.append(load_recording(tmp_path / "left.csv"))
+        file = tmp_path / "cut.log.jsonl"
+        if file.exists() and not seen and file.stat().st_size > 40_000:
+            seen.append(load_recording(file, on_warning=pytest.fail))
         return bool(seen)
 
     found = run(schedule, output=output, stopped=cut, **SIMULATED)
     rows = seen[0].samples
     assert rows > 50
     np.testing.assert_array_equal(seen[0].key_points_mm, found.recording.key_points_mm[:rows])
+
+
+def test_the_log_of_an_interrupted_run_is_not_overwritten(schedule, tmp_path):
+    left = tmp_path / "run.log.jsonl"
+    left.write_text("what is left of an earlier run")
+    with pytest.raises(InputError, match="the log of an interrupted recording is there"):
+        run(schedule, output=tmp_path / "run.parquet", **SIMULATED)
+    assert left.read_text() == "what is left of an earlier run"
 
 
 def test_the_model_of_another_arm_is_refused(schedule, tmp_path):

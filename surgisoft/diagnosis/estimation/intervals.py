@@ -65,6 +65,17 @@ class Parameter:
     """Where the range comes from."""
 
     @property
+    def may_be_plausible(self) -> bool:
+        """Whether every value may lie in the plausible range, as far as its interval tells.
+
+        A recording of minutes leaves a time constant of hours undetermined: the estimate may then
+        lie beyond the range while the interval reaches far into it.
+        """
+        least, most = self.plausible_range
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        return self.plausible or bool(np.all((low <= most) & (high >= least)))
+
+    @property
     def interval_text(self) -> str:
         """The interval in short; empty where the value was given or there are too many."""
         if np.size(self.value) > MOST_VALUES or self.low == self.high:

@@ -58,7 +58,7 @@ COMMANDS = {
     "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
     "improve": "improve arm bench.parquet --max-effects 1 -o improved",
     "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
-    "run": "run mixed --model arm --minutes 1.2 --clean 40 --clock simulated -o run.csv",
+    "run": "run mixed --model arm --any-model --minutes 1 --clean 40 --clock simulated -o r.csv",
     "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
     "export": "export arm -o exported",

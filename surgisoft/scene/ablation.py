@@ -270,9 +270,7 @@ class AblationMap:
         deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
         for beam in _each_beam(began, ended, middle, energy):
             tensors = deposit(*beam, state.ring, *tensors)
-        return AblationState(
-            *tensors, state.delivered_j + energy, point, aim, on, state.ring
-        )
+        return AblationState(*tensors, state.delivered_j + energy, point, aim, on, state.ring)
 
     @staticmethod
     def _last(point_mm, direction, on) -> dict[str, torch.Tensor]:

@@ -83,7 +83,6 @@ def only(by_arm: Mapping[str, Item], tool: str) -> Item:
     return next(iter(by_arm.values()))
 
 
-
 def measured_view(fraction: Tensor, endoscope: str = ENDOSCOPE) -> SceneState:
     """A scene of which only the share (B,) of the ring that an endoscope sees is known."""
     unknown = torch.full_like(fraction, torch.nan)
@@ -230,7 +229,9 @@ class SceneEngine:
             hit = scene.hits[name]
             on = hit.on_organ & (hit.body == self.organ)
             each.append((hit.point_mm, parts[name].tip_direction, on))
-        return each[0] if len(each) == 1 else tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
+        if len(each) == 1:
+            return each[0]
+        return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
 
     def _power(self, power_w: Power, like: Tensor) -> float | Tensor:
         """W: a number or (B,) for one laser, (B, L) for L lasers; `like` is (B,)."""

@@ -28,19 +28,26 @@ PHANTOM = SCENES / "phantom_liver"
 
 
 def packaged_scene(path: str | Path) -> Path:
-    """The folder of the packaged scene of that name; any other path unchanged.
+    """The folder of the packaged scene of that name, or a scene file in it; other paths unchanged.
 
     A file or folder of that name in the working directory has precedence.
     """
     path = Path(path)
-    named = len(path.parts) == 1 and not path.exists()
-    return SCENES / path if named and (SCENES / path / "scene.toml").is_file() else path
+    if path.exists() or path.is_absolute() or ".." in path.parts:
+        return path
+    there = SCENES / path
+    return there if spec_file(there).is_file() else path
+
+
+def spec_file(path: Path) -> Path:
+    """The scene file in a folder, or the file itself."""
+    return path if path.suffix == ".toml" else path / FILE
 
 
 FORMAT = 1
 FILE = "scene.toml"
 TOOLS = ("laser", "endoscope", "tip")
-"""Tools of an arm: the laser's beam, the endoscope's camera, or a plain tip that pushes and touches.
+"""Tools of an arm: the laser's beam, the endoscope's camera, a plain tip that pushes and touches.
 The order is that of the arms in a world, whatever their order in the file."""
 
 
@@ -296,7 +303,8 @@ class SceneSpec:
         The order of the mounts in the file has no influence on the order of the arms.
         """
         named = dict(zip(arm_names(self.mounts), self.mounts, strict=True))
-        return {name: named[name] for name in sorted(named, key=lambda n: _rank(named[n].tool, n))}
+        ordered = sorted(named, key=lambda name: arm_rank(named[name].tool, name))
+        return {name: named[name] for name in ordered}
 
     def mount(self, name: str) -> MountSpec:
         """The mount of the arm of that name."""
@@ -323,7 +331,7 @@ def arm_names(mounts: Sequence[MountSpec]) -> tuple[str, ...]:
     )
 
 
-def _rank(tool: str, name: str) -> tuple:
+def arm_rank(tool: str, name: str) -> tuple:
     """Key that sorts arms by tool, then by name, with numbers by their value."""
     parts = re.split(r"(\d+)", name)
     return TOOLS.index(tool), [(int(part), "") if part.isdigit() else (0, part) for part in parts]

@@ -80,7 +80,10 @@ DAMAGE = {
     "/dose/rows": (lambda a: a + 100, "rows that the log does not have"),
     "/dose/station": (lambda a: a + 10**6, "stations that are not on its ring"),
     "/bodies/0/faces": (lambda a: changed(a, 0, 10**6), "faces without their vertices"),
-    "/beam/hits_organ": (lambda a: a.astype(float), "'hits_organ' of the beam holds float64"),
+    "/beams/laser/hits_organ": (
+        lambda a: a.astype(float),
+        "'hits_organ' of the beam of 'laser' holds",
+    ),
 }
 
 
@@ -122,7 +125,12 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
         (("log", "table", "agents"), ["nobody"], "its agents are none of its arms"),
         (("log", "table", "dose", "table", "body"), "spleen", "a body that is not in it"),
         (("log", "table", "limits", "table"), {}, "a view without its limit"),
-        (("log", "table", "camera", "table", "range_mm"), [5.0, 1.0], "range is impossible"),
+        (
+            ("log", "table", "cameras", "table", "endoscope", "table", "range_mm"),
+            [5.0, 1.0],
+            "range is impossible",
+        ),
+        (("log", "table", "arms", "table", "laser", "table", "tool"), "knife", "unknown tool"),
         (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is no number"),
         (("format",), "\x1b[2J", r"format text '\\x1b\[2J', expected"),
     ],

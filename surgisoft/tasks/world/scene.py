@@ -239,11 +239,9 @@ class SceneEngine:
             hit = scene.hits[name]
             on = hit.on_organ & (hit.body == self.organ)
             each.append((hit.point_mm, parts[name].tip_direction, on))
-        return (
-            each[0]
-            if len(each) == 1
-            else tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
-        )
+        if len(each) == 1:
+            return each[0]
+        return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
 
     def _power(self, power_w: Power, like: Tensor) -> float | Tensor:
         """W: a number or (B,) for one laser, (B, L) for L lasers; `like` is (B,)."""

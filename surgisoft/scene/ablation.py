@@ -187,6 +187,13 @@ class AblationMap:
         lengths = [one.ring_length_mm for one in self.patches]
         self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
 
+    @property
+    def zone_areas_mm2(self) -> tuple[float, float, float]:
+        """Area of the patch's lesion, ring and healthy tissue (of the first ring), mm^2."""
+        zone, areas = self.patch.zone, self.patch.areas_mm2
+        lesion, ring, healthy = (float(areas[zone == k].sum()) for k in (LESION, RING, HEALTHY))
+        return lesion, ring, healthy
+
     def start(
         self,
         point_mm: torch.Tensor,

@@ -203,7 +203,7 @@ def raster(
     """An open path in parallel lines over the inside of a closed outline (N, 3) mm on the mesh.
 
     Lines are pitch_mm apart and run to and fro (boustrophedon) along the outline's longer side, at
-    least inset_mm inside of it. The points are about step_mm apart.
+    least inset_mm inside of it (negative: so far beyond it). The points are about step_mm apart.
     """
     plane = Plane.of(mesh, outline_mm)
     polygon = plane.flat(outline_mm)

@@ -15,6 +15,7 @@ import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.base import Task, TaskSpec
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
 from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
@@ -31,6 +32,7 @@ TASKS: dict[str, TaskSpec] = {
     "keyhole": KEYHOLE,
     "circle_ablation": CIRCLE_ABLATION,
     "contour_ablation": CONTOUR_ABLATION,
+    "area_ablation": AREA_ABLATION,
 }
 """Every task by name."""
 

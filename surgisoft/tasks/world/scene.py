@@ -155,7 +155,7 @@ class SceneEngine:
             treated.patches,
             0.5 * treated.spot_mm,
             Tissue(spec.laser.absorption_per_mm),
-            config.depth_mm,
+            config.depth_mm if treated.depth_mm is None else treated.depth_mm,
             device,
             exact_lesion=treated.exact_lesion,
         )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.scene.ablation import Tissue
 from surgisoft.scene.contours import SurfacePath, contour_path, raster
 from surgisoft.scene.dose_patch import (
     SPACING_WAISTS,
@@ -28,6 +29,8 @@ from surgisoft.tasks.world.arm import Randomisation
 
 PATH_POINTS = 360
 """Points of a ring's path that the laser follows."""
+FINE_STEP_MM = 0.2
+"""Spacing of the points of an outline that nothing follows (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,8 @@ class Treatment:
     """The paths of which the points consist."""
     field_rad: float | None = None
     """Full cone angle in which they have to be seen (rad); None: the camera's field of view."""
+    depth_mm: float | None = None
+    """Depth from which a place counts as treated (mm); None: that of the engine's configuration."""
     exact_lesion: bool = False
     """Whether a place inside (LESION) counts as treated from the dose that cuts, instead of from
     the threshold of ablation."""
@@ -136,26 +141,34 @@ class AreaPlan:
     """Largest distance of two neighbouring points of the raster, mm: that of a step."""
     pitch_mm: float
     """Distance of neighbouring lines of the raster, mm."""
-    inset_mm: float
-    """Distance of the raster from the outline, inwards, mm."""
+    overrun_mm: float
+    """Distance by which the raster reaches beyond the outline, mm."""
     spared_mm: float
     """Margin outside of the outline in which a dose does not count, mm."""
     spot_mm: float
     """Diameter of the beam on the tissue at 1/e^2, mm."""
+    dose_j_per_mm2: float
+    """Dose from which a place counts as treated, J/mm^2."""
     contours: tuple[ContourSpec, ...] = ()
-    """The outlines; none: those of the scene, or the ring around its lesion where it has none."""
+    """The outlines; none: the ring around the scene's lesion."""
 
     def __call__(
         self, scene: Scene, vary: Randomisation, band_mm: float, view_points: int
     ) -> Treatment:
         """The areas in a scene."""
         _check_fixed(vary, "areas")
-        mesh = scene.organ.world_mesh
-        around = outlines(scene, self.contours, 0.0, self.step_mm)
+        mesh, tissue = scene.organ.world_mesh, Tissue(scene.spec.laser.absorption_per_mm)
+        if self.dose_j_per_mm2 < tissue.threshold_j_per_mm2:
+            raise InputError(
+                f"a dose of {self.dose_j_per_mm2:g} J/mm2 ablates nothing of this tissue; expected "
+                f"at least its threshold of {tissue.threshold_j_per_mm2:.3g} J/mm2"
+            )
+        ratio = self.dose_j_per_mm2 / tissue.threshold_j_per_mm2
+        around = outlines(scene, self.contours or (_ring(scene),), 0.0, FINE_STEP_MM)
         patch = area_patch(mesh, around, SPACING_WAISTS * 0.5 * self.spot_mm, self.spared_mm)
         lines = [
             replace(
-                raster(mesh, one.points_mm, self.pitch_mm, self.inset_mm, self.step_mm),
+                raster(mesh, one.points_mm, self.pitch_mm, -self.overrun_mm, self.step_mm),
                 name=one.name,
             )
             for one in around
@@ -172,6 +185,7 @@ class AreaPlan:
                 )
                 for k in (0, 1)
             ),
+            depth_mm=math.log(ratio) / tissue.absorption_per_mm,
             exact_lesion=True,
         )
 
@@ -185,11 +199,15 @@ def outlines(
     """
     mesh = scene.organ.world_mesh
     chosen = tuple(contours) or scene.spec.contours
-    if not chosen:
-        ring = tuple(map(tuple, scene.ring_of(count=PATH_POINTS).points_mm.tolist()))
-        chosen = (ContourSpec("lesion", ring),)
+    chosen = chosen or (_ring(scene),)
     grown = [replace(each, margin_mm=each.margin_mm + margin_mm * each.closed) for each in chosen]
     return tuple(contour_path(mesh, each, step_mm) for each in grown)
+
+
+def _ring(scene: Scene) -> ContourSpec:
+    """The ring around the scene's lesion as a contour."""
+    points = scene.ring_of(count=PATH_POINTS).points_mm.tolist()
+    return ContourSpec("lesion", tuple((x, y, z) for x, y, z in points))
 
 
 def windows(path: SurfacePath, window_mm: float, count: int) -> tuple[np.ndarray, np.ndarray]:

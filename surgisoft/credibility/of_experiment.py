@@ -47,9 +47,11 @@ def check_context(context: Context, spec: Experiment) -> None:
 
 def arm_of(spec: Experiment) -> str:
     """The arm model of an experiment: of its cases, its task, or the mounts of its scene."""
+    stated = getattr(spec.task, "arm", None)
+    default = {str(stated)} if stated else {"default"}
     scene = Path(spec.scene)
-    mounted = {mount.arm for mount in open_scene(scene).spec.mounts}
-    default = {str(spec.task.arm)} if spec.task.arm else mounted
+    if spec.in_scene and not stated:
+        default = {mount.arm for mount in open_scene(scene).spec.mounts}
     arms = {name for case in spec.cases for name in ({case.arm} if case.arm else default)}
     if len(arms) > 1:
         raise InputError(

@@ -11,7 +11,6 @@ from surgisoft.credibility.domain import States, rates, states_of
 from surgisoft.credibility.metrics import COVERAGE_FACTOR, area_metric
 from surgisoft.errors import InputError
 from surgisoft.experiments.results import Results
-from surgisoft.experiments.spec import EXPERIMENT_TASK
 from surgisoft.measurement.protocols.schedule_file import load_schedule
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.scene.capsules import ArmShape
@@ -182,7 +181,7 @@ def outcomes(results: Results) -> list[Outcome]:
                 continue
             if (here.policy, here.arm, ours.values) != (there.policy, there.arm, theirs.values):
                 continue
-            for name, title in EXPERIMENT_TASK.numbers.items():
+            for name, title in results.experiment.of.experiment.numbers.items():
                 a, b = (_values(setting.rows, name) for setting in (ours, theirs))
                 if len(a) and len(b):
                     found.append(_outcome(title, ours.label, theirs.label, a, b))

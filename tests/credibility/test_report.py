@@ -89,9 +89,8 @@ def test_the_page_says_it_and_escapes_what_the_user_wrote(bench, tmp_path):
 
 
 def test_a_micrometre_on_a_limit_flips_the_result(tmp_path):
-    """The upper end of E with its uncertainty counts, of the worst key point."""(
-        tmp_path / "a.parquet"
-    ).touch()
+    """The upper end of E with its uncertainty counts, of the worst key point."""
+    (tmp_path / "a.parquet").touch()
     (tmp_path / "context.toml").write_text(CONTEXT)
     context = load_context(tmp_path / "context.toml")
     points = (

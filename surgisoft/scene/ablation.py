@@ -278,13 +278,15 @@ class AblationMap:
         before = torch.where(state.last_on[..., None], state.last_direction, aim)
         after = torch.where(on[..., None], aim, state.last_direction)
         middle = torch.nn.functional.normalize(before + after, dim=-1)
-        tensors = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
+        sums = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
         if not in_place:
-            tensors = [t.clone() for t in tensors]
+            sums = [t.clone() for t in sums]
         deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
-        for beam in _each_beam(began, ended, middle, energy):
-            tensors = deposit(*beam, state.ring, *tensors)
-        return AblationState(*tensors, state.delivered_j + energy, point, aim, on, state.ring)
+        for began_of, ended_of, along, joule in _each_beam(began, ended, middle, energy):
+            sums = [*deposit(began_of, ended_of, along, joule, state.ring, *sums)]
+        dose, peak, band, area, zone_j = sums
+        total = state.delivered_j + energy
+        return AblationState(dose, peak, band, area, zone_j, total, point, aim, on, state.ring)
 
     @staticmethod
     def _last(point_mm, direction, on) -> dict[str, torch.Tensor]:

@@ -86,10 +86,13 @@ COMFORT_MM = 10.0
 class Site(Protocol):
     """A mount of an arm, evaluated without the other arms."""
 
-    arm: MountedArm
-    """Reach, pose and shaft."""
-    score: float
-    """Higher is better."""
+    @property
+    def arm(self) -> MountedArm:
+        """Reach, pose and shaft."""
+
+    @property
+    def score(self) -> float:
+        """Higher is better."""
 
     @property
     def way_mm(self) -> np.ndarray:
@@ -523,6 +526,7 @@ def find_mounts(
         reach, shaft_mm = reaches[name], mount.shaft_mm
         alike = (mount.tool, mount.arm, reach.radius_mm, shaft_mm)
         if alike not in evaluated:
+            found: list
             if mount.tool == "laser":
                 found = laser_sites(engine, name, reach, ring, laser, limits, shaft_mm, report)
             elif mount.tool == "endoscope":
@@ -569,7 +573,7 @@ def find_mounts(
     return arrangements, None
 
 
-def _suffices(site: Site, limits: LimitsSpec) -> bool:
+def _suffices(site: LaserSite | EndoscopeSite | TipSite, limits: LimitsSpec) -> bool:
     """Whether the mount is good enough for its arm without the others."""
     if isinstance(site, LaserSite):
         return bool(site.good.all())
@@ -612,13 +616,14 @@ def _together(
         longer = []
         for score, chosen in partial:
             for k, site in enumerate(each):
-                gains = []
+                total: float | None = score + site.score
                 for before in chosen:
-                    gains.append(gain(before, (name, k)))
-                    if gains[-1] is None:
+                    more = gain(before, (name, k))
+                    total = None if total is None or more is None else total + more
+                    if total is None:
                         break
-                else:
-                    longer.append((sum(gains, score + site.score), (*chosen, (name, k))))
+                if total is not None:
+                    longer.append((total, (*chosen, (name, k))))
         longer.sort(key=lambda one: -one[0])
         partial = longer[:PARTIAL]
     found = []

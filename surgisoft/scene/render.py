@@ -103,9 +103,9 @@ class Renderer:
         for name, shape in (arms or {}).items():
             gap = self_contact_gap_mm(shape.radius_mm) if name == own else -1.0
             self._draw_arm(shape, gap, origins, rays, distance, colour, normal)
-        beams = [] if beam_mm is None else np.asarray(beam_mm, dtype=np.float64).reshape(-1, 2, 3)
+        beams = np.zeros((0, 2, 3)) if beam_mm is None else np.asarray(beam_mm, dtype=np.float64)
         beam = np.zeros(len(rays))
-        for ends in beams:
+        for ends in beams.reshape(-1, 2, 3):
             beam = np.maximum(beam, _glow(origin, rays, distance, ends, beam_radius_mm))
         return self._developed(rays, distance, normal, colour, beam)
 

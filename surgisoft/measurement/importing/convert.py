@@ -41,6 +41,7 @@ from surgisoft.measurement.importing.spec import (
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.importing.units import factor
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.lerobot import load_lerobot
 from surgisoft.measurement.recordings.log import read_log
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
@@ -73,6 +74,11 @@ def import_log(path: Path, name: str) -> Imported:
     """The recording in a log of a recording, such as one that was interrupted; it needs no map."""
     recording, lacking = read_log(path)
     return Imported(replace(recording, name=name), [lacking] if lacking else [])
+
+
+def import_lerobot(folder: Path, name: str) -> Imported:
+    """The recording in a LeRobotDataset whose values have a recording's names; it needs no map."""
+    return Imported(load_lerobot(folder, name), [])
 
 
 def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path]]:
@@ -109,7 +115,12 @@ def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
     """The files given, and those of folders that have a role."""
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
+        if path.is_dir() and any(
+            role.format != AUTO and (known := reader(role.format)).is_folder and known.fits(path)
+            for role in spec.file.values()
+        ):
+            found.append(path)
+        elif path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.is_file() and _roles_of(p, spec))
             if not inside:
                 raise InputError(f"{path}: no file here fits the map, expected {_patterns(spec)}")

@@ -59,7 +59,7 @@ TIMED: tuple[tuple[Any, str, str], ...] = (
     (ModelArm, "predict", "arms"),
     (BatchedScene, "clearance", "clearance"),
     (SceneEngine, "aimed", "beam"),
-    (scene_module, "view", "view"),
+    (scene_module, "seen_from", "view"),
     (AblationMap, "advance", "dose"),
     (AblationMap, "report", "dose"),
     (Episodes, "observe", "observations"),
@@ -369,7 +369,10 @@ def markdown(rows: list[Row], rates: Rates) -> str:
             + " | ".join(f"{row.products / row.world:.0%}" for row in some),
             "",
         ]
-        lines = [line + " |" if line.startswith("|") and not line.endswith("|") else line for line in lines]
+        lines = [
+            line + " |" if line.startswith("|") and not line.endswith("|") else line
+            for line in lines
+        ]
     return "\n".join(lines)
 
 

@@ -82,7 +82,7 @@ class BatchedScene:
             raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
         self.compiled = engine == "compiled"
         kind = CompiledSurface if self.compiled else TorchSurface
-        self._surfaces = []
+        self._surfaces, self._trees = [], []
         self._at_home = {body.name: self._inverse(_pose_of(body)) for body in self.bodies}
         for body in self.bodies:
             tree = build_tree(body.mesh)
@@ -90,6 +90,7 @@ class BatchedScene:
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
             field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
             self._surfaces.append(kind(tree, field, self.device))
+            self._trees.append(tree.arrays)
 
     def radius_mm(self, arm: str) -> float:
         """Radius of an arm by name (mm)."""
@@ -210,9 +211,9 @@ class BatchedScene:
             hide_behind_chain(
                 eyes, ends, distance, short_mm, line, radius, gap, wanted.numpy(), flags
             )
-        for body, surface in zip(self.bodies, self._surfaces, strict=True):
+        for body, tree in zip(self.bodies, self._trees, strict=True):
             turn, shift = (t.numpy() for t in self._inward(body, poses))
-            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, surface.tree, flags)
+            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree, flags)
         return clear
 
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
@@ -259,7 +260,7 @@ class CompiledSurface:
     """One body's surface on the CPU: compiled clearance queries, rays by Embree."""
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
-        self._tree, self._field, self.tree = tree, field, tree.arrays
+        self._tree, self._field = tree, field
         self._closed = tree.mesh.is_watertight
         self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)

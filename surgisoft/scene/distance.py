@@ -119,27 +119,38 @@ def _least_distance(value, band, slack, most):
 
 
 @compiled
-def _from_afar(line, given, turn, shift, longest, values, origin, cell, band, slack, most):
+def _from_afar(
+    line, given, turn, shift, longest, values, origin, cell, band, slack, most, tree, bounds
+):
     """Smallest field value at the points of a line (K, 3), and a lower bound of all values (mm).
 
     One lookup in a group of points may rule out the others: where the distance is at least d, a
-    field value r away is at least d - r - slack. Consecutive points are no farther apart than
-    `longest`, mm. Values of `most` and above are all alike.
+    field value r away is at least d - r - slack. The distance is at least that to the body's box,
+    too. Consecutive points are no farther apart than `longest`, mm. Values of `most` and above are
+    all alike. bounds (G,) is working memory.
     """
-    count = len(line)
+    count, groups = len(line), len(bounds)
     estimate, least = most, most
-    for first in range(0, count, GROUP):
+    for g in range(groups):
+        first = g * GROUP
         last = min(first + GROUP, count)
         middle = min(first + GROUP // 2, count - 1)
-        value = field_at(values, origin, cell, _moved(turn, shift, line[middle]))
+        p = _moved(turn, shift, line[middle])
+        reach = max(middle - first, last - 1 - middle) * longest + slack
+        bounds[g] = math.sqrt(boxes_d2(p, p, tree[2], tree[3], 0)) - reach
+        if bounds[g] >= most:
+            continue
+        value = field_at(values, origin, cell, p)
         estimate = min(estimate, value if given[middle] else abs(value))
         least = min(least, value)
-        reach = max(middle - first, last - 1 - middle) * longest
-        bound = _least_distance(value, band, slack, most) - slack - reach
-        if bound >= estimate and bound > 0.0:
-            least = min(least, bound)
+        bounds[g] = max(bounds[g], _least_distance(value, band, slack, most) - reach)
+    for g in range(groups):
+        if bounds[g] >= estimate and bounds[g] > 0.0:
+            least = min(least, bounds[g])
             continue
-        for k in range(first, last):
+        first = g * GROUP
+        middle = min(first + GROUP // 2, count - 1)
+        for k in range(first, min(first + GROUP, count)):
             if k != middle:
                 value = field_at(values, origin, cell, _moved(turn, shift, line[k]))
                 estimate = min(estimate, value if given[k] else abs(value))
@@ -224,6 +235,7 @@ def chains_to_surface(
     count, points, _ = lines.shape
     line = np.empty((points, 3))
     values_at, lows = np.empty(points), np.empty(points - 1)
+    bounds = np.empty((points + GROUP - 1) // GROUP)
     nodes, reach = np.empty(STACK, np.int64), np.empty(STACK)
     for b in range(count):
         pose = b if len(turns) > 1 else 0
@@ -251,6 +263,8 @@ def chains_to_surface(
             band,
             slack,
             horizon + radius,
+            tree,
+            bounds,
         )
         if min(least, band) - 0.5 * longest - slack - radius <= within:
             for k in range(points):

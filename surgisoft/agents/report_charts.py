@@ -184,11 +184,12 @@ def dose_map(log: EpisodeLog) -> Picture | None:
     middle, plane = path_plane(log.path_mm)
     flat = (dose.points_mm - middle) @ plane
     cell = max(MAP_CELL_MM, float(np.sqrt(2.0 * dose.areas_mm2.mean())))
-    edges = [np.arange(flat[:, i].min(), flat[:, i].max() + cell, cell) for i in (0, 1)]
-    total = np.histogram2d(*flat.T, edges, weights=dose.areas_mm2 * share)[0]
-    area = np.histogram2d(*flat.T, edges, weights=dose.areas_mm2)[0]
-    inside = np.histogram2d(*flat.T, edges, weights=dose.areas_mm2 * (dose.zone == LESION))[0]
-    spared = np.histogram2d(*flat.T, edges, weights=dose.areas_mm2 * (dose.zone == HEALTHY))[0]
+    x, y = flat.T
+    edges = tuple(np.arange(each.min(), each.max() + cell, cell) for each in (x, y))
+    area, total, inside, spared = (
+        np.histogram2d(x, y, edges, weights=dose.areas_mm2 * factor)[0]
+        for factor in (1.0, share, dose.zone == LESION, dose.zone == HEALTHY)
+    )
     mean, inside, spared = (
         np.divide(each, area, out=np.full_like(each, np.nan), where=area > 0.0)
         for each in (total, inside, spared)

@@ -169,7 +169,7 @@ def grown(mesh: Mesh, outline_mm: np.ndarray, margin_mm: float, what: str = "pat
     lines = contour_generator(x, y, away).lines(margin_mm)
     if not lines:
         raise InputError(f"{what}: a margin of {margin_mm:g} mm leaves no outline")
-    longest = max(lines, key=lambda line: np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    longest = max((np.asarray(line) for line in lines), key=arc_length_mm)
     return plane.on(mesh, longest[:-1], f"{what} with its margin of {margin_mm:g} mm")
 
 

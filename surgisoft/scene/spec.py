@@ -376,13 +376,12 @@ def _check_whole(spec: SceneSpec, where: Where) -> None:
                 f"a second body '{body.name}'", "names that differ"
             )
         seen.add(body.name)
-    names: set[str] = set()
-    for i, contour in enumerate(spec.contours):
-        if contour.name in names:
+    contours = [contour.name for contour in spec.contours]
+    for i, name in enumerate(contours):
+        if name in contours[:i]:
             raise (where / "contours" / i / "name").error(
-                f"a second contour '{contour.name}'", "names that differ"
+                f"a second contour '{name}'", "names that differ"
             )
-        names.add(contour.name)
     organs = [body.name for body in spec.bodies if body.role == "organ"]
     if not organs:
         raise (where / "bodies").error("no body has the role 'organ'", "at least one organ")

@@ -20,7 +20,7 @@ from surgisoft.tasks.base import TaskSpec, TaskState
 from surgisoft.tasks.laser_supervision import laser_experiment
 from surgisoft.tasks.laser_work import DONE, EndoscopeWeights
 from surgisoft.tasks.observations import Block, ObservationBlocks, joined
-from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route
+from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
 from surgisoft.tasks.world.treatment import AreaPlan, ContourSpec
@@ -154,7 +154,7 @@ class AreaAblation:
         self.scene, self.dt_s = self.world.scene, self.world.config.dt_s
         self.spec = self.scene.spec
         self.steps = round(c.time_s / self.dt_s)
-        least = sum(each.count for each in self.scene.stretches)
+        least = route_steps(self.scene.stretches, 0)
         if least > self.steps:
             raise InputError(
                 f"area_ablation: the raster takes {least * self.dt_s:.0f} s at {c.speed_mm_s:g} "

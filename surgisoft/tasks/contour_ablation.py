@@ -20,7 +20,7 @@ from surgisoft.tasks.base import TaskSpec, TaskState
 from surgisoft.tasks.laser_supervision import laser_experiment
 from surgisoft.tasks.laser_work import DONE, LaserWorkWeights
 from surgisoft.tasks.observations import ObservationBlocks, joined
-from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route
+from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
 from surgisoft.tasks.world.treatment import ContourPlan, ContourSpec
@@ -104,7 +104,7 @@ class ContourAblation:
         self.spec = self.scene.spec
         self.steps = round(c.time_s / self.dt_s)
         self.overlap = round(OVERLAP_MM / step_mm)
-        least = sum(each.count + self.overlap * each.closed for each in self.scene.stretches)
+        least = route_steps(self.scene.stretches, self.overlap)
         if least > self.steps:
             raise InputError(
                 f"contour_ablation: the contours take {least * self.dt_s:.0f} s at "

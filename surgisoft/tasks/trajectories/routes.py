@@ -65,3 +65,8 @@ def draw_route(
         parts.append(stretch.first + place)
     done = torch.zeros_like(stream.count)
     return stream, RouteProgress(torch.cat(parts, 1), done, done > 0)
+
+
+def route_steps(stretches: Sequence[Stretch], overlap: int) -> int:
+    """Steps of a route over all stretches, see `draw_route`."""
+    return sum(each.count + (overlap if each.closed else 0) for each in stretches)

@@ -289,12 +289,12 @@ class SceneSpec:
     """The endoscope's camera."""
     limits: LimitsSpec = field(default_factory=LimitsSpec)
     """Limits of every task."""
-    contours: tuple[ContourSpec, ...] = ()
-    """Paths on the lesion's organ that a task may follow, in this order."""
     note: str = ""
     """Free text."""
     format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
     """Version of this file format."""
+    contours: tuple[ContourSpec, ...] = ()
+    """Paths on the lesion's organ that a task may follow, in this order."""
 
     @property
     def arms(self) -> dict[str, MountSpec]:

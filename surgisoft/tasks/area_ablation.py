@@ -17,9 +17,10 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.tasks import laser_work
 from surgisoft.tasks.base import TaskSpec, TaskState
-from surgisoft.tasks.laser_supervision import laser_experiment
+from surgisoft.tasks.laser_supervision import completed, laser_experiment
 from surgisoft.tasks.laser_work import DONE, EndoscopeWeights
 from surgisoft.tasks.observations import Block, ObservationBlocks, joined
+from surgisoft.tasks.supervision import Condition
 from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
@@ -260,6 +261,10 @@ AREA_ABLATION = TaskSpec(
         "evaluation_episodes": 16,
     },
     training_steps=1_500_000,
-    experiment=laser_experiment("share of the area treated", {}, {}),
+    experiment=laser_experiment(
+        "share of the area treated",
+        {"treated": Condition("this share of the area has the dose (0..1)", 0.98, completed)},
+        {},
+    ),
     success_rule=success_rule,
 )

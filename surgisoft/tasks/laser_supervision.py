@@ -71,7 +71,8 @@ def _aimed(task: LaserTask, state: TaskState, within: float) -> Tensor:
     return laser_work.measured_error_mm(task, state) <= within
 
 
-def _cut(task: LaserTask, state: TaskState, within: float) -> Tensor:
+def completed(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    """(B,) bool: the measure `completion` is at least `within`."""
     return task.measures(state)["completion"] >= within
 
 
@@ -103,7 +104,7 @@ LASER_EXPERIMENT = ExperimentTask(
     conditions={
         "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
         "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
-        "cut": Condition("this share of the ring is cut (0..1)", 1.0, _cut),
+        "cut": Condition("this share of the ring is cut (0..1)", 1.0, completed),
         "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),
         "never": NEVER,
     },

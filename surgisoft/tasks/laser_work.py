@@ -8,7 +8,7 @@ rigs (`agents.on_rig`) has the same rules.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import torch
@@ -212,9 +212,11 @@ def rewards(
         "look": 1.0 / (1.0 + view.axis_error_mm / config.far_mm),
         "view": view.fraction,
     }
+    found = {LASER: laser | shared, ENDOSCOPE: endoscope | shared}
     return {
-        LASER: weighted(laser | shared, task.weights[LASER]),
-        ENDOSCOPE: weighted(endoscope | shared, task.weights[ENDOSCOPE]),
+        agent: weighted({f.name: terms[f.name] for f in fields(task.weights[agent])}, weights)
+        for agent, terms in found.items()
+        for weights in (task.weights[agent],)
     }
 
 

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.camera import View, view
+from surgisoft.scene.camera import View, seen_from
 from surgisoft.scene.capsules import BatchClearance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
@@ -216,8 +215,8 @@ class SceneEngine:
 
     def _seen(self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines) -> View:
         """What an endoscope sees of the ring's points and normals (B, M, 3)."""
-        pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
-        return view(self.geometry, self.camera, pose, *ring, lines, own=name)
+        at = (eye.tip_mm, eye.tip_direction)
+        return seen_from(self.geometry, self.camera, *at, *ring, lines, own=name)
 
     def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
         """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.

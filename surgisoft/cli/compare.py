@@ -12,12 +12,14 @@ from surgisoft.cli.inputs import (
     check_model,
     leading_models,
     read_before,
+    read_context,
     read_recordings,
     warn_all,
 )
 from surgisoft.cli.options import (
     AnyModel,
     Before,
+    Credibility,
     EffectFiles,
     JsonFile,
     ModelError,
@@ -28,8 +30,10 @@ from surgisoft.cli.options import (
     model_options,
     with_effect_files,
 )
+from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
+from surgisoft.progress import text_only
 
 AXES_SHOWN = 5
 """Axes that the terminal lists; the page and the JSON file have all of them."""
@@ -58,13 +62,14 @@ def compare(
     scale: Annotated[
         float | None,
         Option(
-            "--scale",
+            "--error-scale",
             metavar="MM",
             min=1e-6,
             help="Error at which the replay's colours end, mm; default: from the errors of the "
             "worst model. Give the same for replays that are to be compared.",
         ),
     ] = None,
+    credibility: Credibility = None,
     effect_files: EffectFiles = None,
 ) -> None:
     """Compare arm models with measurements: the error, and what it depends on.
@@ -74,9 +79,12 @@ def compare(
     check_free(json_file, "rmse_mm")
     check_folder(report)
     check_replay(replay)
+    if credibility and not report:
+        raise InputError("--credibility: writes into the folder of the report; add --report DIR")
+    context = read_context(credibility)
 
     if scale is not None and not replay:
-        raise InputError("--scale is that of a replay; add --replay FILE.rrd")
+        raise InputError("--error-scale is that of a replay; add --replay FILE.rrd")
     check_model(model, predictions)
     others, recordings = leading_models(recordings)
     if others and predictions:
@@ -110,6 +118,13 @@ def compare(
         from surgisoft.diagnosis.pages.compare import write_report
 
         written += write_report(compared, report, title)
+    if context and report:
+        from surgisoft.credibility.assessment import assess
+        from surgisoft.credibility.page import write_report as write_credibility
+
+        with progress("credibility") as tell:
+            assessed = assess(context, result, rest, measured, progress=text_only(tell))
+        written += write_credibility(assessed, report)
     if replay:
         from surgisoft.replay.model_error import write_compared
 
@@ -127,6 +142,8 @@ def compare(
     if others:
         print()
         _table(compared)
+    if context:
+        print(f"credibility: {assessed.sentence}")
     for path in written:
         print(f"wrote {path}")
     if result.explainable:

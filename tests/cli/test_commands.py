@@ -244,7 +244,7 @@ def test_several_models_on_the_same_recording(lab, tmp_path, capsys):
     for wrong, said in (
         (["compare", arm, test, "default"], "give all models first"),
         (["compare", arm, "default"], "models only"),
-        (["compare", arm, test, "--scale", "1"], "add --replay"),
+        (["compare", arm, test, "--error-scale", "1"], "add --replay"),
     ):
         assert run(wrong) == 2
         assert said in capsys.readouterr().err

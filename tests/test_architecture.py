@@ -28,7 +28,7 @@ MAY_IMPORT = {
         "report",
     },
     "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
-    "replay": {"scene", "tasks"},
+    "replay": {"scene", "tasks", "diagnosis"},
     "report": set(),
     "credibility": {
         "diagnosis",
@@ -104,12 +104,12 @@ FLOORS = {
     ),
     "replay": (
         ("colours", "contents", "shapes", "surfaces"),
-        ("plots",),
+        ("plots", "legends"),
         ("recording",),
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
-        ("live_view",),
+        ("live_view", "model_error"),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),

@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
 from surgisoft.cli.inputs import counted, read_context
-from surgisoft.cli.options import Credibility, EffectFiles, ExperimentFile, RigsOfArms
+from surgisoft.cli.options import Credibility, EffectFiles, ExperimentFile, Preflight, RigsOfArms
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(
@@ -44,6 +44,7 @@ def run(
         int | None, typer.Option(min=1, max=100_000, help="Episodes of each setting.")
     ] = None,
     rig: RigsOfArms = None,
+    preflight: Preflight = False,
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
@@ -63,7 +64,14 @@ def run(
 
         check_context(context, open_experiment(file))
     spec, folder = start_experiment(
-        file, output, policy or (), repeats, rigs_in(rig or ""), resume=resume, force=force
+        file,
+        output,
+        policy or (),
+        repeats,
+        rigs_in(rig or ""),
+        preflight=preflight,
+        resume=resume,
+        force=force,
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"

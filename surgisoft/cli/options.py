@@ -172,6 +172,15 @@ RigsOfArms = Annotated[
     ),
 ]
 
+Preflight = Annotated[
+    bool,
+    Option(
+        "--preflight",
+        help="On a real rig: try each chamber alone first, and stop where the arm does not move as "
+        "its model predicts.",
+    ),
+]
+
 Hidden = Annotated[
     list[str] | None,
     Option(

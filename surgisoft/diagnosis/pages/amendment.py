@@ -31,8 +31,8 @@ from surgisoft.time_axis import with_gaps
 
 HOW = (
     "The parameters were fitted through the whole model to the training part of the recordings, "
-    "with the model discrepancy beside them. The errors on top are those on the held-out part, "
-    "the last quarter of each recording, which was evaluated once.\n\n"
+    "with the model discrepancy beside them. The errors on top are those on the held-out part (the "
+    "last quarter of each recording, of four runs or more the last ones), which was evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
     "correlated errors."
 )
@@ -300,6 +300,14 @@ def _left(result: Improvement) -> Section:
     parts: list[Part] = [Text(f"{end.sentence[:1].upper()}{end.sentence[1:]}.")]
     if last.axis:
         parts.append(Text(f"The remaining error depends most on {last.axis}."))
+    wrong = [each for each in result.parameters if not each.plausible]
+    if wrong:
+        names = ", ".join(f"{each.name} of {each.effect}" for each in wrong)
+        text = (
+            f"Outside its plausible range, so not known from these recordings: {names}. The error "
+            "falls with it, but its value is no measurement."
+        )
+        parts.append(Text(text))
     if last.next_experiment:
         plan = last.next_experiment
         pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"

@@ -31,8 +31,8 @@ from surgisoft.time_axis import with_gaps
 
 HOW = (
     "The parameters were fitted through the whole model to the training part of the recordings, "
-    "with the model discrepancy beside them. The errors on top are those on the held-out part (the "
-    "last quarter of each recording, of four runs or more the last ones), which was evaluated once.\n\n"
+    "with the model discrepancy beside them. The errors on top are those on the held-out part "
+    "(the last quarter of each recording, of four runs or more the last ones), evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
     "correlated errors."
 )

@@ -41,19 +41,21 @@ def episode_charts(log: EpisodeLog) -> list[Picture]:
 def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     """Where the beam burnt (or the point went) over where it should, in the path's plane."""
     wanted = log.path_mm if len(log.path_mm) else log.target_mm
-    on = log.beam.on if log.beam is not None else np.ones(log.rows, bool)
-    done = log.beam.end_mm if log.beam is not None else log.actual_mm
+    always = np.ones(log.rows, bool)
+    done = [(beam.end_mm, beam.on) for beam in log.beams.values()] or [(log.actual_mm, always)]
     middle, plane = path_plane(wanted)
     flat = (wanted - middle) @ plane
     if len(log.path_mm):
         flat = np.vstack((flat, flat[:1]))
-    went = (done - middle) @ plane
-    went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
     with drawing():
         figure, axis = plt.subplots(figsize=(CHART[0], 4.2))
         axis.plot(*broken_at_jumps(flat).T, c=AMBER, lw=5, alpha=0.55, label="reference")
-        word = "burnt" if log.beam is not None else "done"
-        axis.plot(*broken_at_jumps(went).T, c=BLUE, lw=1.3, label=word)
+        for number, (end, on) in enumerate(done):
+            went = (end - middle) @ plane
+            went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
+            word = [*log.beams][number] if len(done) > 1 else "burnt" if log.beams else "done"
+            colour = (BLUE, GREEN)[number % 2]
+            axis.plot(*broken_at_jumps(went).T, c=colour, lw=1.3, label=word)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
@@ -76,21 +78,20 @@ def error_chart(log: EpisodeLog) -> Picture | None:
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
-        axis.set_title(
-            "error over time" + (" while the beam is on" if log.beam is not None else "")
-        )
+        axis.set_title("error over time" + (" while the beam is on" if log.beams else ""))
         return chart(figure, "error over time", f"Largest {largest:.3g} mm")
 
 
 def progress_chart(log: EpisodeLog) -> Picture | None:
     """Share of the ring that is cut and seen, over time, with the beam's times shaded."""
     seen = log.view_fraction
-    if log.beam is None or seen is None or "completion" not in log.measures:
+    on = log.burning
+    if on is None or seen is None or "completion" not in log.measures:
         return None
     with drawing():
         figure, axis = plt.subplots()
         axis.fill_between(
-            log.time_s, 0, 1.05, where=log.beam.on, color=GREEN, alpha=0.15, lw=0, label="beam on"
+            log.time_s, 0, 1.05, where=on, color=GREEN, alpha=0.15, lw=0, label="beam on"
         )
         axis.plot(log.time_s, log.measures["completion"], c=BLUE, label="cut")
         axis.plot(log.time_s, seen, c=AMBER, lw=1.0, label="in sight")

@@ -142,7 +142,7 @@ def success_rule(config: CircleAblationConfig) -> str:
 
 
 class CircleAblation:
-    """The two arms of a scene: agents `laser` and `endoscope`."""
+    """Two arms of a scene: agents `laser` and `endoscope`."""
 
     name, agents = "circle_ablation", ("laser", "endoscope")
     signals = (
@@ -154,7 +154,8 @@ class CircleAblation:
         self, config: CircleAblationConfig | None = None, device: str | torch.device = "cpu"
     ):
         self.config = config or CircleAblationConfig()
-        self.world = scene_world(self.config.scene, self.config.world, device, arm=self.config.arm)
+        c = self.config
+        self.world = scene_world(c.scene, c.world, device, arm=c.arm, agents=self.agents)
         self.scene, self.dt_s = self.world.scene, self.world.config.dt_s
         self.spec = self.scene.spec
         self.steps = round(self.spec.limits.time_s / self.dt_s)
@@ -194,14 +195,13 @@ class CircleAblation:
     def fires(self, state: TaskState[RingCut]) -> Tensor:
         """(B,) bool: as far as is measured the beam is near its target and meets the organ, and the
         endoscope's picture shows enough of the ring. The true pose of the arms does not enter."""
-        scene = state.world.scene
-        seen = scene.view.fraction >= self.spec.limits.view_fraction
+        seen = state.world.scene.views["endoscope"].fraction >= self.spec.limits.view_fraction
         near = self.measured_error_mm(state) <= self.config.fire_mm
         return seen & near & self._on_organ(state)
 
     def _on_organ(self, state: TaskState[RingCut]) -> Tensor:
         """(B,) bool: the beam meets the organ, from the measured key points of both arms."""
-        parts, hit = state.world.arms, state.world.scene.hit
+        parts, hit = state.world.arms, state.world.scene.hits["laser"]
         if all(torch.equal(part.seen_mm, part.points_mm) for part in parts.values()):
             return hit.on_organ  # what is measured is the truth: the ray was cast already
         return self.scene.aimed(
@@ -218,7 +218,8 @@ class CircleAblation:
         the reference moves on. None: where `fires` holds.
         """
         fired = self.fires(state) if fired is None else fired
-        world = self.world.step(state.world, actions, fired * self.spec.laser.power_w)
+        power_w = {"laser": fired * self.spec.laser.power_w}
+        world = self.world.step(state.world, actions, power_w)
         return TaskState(world, state.goal.after(fired))
 
     def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
@@ -230,7 +231,7 @@ class CircleAblation:
     ) -> dict[str, Tensor]:
         """The signals of a simulated step; see `MeasuredTask.true_signals`."""
         return {
-            "view_fraction": after.world.scene.view.fraction,
+            "view_fraction": after.world.scene.views["endoscope"].fraction,
             "beam_on": after.goal.fired.float(),
         }
 
@@ -258,7 +259,7 @@ class CircleAblation:
             "endoscope": {VIEW_ERROR: look.asinh()},
         }
         shared = {
-            VIEW: scene.view.fraction[:, None],
+            VIEW: scene.views["endoscope"].fraction[:, None],
             FIRED: cut.fired[:, None].float(),
             TIME: state.world.steps[:, None] / self.steps,
             APART: (laser.seen_mm[:, -1] - eye.seen_mm[:, -1]) / 50.0,
@@ -275,6 +276,7 @@ class CircleAblation:
     def rewards(self, state: TaskState[RingCut]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `LaserWeights` and `EndoscopeWeights`."""
         error, scene = self.beam_error_mm(state), state.world.scene
+        view = scene.views["endoscope"]
         shared = {
             "cut": state.goal.fired.float(),
             "contact": (scene.clearance.least_mm < self.spec.limits.clearance_mm).float(),
@@ -285,8 +287,8 @@ class CircleAblation:
             "fine": (-error / self.config.fine_mm).exp(),
         }
         endoscope = {
-            "look": 1.0 / (1.0 + scene.view.axis_error_mm / self.config.far_mm),
-            "view": scene.view.fraction,
+            "look": 1.0 / (1.0 + view.axis_error_mm / self.config.far_mm),
+            "view": view.fraction,
         }
         return {
             "laser": weighted(laser | shared, self.weights["laser"]),
@@ -314,7 +316,7 @@ class CircleAblation:
             "completion": ring.completion,
             "largest_gap_mm": ring.largest_gap_mm,
             "healthy_mm2": ring.healthy_mm2,
-            "view_fraction": scene.view.fraction,
+            "view_fraction": scene.views["endoscope"].fraction,
             "clearance_mm": scene.clearance.least_mm,
             "collided": hit.float(),
             "success": ((ring.completion >= 1.0) & ~hit).float(),
@@ -322,7 +324,7 @@ class CircleAblation:
 
     def trace(self, state: TaskState[RingCut]) -> tuple[Tensor, Tensor]:
         """Reference point on the ring and end of the beam, each (B, 1, 3) mm."""
-        return self.target_mm(state)[:, None], state.world.scene.hit.point_mm[:, None]
+        return self.target_mm(state)[:, None], state.world.scene.hits["laser"].point_mm[:, None]
 
     def script(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
         """Scripted expert: points the laser at its next target, the endoscope at the lesion."""

@@ -48,7 +48,7 @@ def _with(state, fraction=None, clearance=None):
     scene = state.world.scene
     ones = torch.ones_like(scene.view.fraction)
     if fraction is not None:
-        scene = replace(scene, view=replace(scene.view, fraction=fraction * ones))
+        scene = replace(scene, views={"endoscope": replace(scene.view, fraction=fraction * ones)})
     if clearance is not None:
         room = SimpleNamespace(least_mm=clearance * ones, collides=clearance * ones < 0.0)
         scene = replace(scene, clearance=room)

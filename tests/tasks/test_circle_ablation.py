@@ -85,9 +85,9 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
     scene, goal = state.world.scene, state.goal
     if what == "view":
         low = replace(scene.view, fraction=torch.tensor([0.94]))
-        scene = replace(scene, view=low)
+        scene = replace(scene, views={"endoscope": low})
     elif what == "blocked":
-        scene = replace(scene, hit=replace(scene.hit, struck=torch.tensor([4])))
+        scene = replace(scene, hits={"laser": replace(scene.hit, struck=torch.tensor([4]))})
     else:
         goal = replace(goal, done=goal.done + 3)
     changed = replace(state, goal=goal, world=replace(state.world, scene=scene))
@@ -266,7 +266,7 @@ def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
         axis_error_mm=torch.tensor([0.0, 10.0]),
         fraction=torch.tensor([0.25, 1.0]),
     )
-    looks = quick.rewards(with_scene(state, view=view))["endoscope"]
+    looks = quick.rewards(with_scene(state, views={"endoscope": view}))["endoscope"]
     assert looks["look"].tolist() == [1.0, 0.5]
     assert looks["view"].tolist() == [0.25, 1.0]
 

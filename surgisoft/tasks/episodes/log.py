@@ -7,7 +7,7 @@ stands alone: the scene's bodies, the dose's triangles and the camera are in it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from surgisoft.tasks.episodes.parts import (
     DoseLog,
     Event,
 )
-from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
+from surgisoft.tasks.world.scene import SceneEngine
 
 NO_DIAMETER_MM = 15.0
 """Outer diameter (mm) of an arm where neither scene nor model states it: the paper's arm."""
@@ -64,14 +64,14 @@ class EpisodeLog:
     """agent -> reward term -> (T,); nan in row 0."""
     limits: dict[str, float]
     """The scene's limits: `clearance_mm`, `view_fraction`, `time_s`; empty without a scene."""
-    beam: BeamLog | None = None
-    """The laser's beam."""
-    camera: CameraLog | None = None
-    """The endoscope's camera."""
+    beams: dict[str, BeamLog] = field(default_factory=dict)
+    """Each laser's beam by the arm's name."""
+    cameras: dict[str, CameraLog] = field(default_factory=dict)
+    """Each endoscope's camera by the arm's name."""
     clearance_mm: np.ndarray | None = None
-    """(T,) mm: least distance of any arm from a body or the other arm."""
-    view_fraction: np.ndarray | None = None
-    """(T,) 0..1: share of the ring that the endoscope sees."""
+    """(T,) mm: least distance of any arm from a body or another arm."""
+    views: dict[str, np.ndarray] = field(default_factory=dict)
+    """Endoscope's name -> (T,) 0..1: share of the ring that it sees."""
     dose: DoseLog | None = None
     """Dose map of the organ around the ring."""
     bodies: tuple[BodyLog, ...] = ()
@@ -83,6 +83,27 @@ class EpisodeLog:
     def rows(self) -> int:
         """Number T of rows."""
         return len(self.time_s)
+
+    @property
+    def beam(self) -> BeamLog | None:
+        """The beam of the first laser; None without one."""
+        return next(iter(self.beams.values()), None)
+
+    @property
+    def camera(self) -> CameraLog | None:
+        """The camera of the first endoscope; None without one."""
+        return next(iter(self.cameras.values()), None)
+
+    @property
+    def view_fraction(self) -> np.ndarray | None:
+        """(T,) 0..1: share of the ring that the first endoscope sees; None without one."""
+        return next(iter(self.views.values()), None)
+
+    @property
+    def burning(self) -> np.ndarray | None:
+        """(T,) bool: some beam burnt in the step before; None without a laser."""
+        on = [beam.on for beam in self.beams.values()]
+        return np.any(on, axis=0) if on else None
 
     @property
     def target_mm(self) -> np.ndarray:
@@ -201,12 +222,13 @@ class EpisodeRecorder:
         near = state.world.scene
         if near.clearance is not None:
             row["clearance"] = near.clearance.least_mm
-        if near.hit is not None:
-            row |= {"end": near.hit.point_mm, "hits": near.hit.on_organ}
-        if near.view is not None:
-            row["view"] = near.view.fraction
+        for name, hit in near.hits.items():
+            row |= {f"end/{name}": hit.point_mm, f"hits/{name}": hit.on_organ}
+        row |= {f"view/{name}": view.fraction for name, view in near.views.items()}
         if near.dose is not None:
-            row["delivered"] = near.dose.delivered_j
+            delivered = near.dose.delivered_j
+            delivered = delivered.reshape(len(delivered), -1).unbind(1)
+            row |= {f"delivered/{n}": j for n, j in zip(near.hits, delivered, strict=True)}
             self._add_dose(self._of(near.dose.dose))
         self._rows.append({name: self._of(value) for name, value in row.items()})
 
@@ -237,21 +259,32 @@ class EpisodeRecorder:
             mount=self._mounts[name],
             radius_mm=float(radius),
             shaft_mm=float(-arm.shaft[0, 2]) if len(arm.shaft) else 0.0,
+            tool=self._tool(name),
         )
+
+    def _tool(self, name: str) -> str:
+        """The tool of an arm; empty without a scene."""
+        around = self.task.world.scene
+        return around.spec.mount(name).tool if isinstance(around, SceneEngine) else ""
 
     def _scene_fields(self, near: SceneEngine, rows: Mapping[str, np.ndarray]) -> dict:
         """The log's fields that only a scene has."""
-        burnt = np.diff(rows["delivered"], prepend=rows["delivered"][:1])
-        beam = BeamLog(burnt / self.task.world.config.dt_s, rows["end"], rows["hits"])
         camera = CameraLog(near.camera.fov_rad, tuple(map(float, near.camera.range_mm)))
         return {
-            "beam": beam,
-            "camera": camera if ENDOSCOPE in self.task.world.arms else None,
+            "beams": {name: self._beam_log(name, rows) for name in near.lasers},
+            "cameras": dict.fromkeys(near.endoscopes, camera),
             "clearance_mm": rows["clearance"],
-            "view_fraction": rows["view"],
-            "dose": self._dose_log(near),
+            "views": _below(rows, "view/"),
+            "dose": self._dose_log(near) if near.lasers else None,
             "bodies": tuple(_body(body) for body in near.geometry.bodies),
         }
+
+    def _beam_log(self, name: str, rows: Mapping[str, np.ndarray]) -> BeamLog:
+        """The beam of one laser."""
+        delivered = rows[f"delivered/{name}"]
+        burnt = np.diff(delivered, prepend=delivered[:1])
+        power = burnt / self.task.world.config.dt_s
+        return BeamLog(power, rows[f"end/{name}"], rows[f"hits/{name}"])
 
     def _path(self, near: SceneEngine | None) -> np.ndarray:
         """(M, 3) mm: the ring's path of this episode's lesion."""
@@ -316,11 +349,15 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
     """
     found: list[Event] = []
     found.append(Event(0.0, "info", f"{log.task} by {log.driver} in {log.on}, seed {log.seed}"))
-    if log.beam is not None:
-        found += _changes(log, log.beam.on, ("info", "beam on"), ("info", "beam off"))
-    if log.view_fraction is not None:
-        seen = log.view_fraction >= log.limits["view_fraction"]
-        found += _changes(log, seen, ("info", "lesion in sight"), ("warning", "lesion lost"))
+    for name, beam in log.beams.items():
+        whose = f" of {name}" if len(log.beams) > 1 else ""
+        words = ("info", f"beam{whose} on"), ("info", f"beam{whose} off")
+        found += _changes(log, beam.on, *words)
+    for name, view in log.views.items():
+        seen = view >= log.limits["view_fraction"]
+        by = f" by {name}" if len(log.views) > 1 else ""
+        words = ("info", f"lesion in sight{by}"), ("warning", f"lesion lost{by}")
+        found += _changes(log, seen, *words)
     if log.clearance_mm is not None:
         if "clearance_mm" in log.limits:
             least = log.limits["clearance_mm"]

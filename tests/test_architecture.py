@@ -142,6 +142,7 @@ ONLY_IN = {
     "serial": "rig/drivers/serial_controller",
     "mcap": "measurement/importing/readers/mcap",
     "mcap_ros2": "measurement/importing/readers/mcap",
+    "distributed": "workers",
 }
 
 

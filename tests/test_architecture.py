@@ -89,7 +89,7 @@ FLOORS = {
     ),
     "scene": (
         ("frames",),
-        ("mesh", "capsules"),
+        ("mesh", "capsules", "moving"),
         ("meshio", "bvh", "rays", "plate"),
         ("field", "inside", "segmentation", "sight"),
         ("distance", "torch_queries", "camera"),

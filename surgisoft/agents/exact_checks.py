@@ -21,7 +21,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.rays import RayHit
 from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.world.arm import ArmPart
-from surgisoft.tasks.world.scene import SceneEngine
+from surgisoft.tasks.world.scene import SceneEngine, SceneState
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are computed."""
@@ -68,8 +68,11 @@ class _Notes:
     contact_differs: int = 0
     beam_differs: int = 0
     beam_off_mm: float = 0.0
-    closest: list[tuple[float, int, dict[str, ArmShape]]] = field(default_factory=list)
-    """(clearance in mm, step, arms) at the steps of least clearance by the batched geometry."""
+    closest: list[tuple[float, int, dict[str, ArmShape], CollisionChecker]] = field(
+        default_factory=list
+    )
+    """(clearance in mm, step, arms, checker with the bodies of the step) at the steps of least
+    clearance by the batched geometry."""
 
 
 class ExactChecks:
@@ -83,7 +86,7 @@ class ExactChecks:
                 f"task {task.name}: its world is empty, expected bodies to check against"
             )
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
-        self.checker = CollisionChecker(around.geometry.bodies)
+        self.around, self.checker = around, CollisionChecker(around.geometry.bodies)
         self.beam_mm = around.beam_mm if isinstance(around, SceneEngine) else math.nan
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
 
@@ -104,24 +107,39 @@ class ExactChecks:
             name: ArmShape(part.line_mm[row].cpu().numpy(), self.radii[name])
             for name, part in world.arms.items()
         }
-        found, step = self.checker.collisions(arms), int(world.steps[row])
+        checker = self._checker(world.scene, row)
+        found, step = checker.collisions(arms), int(world.steps[row])
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         notes.steps += 1
         clearance = world.scene.clearance
         assert clearance is not None, "a world with bodies has a clearance"
         notes.contact_differs += bool(found) != bool(clearance.collides[row])
-        notes.closest.append((float(clearance.least_mm[row]), step, arms))
+        notes.closest.append((float(clearance.least_mm[row]), step, arms, checker))
         notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
         for laser, hit in world.scene.hits.items():
-            self._look_along(notes, world.arms[laser], hit, row, arms, laser)
+            self._look_along(notes, world.arms[laser], hit, row, arms, laser, checker)
+
+    def _checker(self, scene: SceneState, row: int) -> CollisionChecker:
+        """The checker with the bodies where they are in one row of the batch."""
+        if scene.breaths is None or not isinstance(self.around, SceneEngine):
+            return self.checker
+        placement = self.around.placement(scene.breaths)
+        return self.checker if placement is None else self.checker.moved(placement, row)
 
     def _look_along(
-        self, notes: _Notes, beam: ArmPart, hit: RayHit, row: int, arms, laser: str
+        self,
+        notes: _Notes,
+        beam: ArmPart,
+        hit: RayHit,
+        row: int,
+        arms,
+        laser: str,
+        checker: CollisionChecker,
     ) -> None:
         """Compare the exact end of a laser's beam with that of the batched geometry."""
         origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
-        exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=laser)
+        exact = checker.cast(origin, aim, self.beam_mm, arms, own=laser)
         if int(exact.struck) != int(hit.struck[row]):
             notes.beam_differs += 1
         else:
@@ -129,7 +147,7 @@ class ExactChecks:
             notes.beam_off_mm = max(notes.beam_off_mm, float(off))
 
     def _check(self, notes: _Notes) -> EpisodeCheck:
-        exact = [self.checker.clearance(arms).least_mm for _, _, arms in notes.closest]
+        exact = [checker.clearance(arms).least_mm for _, _, arms, checker in notes.closest]
         offs = [abs(mm - seen[0]) for mm, seen in zip(exact, notes.closest, strict=True)]
         return EpisodeCheck(
             contact=notes.contact,

@@ -225,16 +225,13 @@ class CollisionChecker:
         level = int(placement.level[environment])
         rigid = placement.rigid[environment].detach().cpu().double().numpy()
         strain = placement.strains[level].detach().cpu().double().numpy()
-        checker.bodies, checker._inward, checker._objects = (
-            list(each) for each in (self.bodies, self._inward, self._objects)
-        )
+        bodies, inward, objects = list(self.bodies), list(self._inward), list(self._objects)
         for index, body in enumerate(self.bodies):
             if body.name in placement.at_rest:
                 mesh, model = self._strained(index, level, strain)
-                checker.bodies[index] = Body(body.name, body.role, mesh, rigid)
-                checker._inward[index] = frames.invert(rigid)
-                checker._objects[index] = _placed(model, rigid)
-        checker.bodies = tuple(checker.bodies)
+                bodies[index] = Body(body.name, body.role, mesh, rigid)
+                inward[index], objects[index] = frames.invert(rigid), _placed(model, rigid)
+        checker.bodies, checker._inward, checker._objects = tuple(bodies), inward, objects
         return checker
 
     def _strained(self, index: int, level: int, strain: np.ndarray) -> tuple[Mesh, fcl.BVHModel]:

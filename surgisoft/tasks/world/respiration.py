@@ -5,11 +5,12 @@ z(t) = z0 - b cos^2n(pi t / tau - phi), with z0 the place at the end of exhalati
 rests longest, b the amplitude, tau the period and n = 1, 2, 3 the asymmetry. Each breath has its
 own b and tau; breaths join at the end of exhalation, where the displacement and its rate are 0.
 
-The organ moves towards the feet and a share of that forwards, turns about the lateral axis, and is
-strained in proportion: shorter from head to feet, deeper from back to front, and sheared. The liver
-moves 5 to 25 mm from head to feet in quiet breathing (Keall et al. 2006, AAPM TG-76, Med. Phys.
-33:3874, table I) and deforms by some millimetres beside (Rohlfing et al. 2004, Med. Phys. 31:427).
-Strain is homogeneous: bending is not modelled.
+The lesion moves towards the feet and a share of that forwards; about it the organ turns about the
+lateral axis, and is strained in proportion: shorter from head to feet, deeper from back to front,
+and sheared. In quiet breathing the liver moves by 5 to 25 mm from head to feet (studies collected by
+Keall et al. 2006, AAPM TG-76, Med. Phys. 33:3874) and deforms by some millimetres beside (Rohlfing
+et al. 2004, Med. Phys. 31:427); the strains here make 2.4 mm at 80 mm from the lesion and a breath
+of 20 mm. Strain is homogeneous: bending is not modelled.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from surgisoft.tasks.world.random_streams import Stream
 
 MOVING = ("organ", "keep-out")
 """Roles of the bodies that move with respiration; supports stay."""
-LEVELS = 24
+LEVELS = 12
 """Levels of the strain between none and that of the largest displacement."""
 LEAST_SHARE, MOST_SHARE = 0.4, 1.6
 """Smallest and largest amplitude and period of a breath, in those of the episode."""
@@ -41,7 +42,7 @@ class Respiration:
     """How the organ breathes; each episode draws its mean amplitude and rate uniformly."""
 
     amplitude_mm: tuple[float, float] = (5.0, 20.0)
-    """Smallest and largest mean displacement towards the feet of an episode, mm."""
+    """Smallest and largest mean displacement of the lesion towards the feet, mm."""
     rate_per_min: tuple[float, float] = (10.0, 20.0)
     """Smallest and largest mean number of breaths in a minute."""
     irregular: float = 0.15
@@ -126,16 +127,19 @@ class OrganMotion:
         self,
         respiration: Respiration,
         bodies: Sequence[Body],
-        organ: Body,
+        centre_mm: np.ndarray,
         time_s: float,
         device: torch.device,
     ):
-        """time_s: longest episode, s, which sets the number of breaths that are drawn."""
+        """centre_mm (3,): the lesion's centre, whose displacement is that of the breath, and about
+        which the organ turns and is strained, so that levels of strain do not move it. time_s:
+        longest episode, s, which sets the number of breaths that are drawn.
+        """
         self.config, self.device = respiration, device
         shortest_s = LEAST_SHARE * 60.0 / respiration.rate_per_min[1]
         self.count = math.ceil(time_s / shortest_s) + 2
         self.largest_mm = MOST_SHARE * respiration.amplitude_mm[1]
-        self.centre_mm = organ.world_mesh.bounds_mm.mean(axis=0)
+        self.centre_mm = np.asarray(centre_mm, float)
         feet = frames.normalise(np.asarray(respiration.feet, float))
         front = np.asarray(respiration.front, float)
         front = frames.normalise(front - (front @ feet) * feet)

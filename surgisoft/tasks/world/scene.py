@@ -154,8 +154,8 @@ class SceneEngine:
         self.organ = scene.bodies.index(scene.organ)
         self.motion: OrganMotion | None = None
         if respiration is not None:
-            bodies = (scene.bodies, scene.organ)
-            self.motion = OrganMotion(respiration, *bodies, time_s, self.device)
+            about = np.array(scene.spec.lesion.centre_mm)
+            self.motion = OrganMotion(respiration, scene.bodies, about, time_s, self.device)
         treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
         self.work_camera = self.camera
         if treated.field_rad is not None:

@@ -8,7 +8,6 @@ point is inside a closed body.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -221,7 +220,8 @@ class CollisionChecker:
 
         The strained surface of each level is built once and kept.
         """
-        checker = copy.copy(self)
+        checker = object.__new__(type(self))  # `copy.copy` would build every surface anew
+        checker.__dict__.update(self.__dict__)
         level = int(placement.level[environment])
         rigid = placement.rigid[environment].detach().cpu().double().numpy()
         strain = placement.strains[level].detach().cpu().double().numpy()

@@ -7,10 +7,10 @@ own b and tau; breaths join at the end of exhalation, where the displacement and
 
 The lesion moves towards the feet and a share of that forwards; about it the organ turns about the
 lateral axis, and is strained in proportion: shorter from head to feet, deeper from back to front,
-and sheared. In quiet breathing the liver moves by 5 to 25 mm from head to feet (studies collected by
-Keall et al. 2006, AAPM TG-76, Med. Phys. 33:3874) and deforms by some millimetres beside (Rohlfing
-et al. 2004, Med. Phys. 31:427); the strains here make 2.4 mm at 80 mm from the lesion and a breath
-of 20 mm. Strain is homogeneous: bending is not modelled.
+and sheared. In quiet breathing the liver moves by 5 to 25 mm from head to feet (studies collected
+by Keall et al. 2006, AAPM TG-76, Med. Phys. 33:3874) and deforms by some millimetres beside
+(Rohlfing et al. 2004, Med. Phys. 31:427); the strains here make 2.4 mm at 80 mm from the lesion and
+a breath of 20 mm. Strain is homogeneous: bending is not modelled.
 """
 
 from __future__ import annotations

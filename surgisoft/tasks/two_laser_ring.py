@@ -62,7 +62,7 @@ LEAD = Block(
 )
 BEAM_CLEARANCE = Block(
     "beam_clearance",
-    "least distance of the beam's path from the skin of the other arms",
+    "least measured distance of the beam's path from the skin of the other arms, own beam first",
     "mm",
     "min(x, 60) / 10",
     -2.0,
@@ -75,8 +75,10 @@ VIEW_ERROR = Block(
     "asinh(x / 1 mm)",
 )
 VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x", 0.0, 1.0)
-SPOTS = Block("spots", "1 if the endoscope sees the laser's target, for each", "-", "x", 0.0, 1.0)
-FIRED = Block("fired", "1 if the beam was on in the last step, own first", "-", "x", 0.0, 1.0)
+SPOTS = Block(
+    "spots", "1 if the endoscope sees a laser's target, own laser first", "-", "x", 0.0, 1.0
+)
+FIRED = Block("fired", "1 if a beam was on in the last step, own beam first", "-", "x", 0.0, 1.0)
 APART = Block("apart", "measured tips of the other arms minus the own one", "mm", "x / 50")
 
 
@@ -297,6 +299,15 @@ class TwoLaserRing:
             found.append(torch.stack(away).amin(0))
         return torch.stack(found, 1)
 
+    def _measured_arms(self, state: TaskState[SharedCut]) -> Mapping[str, ArmPart]:
+        """The arms with their bodies where they are measured; the state's own where that is exact."""
+        arms = state.world.arms
+        if all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values()):
+            return arms
+        return {
+            name: self.world.arms[name].posed(part, part.seen_mm) for name, part in arms.items()
+        }
+
     def fires(self, state: TaskState[SharedCut]) -> Tensor:
         """(B,) bool: some beam is released, see `released`."""
         return self.released(state).any(1)
@@ -307,13 +318,8 @@ class TwoLaserRing:
         fraction = state.world.scene.views[ENDOSCOPE].fraction
         seen = (fraction >= self.spec.limits.view_fraction)[:, None] & self.spots_seen(state)
         near = self.measured_errors_mm(state) <= self.config.fire_mm
-        arms = state.world.arms
-        exact = all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values())
-        if not exact:
-            arms = {
-                name: self.world.arms[name].posed(part, part.seen_mm) for name, part in arms.items()
-            }
-        hits = state.world.scene.hits
+        arms, hits = self._measured_arms(state), state.world.scene.hits
+        exact = arms is state.world.arms  # the rays were cast already
         hit = [hits[n] if exact else self.scene.aimed(arms, n) for n in LASERS]
         clear = self.beam_clearance_mm(state, arms) >= self.config.beam_mm
         return seen & near & clear & torch.stack([one.on_organ for one in hit], 1)
@@ -338,7 +344,8 @@ class TwoLaserRing:
         arms, scene, cut = state.world.arms, state.world.scene, state.goal
         pointing, tips = self.pointing, {name: arms[name].seen_mm[:, -1] for name in AGENTS}
         ahead = [self.targets_mm(state, k) for k in range(self.config.preview + 1)]
-        clear = self.beam_clearance_mm(state).clamp(-20.0, 60.0) / 10.0
+        clear = self.beam_clearance_mm(state, self._measured_arms(state))
+        clear = clear.clamp(-20.0, 60.0) / 10.0
         lead = (cut.done[:, :1] - cut.done[:, 1:]) / self.round
         seen, fired = self.spots_seen(state).float(), cut.fired.float()
         own: dict[str, ObservationBlocks] = {}

@@ -51,7 +51,7 @@ FLOORS = {
     "diagnosis": (
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
-        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
         ("black_box", "candidates", "setup"),

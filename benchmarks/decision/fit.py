@@ -2,7 +2,7 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases. The penalty of each model is chosen by leaving out one group of robots after another within
+cases, and so do the kinds of cases in every source (PRIORS). The penalty of each model is chosen by leaving out one group of robots after another within
 the cases that it is fitted to, so nothing of a source that is judged enters.
 """
 
@@ -34,6 +34,10 @@ WEAK = 0.5
 cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
+PRIORS = {"missing": 0.75, "known": 0.75, "two": 0.3, "network": 0.2}
+"""Shares of cases of which each statement is true, for which the probabilities are calibrated. They
+are stated: how often cases of each kind were drawn for a source says nothing of real arms, and it
+differs between sources."""
 WHOLE_TRUTH = ("missing", "known", "network")
 """Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
@@ -79,12 +83,20 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
     return answer
 
 
-def source_weights(cases: Sequence[Labelled]) -> np.ndarray:
-    """(N,) weights of cases of mean 1: every source has the same sum, unless it has few cases."""
-    names = [case.source for case in cases]
-    number = {name: names.count(name) for name in names}
-    weights = np.array([len(names) / len(number) / number[name] for name in names])
-    weights = np.minimum(weights, MOST_WEIGHT)
+def case_weights(name: str, some: Sequence) -> np.ndarray:
+    """(N,) weights of a model's sample, of mean 1.
+
+    Every source has the same sum, unless it has few cases, and in every source the statement is
+    true for the share PRIORS of it; where a source has cases of one kind only, they have the share
+    of that kind.
+    """
+    prior = PRIORS.get(name)
+    kinds = [(case.source, prior is None or bool(right)) for _, right, case in some]
+    number = {kind: kinds.count(kind) for kind in kinds}
+    sources = len({source for source, _ in kinds})
+    share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
+    weights = [share[kind[1]] * len(kinds) / sources / number[kind] for kind in kinds]
+    weights = np.minimum(np.array(weights, float), MOST_WEIGHT)
     return weights / weights.mean()
 
 
@@ -107,7 +119,7 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     signs = np.array([feature.sign for feature in features], float)
     if not some:
         return Logistic(tuple(0.0 for _ in features))
-    weights = source_weights([case for _, _, case in some])
+    weights = case_weights(name, some)
     joint = name == "first"
     if joint:
         x = [rows for rows, _, _ in some]
@@ -162,7 +174,7 @@ def penalty_of(name: str, some: Sequence) -> float:
     fold = _folds(some) if some else np.zeros(0)
     if len(np.unique(fold)) < 2:
         return PENALTIES[-1]
-    weights = source_weights([case for _, _, case in some])
+    weights = case_weights(name, some)
     totals = []
     for penalty in PENALTIES:
         total = 0.0

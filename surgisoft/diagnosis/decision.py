@@ -52,6 +52,9 @@ ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
 """The fitted decision that is in force."""
 FEW_MOTIONS = 24
 """Fewer different motions than this, two minutes of five seconds each, are few data."""
+FEW_PAIRED_MOTIONS = 12
+"""Fewer than this, one minute, are few where a paired difference is explained: it has no error of a
+network that an effect has to be told apart from."""
 LEARNED = 0.1
 """Share of what can be explained that memory must explain beyond any static function before the
 network is said to have learned part of what is missing."""
@@ -258,7 +261,7 @@ KNOWN = (
         "exact_left",
         -1,
         _exact_left,
-        "log size of what is left by an effect whose form is exact (frame, weight)",
+        "log size of what is left by an effect whose form is exact (frame)",
     ),
     Feature(
         "effect_z",
@@ -306,7 +309,7 @@ FIRST = (
     Feature(
         "amplitudes",
         -1,
-        lambda x, e: _log(x.amplitudes, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
+        lambda x, e: _log(x.size, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
         "log of its number of amplitudes, where it explains about as much as the best",
     ),
     Feature(
@@ -629,4 +632,5 @@ def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
     memory = evidence.free_box - evidence.free_static
     if evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
         return "learned"
-    return "few_data" if evidence.motions < FEW_MOTIONS else "schedule"
+    few = FEW_PAIRED_MOTIONS if evidence.paired else FEW_MOTIONS
+    return "few_data" if evidence.motions < few else "schedule"

@@ -217,7 +217,7 @@ def diagnose(
     Only the training rows are looked at: the view of the residual table that is worked on holds no
     other key points. before: recordings from before a change in question. Where they were made with
     the same actuation, the paired difference is explained (`pairs`), else the residuals of the
-    model, with those of `before` as what was known; paired: `auto`, `always` (too few common
+    model less what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few common
     motions are an error) or `never`. reference: recordings, as before; or residuals of the model
     from before, default those that it keeps of its fit. without: effects that cannot act, such as a
     contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates

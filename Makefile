@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test fast lint docs clean
+.PHONY: demo test fast lint docs fuzz clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -40,6 +40,10 @@ lint: $(STAMP)  ## style, format, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+SECONDS ?= 300
+fuzz: $(STAMP)  ## mutated files into every reader for SECONDS
+	$(BIN)/python -m benchmarks.fuzz --seconds $(SECONDS) --workers 2
 
 docs: $(DOCS_STAMP)  ## the documentation site, in site/
 	$(BIN)/python docs/draw_architecture.py --check

@@ -26,6 +26,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from surgisoft.environments import register_with_gymnasium
+from surgisoft.extras import missing_library
 
 __version__ = "0.1.0"
 
@@ -110,7 +111,13 @@ def __getattr__(name: str) -> object:
     present = _OTHER_NAMES.get(name, name)
     if present not in _PLACES:
         raise AttributeError(f"module 'surgisoft' has no attribute '{name}'")
-    found = getattr(import_module(f"surgisoft.{_PLACES[present]}"), present)
+    try:
+        found = getattr(import_module(f"surgisoft.{_PLACES[present]}"), present)
+    except ModuleNotFoundError as error:
+        advice = missing_library(error, name)
+        if advice is None:
+            raise
+        raise ImportError(f"surgisoft.{name}: {advice}", name=error.name) from None
     globals()[name] = found
     return found
 

@@ -26,7 +26,7 @@ import tomli_w
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 
-LARGEST_BYTES = 4_000_000
+LARGEST_BYTES = 1_000_000
 """A larger file is no configuration and is not parsed."""
 DEEPEST_KEY = 100
 """A dotted key of more parts is refused."""

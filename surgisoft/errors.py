@@ -2,6 +2,9 @@
 
 from collections.abc import Iterable
 
+LONGEST = 1000
+"""Characters of a message; of a longer one the middle is left out."""
+
 
 class InputError(ValueError):
     """Bad input from outside.
@@ -11,7 +14,21 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str):
-        super().__init__(" ".join(message.split()))
+        super().__init__(one_line(message))
+
+
+def one_line(text: str) -> str:
+    """The text as one printable line of at most `LONGEST` characters.
+
+    What a file holds can stand in a message. Control characters, which could steer a terminal, and
+    lone surrogates, which cannot be encoded, are written as their escapes.
+    """
+    line = " ".join(text[: 100 * LONGEST].split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    if len(line) <= LONGEST:
+        return line
+    return f"{line[: LONGEST * 7 // 10]} ... {line[len(line) - LONGEST // 5 :]}"
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> InputError:

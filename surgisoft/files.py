@@ -17,6 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from surgisoft.errors import InputError
+
+LARGEST_JSON = 8_000_000
+"""A larger JSON file is none that the package writes, bytes."""
+
 
 @contextlib.contextmanager
 def new_file(path: str | Path) -> Iterator[Path]:
@@ -71,6 +76,21 @@ def write_atomically(path: str | Path, content: bytes | str) -> None:
 def write_json(path: str | Path, value: Any) -> None:
     """Write a value as strict JSON, whole or not at all; not finite numbers become null."""
     write_atomically(path, json.dumps(json_safe(value), indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: str | Path, most_bytes: int = LARGEST_JSON) -> Any:
+    """The value in a JSON file; raises InputError for a file that is too large or no JSON."""
+    path = Path(path)
+    with path.open("rb") as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise InputError(f"{path}: larger than {most_bytes} bytes; expected a smaller JSON file")
+    try:
+        return json.loads(content)
+    except RecursionError:
+        raise InputError(f"{path}: not valid JSON: nested too deeply") from None
+    except ValueError as error:  # also text that is not UTF-8, and integers of too many digits
+        raise InputError(f"{path}: not valid JSON: {error}") from None
 
 
 def json_safe(value: Any) -> Any:

@@ -69,7 +69,7 @@ FLOORS = {
         ("frames",),
         ("mesh", "capsules", "camera"),
         ("meshio", "bvh", "rays", "plate"),
-        ("field", "inside", "render"),
+        ("field", "inside", "render", "segmentation"),
         ("distance", "torch_queries"),
         ("batched", "collision"),
         ("reach", "spec"),
@@ -79,7 +79,7 @@ FLOORS = {
         ("author",),
     ),
     "replay": (
-        ("colours", "shapes", "surfaces"),
+        ("colours", "contents", "shapes", "surfaces"),
         ("plots",),
         ("recording",),
         ("arms", "endoscope"),

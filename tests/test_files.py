@@ -8,7 +8,15 @@ import stat
 import numpy as np
 import pytest
 
-from surgisoft.files import json_safe, new_file, new_folder, write_atomically, write_json
+from surgisoft.errors import InputError
+from surgisoft.files import (
+    json_safe,
+    new_file,
+    new_folder,
+    read_json,
+    write_atomically,
+    write_json,
+)
 
 
 @pytest.fixture(params=[0o022, 0o077, 0o002])
@@ -98,3 +106,21 @@ def test_json_has_null_for_numbers_that_are_not_finite(tmp_path):
         "f": None,
     }
     assert json_safe(True) is True
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"[" * 100_000, "nested too deeply"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "not valid JSON"),
+        (b"\xff\xfe{}", "not valid JSON"),
+        (b"{", "not valid JSON"),
+        (b" " * 2000, "larger than 1000 bytes"),
+    ],
+)
+def test_json_of_any_content_is_a_value_or_one_line(tmp_path, content, said):
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        read_json(tmp_path / "a.json", 1000 if "larger" in said else 10**6)
+    write_json(tmp_path / "b.json", {"a": [1, None]})
+    assert read_json(tmp_path / "b.json") == {"a": [1, None]}

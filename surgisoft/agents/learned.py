@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents.policy_network import ScaledActor, empty_actor
-from surgisoft.agents.run_folder import BEST, LAST, RunFolder
+from surgisoft.agents.presets import Preset
+from surgisoft.agents.run_folder import BEST, LAST, RunFolder, damaged
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Episodes, Task, TaskState
 
@@ -45,17 +46,44 @@ class LearnedPolicy(ActorPolicy):
             which = BEST if self.run.checkpoint(BEST).is_file() else LAST
         device = task.world.device if task else "cpu"
         saved, plan = self.run.load(which, device), self.run.plan()
-        self.which, self.iteration = which, saved["iteration"]
-        actors = {}
-        for agent, size in self.run.agents.items():
-            actor = empty_actor(agent, size["observation"], size["chambers"], plan.preset)
-            weights = saved["agents"][agent]
-            actor.load_state_dict(weights if which == BEST else weights["actor_state_dict"])
-            scaled = ScaledActor(actor, plan.preset.action_kPa, size["step_kPa"])
-            actors[agent] = scaled.to(device).eval().requires_grad_(False)
+        file, actors = self.run.checkpoint(which), {}
+        with damaged(file):
+            self.which, self.iteration = which, int(saved["iteration"])
+            for agent, size in self.run.agents.items():
+                weights = saved["agents"][agent]
+                weights = weights if which == BEST else weights["actor_state_dict"]
+                sizes = size["observation"], size["chambers"]
+                check_weights(file, agent, weights, *sizes, plan.preset)
+                actor = empty_actor(agent, *sizes, plan.preset)
+                actor.load_state_dict(weights)
+                scaled = ScaledActor(actor, plan.preset.action_kPa, size["step_kPa"])
+                actors[agent] = scaled.to(device).eval().requires_grad_(False)
         super().__init__(actors)
         if task is not None:
             check_fits(self.run, task)
+
+
+def check_weights(
+    file: Path, agent: str, weights: Mapping[str, Tensor], width: int, chambers: int, preset: Preset
+) -> None:
+    """Raise InputError unless an actor's weights are finite and of the shapes that the run states.
+
+    The actor is laid out without memory for its numbers, so that a false size costs nothing.
+    """
+    with torch.device("meta"):
+        expected = empty_actor(agent, width, chambers, preset).state_dict()
+    for name, value in expected.items():
+        shape = list(weights[name].shape) if name in weights else "no"
+        if shape != list(value.shape):
+            raise InputError(
+                f"{file}: '{name}' of '{agent}' has {shape} numbers, expected {list(value.shape)} "
+                "by config.json; train it again"
+            )
+        if not weights[name].isfinite().all():
+            raise InputError(
+                f"{file}: '{name}' of '{agent}' has numbers that are NaN or infinite; train it "
+                "again, or use another checkpoint"
+            )
 
 
 def agent_sizes(task: Task) -> dict[str, dict]:

@@ -1,8 +1,13 @@
-"""Tasks with virtual rigs as plants: every arm of every episode is a separate rig.
+"""Tasks with rigs as plants: an arm of the task is a rig, simulated or real.
 
 Commands go to the rig's pumps, pressures and key points come from its sensors and cameras; goals,
-scene and scores of the task stay as they are. The true body, the beam and the errors are those of
-the plant, without the cameras' noise. Policies and the task's controllers see measurements only.
+scene and scores of the task stay as they are. Policies and the task's controllers see measurements
+only.
+
+On a simulated rig every arm of every episode is a separate rig, and the body, the beam and the
+errors are the true ones of the plant, without the cameras' noise. A real rig has no truth: the body
+is the measured one, errors contain the noise of the cameras, and where a key point is lost the
+estimate stands in. There is one bench, so that episodes run one after the other.
 
 An observer makes an estimate of them: the arm's model runs beside the rig, driven by the measured
 pressures, and its output is corrected by a filtered output disturbance, as in offset-free model
@@ -13,8 +18,10 @@ measurement.
 from __future__ import annotations
 
 import copy
+import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +29,10 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.rig import SimulatedRig, VirtualRig
+from surgisoft.rig import Rig
+from surgisoft.rig.interface import is_simulated
+from surgisoft.rig.registry import open_rig, parse_rig
+from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import Arm, ArmPart, ModelArm
@@ -32,14 +42,14 @@ from surgisoft.tasks.world.random_streams import Stream
 
 @dataclass(frozen=True)
 class RigConfig:
-    """Which virtual rig replaces each arm, and how its measurements are filtered."""
+    """Which rig replaces each arm, and how its measurements are filtered."""
 
     seed: int = 0
-    """Seed of the virtual robot; the default arm model was fitted to robot 0."""
+    """Seed of the robot of a simulated rig; the default arm model was fitted to robot 0."""
     hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects: (name, amplitude)."""
+    """Hidden effects of a simulated rig: (name, amplitude)."""
     noise: float = 1.0
-    """Factor on all sensor and camera noise."""
+    """Factor on all sensor and camera noise of a simulated rig."""
     cameras: bool = True
     """Whether cameras measure the key points; else the model alone estimates them."""
     observer_gain: float = 0.3
@@ -52,6 +62,9 @@ class RigConfig:
     the pumps adopts in a step, 0..1."""
     settle_s: float = 4.0
     """Time at each pressure of the random history before an episode, s."""
+    rigs: tuple[str, ...] = ("virtual",)
+    """Texts `NAME[:option=value,...]` (`surgisoft.rig.registry`): one for every arm, or
+    `ARM=NAME[:...]` for single arms, the others then being virtual."""
 
     def __post_init__(self):
         for name in ("observer_gain", "drift_gain", "pump_gain"):
@@ -61,13 +74,53 @@ class RigConfig:
             raise InputError(f"rig: settle_s is {self.settle_s}, expected more than 0 s")
 
 
-BuildRig = Callable[[RigConfig, int], SimulatedRig]
-"""Makes the rig of one arm of one episode from the configuration and the number of its trial."""
+BuildRig = Callable[[RigConfig, int], Rig]
+"""Makes the rig of one arm of one episode from the configuration and the number of its trial.
+
+The configuration has one entry in `rigs`, that of the arm. A real rig is made once."""
 
 
-def virtual_rig(config: RigConfig, trial: int = 0) -> VirtualRig:
-    """The virtual rig of a configuration; another trial has other noise on the same robot."""
-    return VirtualRig(config.seed, hidden=config.hidden, noise=config.noise, take=trial)
+def named_rig(config: RigConfig, trial: int = 0) -> Rig:
+    """The rig of a configuration; another trial has other noise on the same simulated robot."""
+    (text,) = config.rigs
+    plain = RigConfig()
+    changed = {
+        name: getattr(config, name)
+        for name in ("hidden", "noise")
+        if getattr(config, name) != getattr(plain, name)
+    }
+    return open_rig(text, {"seed": config.seed, "noise_seed": trial}, **changed)
+
+
+def rigs_in(text: str) -> tuple[str, ...]:
+    """The rigs of one text, as in `RigConfig.rigs`: `NAME[:...]`, or `ARM=NAME[:...] ARM=...`."""
+    return tuple(part for part in re.split(r"\s+(?=\w+=)", text.strip()) if part)
+
+
+def rigs_by_arm(rigs: Sequence[str], arms: Sequence[str]) -> dict[str, str]:
+    """Arm -> text of its rig; `rigs` as in `RigConfig`, arms: names of the task's arms."""
+    named: dict[str, str] = {}
+    plain: list[str] = []
+    for text in rigs:
+        arm, equals, rest = text.partition("=")
+        if not equals or ":" in arm:
+            plain.append(text)
+        elif arm not in arms:
+            raise InputError(f"rig '{text}': no arm '{arm}', expected one of {', '.join(arms)}")
+        elif arm in named:
+            raise InputError(f"rig '{text}': arm '{arm}' has the rig '{named[arm]}' already")
+        else:
+            named[arm] = rest
+    if len(plain) > 1 or (plain and named):
+        raise InputError(
+            f"rigs {', '.join(rigs)}: expected one rig for all arms, or ARM=NAME for each of "
+            f"{', '.join(arms)}"
+        )
+    others = plain[0] if plain else "virtual"
+    found = {arm: named.get(arm, others) for arm in arms}
+    for text in found.values():
+        parse_rig(text)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +131,7 @@ class RigPlant:
     that hold the same rig only the later one is true.
     """
 
-    rigs: ObjectBatch[SimulatedRig]
+    rigs: ObjectBatch[Rig]
     """The B rigs."""
     target_kPa: Tensor
     """(B, m) kPa: pressures that were commanded last."""
@@ -95,33 +148,32 @@ class Reading:
     points_mm: Tensor
     """(B, n, 3) mm, base frame, as measured; nan where the cameras lost one."""
     true_mm: Tensor
-    """(B, n, 3) mm, base frame: what the cameras would measure without noise."""
+    """(B, n, 3) mm, base frame: what the cameras would measure without noise; on a real rig the
+    measurement itself."""
 
 
 class RigArm:
-    """An arm of the world whose plant is a batch of virtual rigs; see the interface `Arm`.
+    """An arm of the world whose plant is a batch of rigs; see the interface `Arm`.
 
     Predictions (`predict`, `settled`) and the range by which observations are scaled (`low`,
     `high`) are those of the simulated arm, on which policies were trained; commands are also held
-    within the rig's limits (`lowest`, `highest`). Holds no state: the rigs are in `ArmPart.plant`.
+    within the rig's limits (`lowest`, `highest`). Holds no state but a real bench (`real`), which
+    is there once; simulated rigs are in `ArmPart.plant`.
     """
 
-    def __init__(
-        self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = virtual_rig
-    ):
+    def __init__(self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = named_rig):
         """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
         self.config, self.build = config, build
         rig = build(config, 0)
-        if (rig.chambers, rig.key_planes) != (arm.chambers, arm.key_points):
-            raise InputError(
-                f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
-                f"the virtual rig's has {rig.chambers} and {rig.key_planes}"
-            )
+        self.real: SafeRig | None = None
+        if not is_simulated(rig):
+            self.real = rig = rig if isinstance(rig, SafeRig) else SafeRig(rig)
+        try:
+            self._check(rig, arm, dt_s)
+        except InputError:
+            self.close()
+            raise
         self.reads = round(dt_s / rig.period_s)
-        if abs(self.reads * rig.period_s - dt_s) > 1e-9 or not self.reads:
-            raise InputError(
-                f"dt_s is {dt_s} s; on the rig expected a multiple of its {rig.period_s} s"
-            )
         self.period_s = rig.period_s
         low, high = (torch.tensor(end).to(arm.low) for end in rig.limits.T)
         self.lowest = torch.maximum(arm.low, low)
@@ -133,9 +185,35 @@ class RigArm:
         self.low, self.high, self.first = arm.low, arm.high, arm.first
         self.pose, self.shaft = arm.pose, arm.shaft
 
+    @staticmethod
+    def _check(rig: Rig, arm: ModelArm, dt_s: float) -> None:
+        """Raise InputError unless the rig fits the simulated arm and the step of the world."""
+        if (rig.chambers, rig.key_planes) != (arm.chambers, arm.key_points):
+            raise InputError(
+                f"arm '{arm.name}' has {arm.chambers} chambers and {arm.key_points} key points; "
+                f"the rig's has {rig.chambers} and {rig.key_planes}"
+            )
+        if rig.unit != "kPa":
+            raise InputError(f"arm '{arm.name}' is commanded in kPa, the rig in {rig.unit}")
+        reads = round(dt_s / rig.period_s)
+        if abs(reads * rig.period_s - dt_s) > 1e-9 or not reads:
+            raise InputError(
+                f"dt_s is {dt_s} s; on the rig expected a multiple of its {rig.period_s} s"
+            )
+
+    def close(self) -> None:
+        """Vent the real bench, where there is one, and give its devices back."""
+        if self.real is not None:
+            self.real.close()
+
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Rigs at rest that then went through random pressures, at the start of an episode."""
-        trials = zip(stream.key.tolist(), stream.count.tolist(), strict=True)
+        trials = list(zip(stream.key.tolist(), stream.count.tolist(), strict=True))
+        if self.real is not None and len(trials) > 1:
+            raise InputError(
+                f"arm '{self.name}' is one real bench, and {len(trials)} episodes were to run side "
+                "by side; expected one after the other (batch=1)"
+            )
         rigs = ObjectBatch(tuple(self._fresh(key, count) for key, count in trials))
         salt = zlib.crc32(f"history {self.name}".encode())
         salted = Stream(stream.key ^ salt, torch.zeros_like(stream.count))
@@ -189,8 +267,9 @@ class RigArm:
         """The action that leads to a pressure, see `Arm.action_for`."""
         return self.simulated.action_for(part, pressure, dt_s)
 
-    def _fresh(self, key: int, count: int) -> SimulatedRig:
-        rig = self.build(self.config, zlib.crc32(f"{self.name} {key} {count}".encode()))
+    def _fresh(self, key: int, count: int) -> Rig:
+        trial = zlib.crc32(f"{self.name} {key} {count}".encode())
+        rig = self.real if self.real is not None else self.build(self.config, trial)
         rig.reset()
         return rig
 
@@ -199,8 +278,13 @@ class RigArm:
         rows = []
         for rig, asked in zip(part.plant.rigs.items, target.double().cpu().numpy(), strict=True):
             rig.command(np.clip(asked, *rig.limits.T))
-            sample, truth = rig.read_beside_truth()
-            rows.append((sample.measured, sample.key_points_mm, truth.noise_free_mm[0]))
+            if is_simulated(rig):
+                sample, truth = rig.read_beside_truth()
+                body_mm = truth.noise_free_mm[0]
+            else:
+                sample = rig.read()
+                body_mm = sample.key_points_mm
+            rows.append((sample.measured, sample.key_points_mm, body_mm))
         columns = (np.stack(column) for column in zip(*rows, strict=True))
         reading = Reading(
             *(torch.tensor(each, dtype=torch.float32, device=self.device) for each in columns)
@@ -228,23 +312,57 @@ class RigArm:
                 now = offset + self.config.observer_gain * surprise
             seen, offset = seen + now, now + drift
             plant = replace(plant, drift_mm=drift)
-        part = self.simulated.posed(part, frames.apply(part.mount, reading.true_mm))
+        body = frames.apply(part.mount, reading.true_mm)
+        if self.real is not None:
+            body = body.where(body.isfinite(), seen)
+        part = self.simulated.posed(part, body)
         return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
 
 
-def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = virtual_rig) -> Task:
+def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_rig) -> Task:
     """The task with every arm on a rig; the given task stays as it is.
 
-    Tasks ask their world for its arms, so that this exchanges the world only.
+    Tasks ask their world for its arms, so that this exchanges the world only. Real benches are open
+    from here on: run the task inside `at_benches`.
     """
     config = config or RigConfig()
     world, moved = copy.copy(task.world), copy.copy(task)
     dt_s = world.config.dt_s
+    texts = rigs_by_arm(config.rigs, tuple(world.arms))
     arms: dict[str, Arm] = {}
-    for name, arm in world.arms.items():
-        if not isinstance(arm, ModelArm):
-            raise InputError(f"arm '{name}' is on a rig already, expected a simulated arm")
-        arms[name] = RigArm(arm, config, dt_s, build)
+    with ExitStack() as opened:
+        for name, arm in world.arms.items():
+            if not isinstance(arm, ModelArm):
+                raise InputError(f"arm '{name}' is on a rig already, expected a simulated arm")
+            placed = RigArm(arm, replace(config, rigs=(texts[name],)), dt_s, build)
+            opened.callback(placed.close)
+            arms[name] = placed
+            if placed.real is not None and list(texts.values()).count(texts[name]) > 1:
+                raise InputError(
+                    f"rig '{texts[name]}' is one bench, and {task.name} has the arms "
+                    f"{', '.join(texts)}: name the arm that is on it, such as "
+                    f"{name}={texts[name]}; the others are virtual"
+                )
+        opened.pop_all()
     world.arms = arms
     moved.world = world
     return moved
+
+
+def real_benches(task: Task) -> dict[str, SafeRig]:
+    """Arm -> its real bench, for every arm of a task that is on one."""
+    return {
+        name: arm.real
+        for name, arm in task.world.arms.items()
+        if isinstance(arm, RigArm) and arm.real is not None
+    }
+
+
+@contextmanager
+def at_benches(task: Task) -> Iterator[None]:
+    """Inside it the task's real benches are driven; at its end they are vented and given back."""
+    with ExitStack() as opened:
+        for arm in task.world.arms.values():
+            if isinstance(arm, RigArm) and arm.real is not None:
+                opened.enter_context(arm.real)
+        yield

@@ -4,10 +4,37 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
+from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.registry import spec_of
+
+ACTIVATIONS: tuple[str, ...] = (
+    "elu",
+    "selu",
+    "relu",
+    "crelu",
+    "lrelu",
+    "tanh",
+    "sigmoid",
+    "softplus",
+)
+ACTIVATIONS += ("softplus", "gelu", "swish", "mish", "identity")
+"""Activations by rsl-rl's names."""
+MOST_TRANSITIONS = 1 << 21
+"""Most steps, over all episodes, between two updates: their storage has to fit into memory."""
+Share = Annotated[float, Rule("a number from 0 to 1", lambda value: 0.0 <= value <= 1.0)]
+Widths = Annotated[
+    tuple[int, ...],
+    Rule(
+        "at most 100 widths from 1 to 10,000",
+        lambda widths: len(widths) <= 100 and all(1 <= width <= 10_000 for width in widths),
+    ),
+]
+Episodes = Annotated[
+    int, Rule("a whole number from 1 to 100,000", lambda count: 1 <= count <= 100_000)
+]
 
 
 @dataclass(frozen=True)
@@ -22,40 +49,45 @@ class Preset:
     """Passes over those steps in an update."""
     batches: int = 4
     """Minibatches of a pass."""
-    gamma: float = 0.9
+    gamma: Share = 0.9
     """Discount of a step."""
-    lam: float = 0.7
+    lam: Share = 0.7
     """Lambda of generalised advantage estimation (Schulman et al. 2016)."""
-    clip: float = 0.2
+    clip: Annotated[float, POSITIVE] = 0.2
     """Clipping of the probability ratio."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     learning_rate: float = 1e-3
     """First learning rate of Adam."""
-    desired_kl: float | None = 0.01
+    desired_kl: Annotated[float, POSITIVE] | None = 0.01
     """The learning rate is adapted to this KL divergence of an update; None: it is not."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: Widths = (64, 64)
     """Widths of the hidden layers of actors and critics."""
-    activation: str = "tanh"
+    activation: Annotated[str, one_of(ACTIVATIONS)] = "tanh"
     """Activation of the hidden layers, by rsl-rl's name."""
     normalise: bool = False
     """Whether observations are normalised by their running mean and deviation. Those of the tasks
     are of the order of 1, and a moving normaliser changes the policy between two updates."""
     action_kPa: float = 1.0
     """Change of pressure for an output of 1, kPa; it is also clipped to the limit of the pumps."""
-    noise: float = 0.5
+    noise: Annotated[float, POSITIVE] = 0.5
     """First standard deviation of the actions, in outputs."""
-    last_noise: float | None = 0.005
+    last_noise: Annotated[float, POSITIVE] | None = 0.005
     """The deviation falls to this, evenly in its logarithm, until the end; None: it is learned."""
-    evaluate_every: int = 100
+    evaluate_every: Annotated[int, at_least(1)] = 100
     """Updates between two evaluations."""
-    evaluation_episodes: int = 32
+    evaluation_episodes: Episodes = 32
     """Episodes of an evaluation."""
 
     def __post_init__(self):
         for name in ("envs", "rollout", "epochs", "batches", "learning_rate", "action_kPa"):
             if not getattr(self, name) > 0:
                 raise InputError(f"preset: {name} is {getattr(self, name)}, expected more than 0")
+        if self.envs * self.rollout > MOST_TRANSITIONS:
+            raise InputError(
+                f"preset: {self.envs} envs x {self.rollout} steps are more than "
+                f"{MOST_TRANSITIONS} in an update; take fewer envs"
+            )
         if (self.envs * self.rollout) // self.batches < 2:
             raise InputError(
                 f"preset: {self.envs} envs x {self.rollout} steps in {self.batches} minibatches "

@@ -7,23 +7,26 @@ evaluation. Checkpoints are read as plain tensors and numbers: none runs code.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
 import platform
 import shutil
-from dataclasses import asdict, replace
+import zipfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 import surgisoft
 from surgisoft.agents.presets import Plan, Preset
-from surgisoft.config import to_table, write_toml
+from surgisoft.config import POSITIVE, Where, at_least, from_table, to_table, write_toml
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, write_atomically
+from surgisoft.files import new_folder, read_json, write_atomically
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.spec import FILE
 from surgisoft.surrogate.checkpoint import save_model
@@ -34,6 +37,44 @@ FORMAT = 1
 """Version of the folder's layout."""
 LAST, BEST = "last", "best"
 """The two checkpoints."""
+
+
+@dataclass(frozen=True)
+class AgentSize:
+    """Sizes of an agent in a run's `config.json`."""
+
+    observation: Annotated[int, at_least(1)]
+    """Width of the observation."""
+    chambers: Annotated[int, at_least(1)]
+    """Number of chambers, the width of the action."""
+    step_kPa: Annotated[float, POSITIVE]
+    """Largest change of pressure in a step, kPa."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The fields of a run's `config.json` that opening it needs; `create_run` writes them."""
+
+    task: str
+    """Name of the task."""
+    task_config: dict[str, Any]
+    """Its configuration as a table."""
+    scene: dict[str, Any] | None
+    """Origin and hash of the scene; None without a scene."""
+    agents: dict[str, AgentSize]
+    """agent -> its sizes."""
+    preset: str
+    """Preset that the hyper-parameters come from."""
+    hyper_parameters: Preset
+    """Hyper-parameters of networks, rollouts and updates."""
+    steps: int | None
+    """See `Plan`."""
+    minutes: float | None
+    """See `Plan`."""
+    target_error: float | None
+    """See `Plan`."""
+    seed: int
+    """See `Plan`."""
 
 
 def default_folder(task: str) -> Path:
@@ -129,13 +170,13 @@ class RunFolder:
                 f"{path}: no training run there (config.json missing); make one with "
                 "'surgisoft train'"
             )
-        try:
-            self.config = json.loads(file.read_text())
-            known = self.config["format"] == FORMAT and "hyper_parameters" in self.config
-        except (ValueError, KeyError, TypeError):
-            known = False
-        if not known:
+        self.config = read_json(file)
+        known = isinstance(self.config, dict) and self.config.get("format") == FORMAT
+        if not known or "hyper_parameters" not in self.config:
             raise InputError(f"{file}: not a training run of format {FORMAT}; train it again")
+        needed = {field.name for field in fields(RunConfig)}
+        table = {name: value for name, value in self.config.items() if name in needed}
+        self.checked: RunConfig = from_table(RunConfig, table, Where(file))
 
     @property
     def agents(self) -> dict[str, dict]:
@@ -144,20 +185,16 @@ class RunFolder:
 
     def plan(self) -> Plan:
         """The plan of the run; its world is built from the parts in the folder."""
-        c = self.config
-        parameters: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in c["hyper_parameters"].items()
-        }
+        c = self.checked
         return Plan(
-            task=c["task"],
+            task=c.task,
             task_config=self._task_config(),
-            preset_name=c["preset"],
-            preset=Preset(**parameters),
-            steps=c["steps"],
-            minutes=c["minutes"],
-            target_error=c["target_error"],
-            seed=c["seed"],
+            preset_name=c.preset,
+            preset=c.hyper_parameters,
+            steps=c.steps,
+            minutes=c.minutes,
+            target_error=c.target_error,
+            seed=c.seed,
         )
 
     def _task_config(self):
@@ -193,6 +230,32 @@ class RunFolder:
                 f"{self.path}'"
             )
         try:
-            return torch.load(file, map_location=device, weights_only=True)
+            _check_packing(file)
+            saved = torch.load(file, map_location=device, weights_only=True)
         except Exception as error:
             raise InputError(f"{file}: damaged checkpoint ({str(error)[:100]})") from error
+        if not isinstance(saved, dict):
+            raise InputError(f"{file}: damaged checkpoint (no table in it); train it again")
+        return saved
+
+
+def _check_packing(file: Path) -> None:
+    """Raise ValueError for an archive whose members claim more bytes than the file has.
+
+    `torch.save` stores its members as they are, without compression.
+    """
+    with zipfile.ZipFile(file) as archive:
+        if sum(member.file_size for member in archive.infolist()) > file.stat().st_size:
+            raise ValueError("its parts claim more bytes than the file has")
+
+
+@contextlib.contextmanager
+def damaged(file: Path) -> Iterator[None]:
+    """Turn what damaged content of a checkpoint makes fail into an InputError."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise InputError(f"{file}: damaged checkpoint ({reason}); train it again") from error

@@ -10,9 +10,9 @@ from typing import Any
 
 from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
-from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.on_rig import RigConfig, at_benches, on_rig, real_benches
 from surgisoft.agents.policies import POLICIES, check_policy, open_policy
-from surgisoft.agents.rollout import EpisodeRecorders
+from surgisoft.agents.rollout import BATCH, EpisodeRecorders
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
@@ -59,7 +59,7 @@ class EvaluationRequest:
     seed: int = 0
     """Seed of the episodes, equal for each policy."""
     rig: RigConfig | None = None
-    """The arms are on this virtual rig; None: in simulation."""
+    """The arms are on these rigs; None: in simulation."""
     referee: bool = True
     """Whether FCL checks contact, clearance and beam, where there is a scene."""
     arm: str | Path | None = None
@@ -113,6 +113,9 @@ class Evaluations:
     """One for each policy, in order."""
     logs: dict[str, EpisodeLog]
     """The first episode of each policy that was to be logged."""
+    measured_arms: tuple[str, ...] = ()
+    """Arms on a real bench: their errors are those of the measured key points, camera noise
+    included."""
 
     def to_json(self) -> dict:
         """Plain values, as `evaluate --json` writes them."""
@@ -122,6 +125,7 @@ class Evaluations:
             "task_config": self.task_config,
             "on": asked.place,
             "rig": asked.rig and to_table(asked.rig),
+            "measured_arms": list(self.measured_arms),
             "seed": asked.seed,
             "episodes": asked.episodes,
             "dt_s": self.dt_s,
@@ -153,6 +157,15 @@ def evaluate(
     request = EvaluationRequest(names, task, **fields)
     plain, config = request.resolved(on_warning)
     place = plain if request.rig is None else on_rig(plain, request.rig)
+    with at_benches(place):
+        return _evaluated(request, plain, place, config, progress)
+
+
+def _evaluated(
+    request: EvaluationRequest, plain: Task, place: Task, config: Any, progress: Progress
+) -> Evaluations:
+    """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
+    measured = tuple(real_benches(place))
     opened = {name: open_policy(name, place) for name in request.policies}
     logs = {
         name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
@@ -173,6 +186,7 @@ def evaluate(
             request.episodes,
             request.seed,
             request.referee,
+            batch=1 if measured else BATCH,
             progress=tell,
             watch=logs.get(name),
         )
@@ -184,4 +198,5 @@ def evaluate(
         plain.world.config.dt_s,
         tuple(results),
         {name: each.log(0) for name, each in logs.items()},
+        measured,
     )

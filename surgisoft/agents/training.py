@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.learned import ActorPolicy, agent_sizes
+from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
 from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import Plan
-from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run
+from surgisoft.agents.run_folder import BEST, LAST, RunFolder, create_run, damaged
 from surgisoft.agents.selection import evaluate_checkpoint, is_better
 from surgisoft.agents.vec_env import JointEnv
 from surgisoft.errors import InputError
@@ -174,18 +174,35 @@ class Training:
             content = dict(saved["agents"][agent])
             rate = content.pop("learning_rate")
             ppo.load(content, None, strict=True)
-            ppo.learning_rate = rate
+            ppo.learning_rate = float(rate)
         local = saved["processes"][self.processes.rank]
-        parts = iter(local["world"])
+        parts = list(local["world"])
+
+        def restored(present: Tensor) -> Tensor:
+            part = parts.pop(0)
+            if part.shape != present.shape or part.dtype != present.dtype:
+                raise ValueError(
+                    f"a part of the world has shape {list(part.shape)} and type {part.dtype}, "
+                    f"expected {list(present.shape)} and {present.dtype}"
+                )
+            return part.to(device).clone()
+
         with torch.inference_mode():
-            self.env.state = tree_map(lambda _: next(parts).to(device).clone(), self.env.state)
+            self.env.state = tree_map(restored, self.env.state)
+        if parts:
+            raise ValueError(f"{len(parts)} parts of the world too many")
         self.seen = self.env.get_observations()
         torch.set_rng_state(local["random"]["cpu"].cpu())
         if device.type == "cuda":
             torch.cuda.set_rng_state(local["random"]["cuda"].cpu(), device)
-        self.iteration, self.best = saved["iteration"], saved["best"]
-        self.clock = Clock(saved["wall_s"], saved["cpu_s"])
+        self.iteration, self.best = int(saved["iteration"]), _evaluation(saved["best"])
+        self.clock = Clock(float(saved["wall_s"]), float(saved["cpu_s"]))
         self.share = self._shared()
+
+
+def _evaluation(saved: Any) -> dict[str, float] | None:
+    """The evaluation in a checkpoint; numbers by name, or None."""
+    return None if saved is None else {str(name): float(saved[name]) for name in saved}
 
 
 def _copied(weights: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -243,7 +260,7 @@ def train_new(
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
     # Everything is read back from the folder, so that resuming finds the same.
-    return _continue(RunFolder(folder), None, processes, device, report)
+    return _continue(RunFolder(folder), processes, device, report)
 
 
 def resume(
@@ -253,16 +270,40 @@ def resume(
     report: Callable[[TrainingProgress], None] = lambda progress: None,
 ) -> Result:
     """Continue a run from its last checkpoint; from the start if it has none."""
+    return _continue(RunFolder(folder), processes, device, report)
+
+
+def reopened(folder: Path, processes: Processes, device: torch.device) -> Training:
+    """The training of a run at its last checkpoint, ready to go on; new where it has none."""
     run = RunFolder(folder)
     saved = run.load(LAST) if run.checkpoint(LAST).is_file() else None
-    return _continue(run, saved, processes, device, report)
-
-
-def _continue(run, saved, processes, device, report) -> Result:
     plan = run.plan()
+    if saved is not None:
+        with damaged(run.checkpoint(LAST)):
+            _check_saved(run, saved, plan)
     training = Training(plan, run.task(device), processes)
     if saved is not None:
-        training.load_state(saved)
+        with damaged(run.checkpoint(LAST)):
+            training.load_state(saved)
+    return training
+
+
+def _check_saved(run: RunFolder, saved: dict[str, Any], plan: Plan) -> None:
+    """Raise unless a checkpoint has the sizes of its run, before memory is taken for them."""
+    for agent, size in run.agents.items():
+        weights = saved["agents"][agent]["actor_state_dict"]
+        sizes = size["observation"], size["chambers"]
+        check_weights(run.checkpoint(LAST), agent, weights, *sizes, plan.preset)
+    for local in saved["processes"]:
+        if len(local["world"][0]) != plan.preset.envs:
+            raise ValueError(
+                f"{len(local['world'][0])} episodes, expected {plan.preset.envs} by config.json"
+            )
+
+
+def _continue(run, processes, device, report) -> Result:
+    training = reopened(run.path, processes, device)
+    plan = training.plan
     log = _Log(run, training.iteration) if processes.leads else None
     written, found = time.monotonic(), training.best
     stopped = reached = False
@@ -352,8 +393,8 @@ class _Log:
         file = run.path / "metrics.jsonl"
         kept = []
         if file.is_file():
-            for line in file.read_text().splitlines():
-                with suppress(ValueError):
+            for line in file.read_text(errors="replace").splitlines():
+                with suppress(ValueError, TypeError, KeyError, RecursionError):
                     if json.loads(line)["iteration"] <= iteration:
                         kept.append(line + "\n")
         file.write_text("".join(kept))

@@ -8,12 +8,12 @@ import typer
 from typer.exceptions import TyperException
 
 from surgisoft.errors import InputError
+from surgisoft.extras import missing_library
 
 app = typer.Typer(
     name="surgisoft",
     help="Soft robot arms in surgical scenes: system identification, diagnosis, control.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -30,13 +30,23 @@ COMMANDS = (
     "evaluate",
     "scene",
     "experiment",
+    "rig",
     "replay",
     "benchmark",
 )
 """Modules of commands, in the order of the help."""
 
 MANY = {
-    *("--before", "--between", "--data", "--effect", "--effect-file", "--effects", "--hidden"),
+    *(
+        "--before",
+        "--between",
+        "--data",
+        "--effect",
+        "--effect-file",
+        "--effects",
+        "--hidden",
+        "--label",
+    ),
     *("--policy", "--strength", "--valid", "--without"),
 }
 """Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
@@ -128,6 +138,16 @@ def run(arguments: list[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         print("surgisoft: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except ModuleNotFoundError as error:
+        advice = missing_library(error, arguments[0] if arguments else "")
+        if advice is None:
+            raise
+        return _fail(advice)
+    except SystemExit as ended:
+        if isinstance(ended.code, int) and ended.code > 128:  # `surgisoft.rig.safety.Terminated`
+            print(f"surgisoft: {ended}", file=sys.stderr)
+            return ended.code
+        raise
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -1,19 +1,31 @@
-"""`surgisoft collect`: record a protocol on a simulated rig."""
+"""`surgisoft collect`: record a protocol on a rig."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.inputs import check_model, warn
 from surgisoft.cli.options import SEED_MAX, Force, Hidden
+from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
+
+if TYPE_CHECKING:
+    from surgisoft.measurement.recordings import Recording
+    from surgisoft.rig import Rig
+
+STOP_NOTE = "space bar, Esc or Ctrl-C: emergency stop; the rig is vented at the end"
+"""What a command says before it drives a real rig."""
 
 
 def _list_hidden(context: typer.Context, value: bool) -> None:
     if value:
-        from surgisoft.rig.trial import hidden_of
+        from surgisoft.rig.registry import hidden_of
 
         for name, effect in hidden_of(context.params.get("rig", "virtual")).items():
             print(f"{name:18s}{effect.place:10s}{effect.about}")
@@ -41,26 +53,18 @@ def collect(
         Path,
         typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
     ],
-    rig: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            is_eager=True,
-            help="Simulated rig: virtual, or elastica (PyElastica's Cosserat rod; other robots, "
-            "other physics).",
-        ),
-    ] = "virtual",
+    rig: RigOption = "virtual",
     seed: Annotated[
-        int,
+        int | None,
         typer.Option(
             "--seed",
             "--robot-seed",
             min=0,
             max=SEED_MAX,
-            help="Seed of the robot; another seed is another arm of the same design (elastica: "
-            "of another design).",
+            help="Seed of the random schedule, and of the robot on a simulated rig; another seed "
+            "is another arm of the same design (elastica: of another design). Default 0.",
         ),
-    ] = 0,
+    ] = None,
     trial: Annotated[
         int,
         typer.Option(
@@ -81,14 +85,14 @@ def collect(
         typer.Option(metavar="X...", help="Amplitudes of the hidden effects, in the same order."),
     ] = None,
     payload_g: Annotated[
-        float, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
-    ] = 0.0,
+        float | None, typer.Option("--payload-g", metavar="G", help="Known mass at the tip, in g.")
+    ] = None,
     gravity: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="Direction of gravity in the arm base frame."),
     ] = None,
     roll_deg: Annotated[
-        float,
+        float | None,
         typer.Option(
             "--roll-deg",
             min=-360,
@@ -96,10 +100,25 @@ def collect(
             metavar="DEG",
             help="Rotation of the base about its axis, degrees.",
         ),
-    ] = 0.0,
+    ] = None,
     noise_scale: Annotated[
-        float, typer.Option(help="Factor on all sensor and camera noise.")
-    ] = 1.0,
+        float | None,
+        typer.Option(help="Factor on all sensor and camera noise of a simulated rig."),
+    ] = None,
+    preflight: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MODEL",
+            help="On a real rig: first try each chamber alone, a little, and go on only if the arm "
+            "moves as this model of it predicts ('surgisoft rig check').",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="On a real rig: show what would be sent, send and write nothing."
+        ),
+    ] = False,
     force: Force = False,
     list_hidden: Annotated[
         bool,
@@ -117,36 +136,102 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording on a simulated rig: the paper's arm, pumps and motion capture."""
+    """Collect a recording on a rig, by default the virtual one."""
     from surgisoft.measurement.recordings import save_recording
-    from surgisoft.rig.trial import collect as collect_recording
 
-    _check_output(output, force)
+    check_new_recording(output, force)
     effects = _pairs(hidden or [], strength or [])
-    mount: dict[str, Any] = {
+    mount = {
         "gravity": gravity,
         "roll_deg": roll_deg,
         "payload_g": payload_g,
         "noise": noise_scale,
     }
-    with progress(f"collect {protocol}") as report:
-        recording = collect_recording(
-            protocol,
-            rig,
-            seed=seed,
-            trial=trial,
-            points=points,
-            hidden=effects,
-            progress=report,
-            **{name: value for name, value in mount.items() if value is not None},
-        )
+    given = {name: value for name, value in mount.items() if value is not None}
+    fields: dict[str, Any] = {"seed": seed, "trial": trial, "points": points, **given}
+    if dry_run:
+        from surgisoft.rig.trial import dry_run as show_commands
+
+        show_commands(protocol, rig, print, **fields)
+        return
+    recording = record_on(
+        protocol, rig, output, force, preflight=preflight, hidden=effects, **fields
+    )
     save_recording(recording, output, force)
+    log_of(output).unlink(missing_ok=True)
+    print(written_line(output, recording, effects))
+
+
+def log_of(output: Path) -> Path:
+    """The log beside a recording, to which samples of a real rig are appended."""
+    return output.with_name(f"{output.stem}.log.jsonl")
+
+
+def record_on(
+    protocol: str | Path,
+    rig: str,
+    output: Path,
+    force: bool = False,
+    preflight: Path | None = None,
+    **fields: Any,
+) -> Recording:
+    """Record a protocol on a rig with a progress bar; fields: as for `surgisoft.collect`.
+
+    What a real rig measures goes to the log beside `output` at once, and stays there where the run
+    is interrupted. preflight: an arm model whose motions a real rig has to show first.
+    """
+    from surgisoft.rig.registry import SIMULATED, parse_rig
+    from surgisoft.rig.trial import collect as collect_recording
+
+    simulated = parse_rig(rig).name in SIMULATED
+    if preflight and simulated:
+        raise InputError("--preflight is for real rigs, and this one is simulated")
+    log = log_of(output)
+    there = log.exists()
+    check = checked_by(preflight) if preflight else None
+    if not simulated:
+        warn(STOP_NOTE)
+    try:
+        with progress(f"collect {protocol}") as report:
+            return collect_recording(
+                protocol,
+                rig,
+                progress=report,
+                log=None if simulated else log,
+                force=force,
+                before=check,
+                **fields,
+            )
+    except BaseException:
+        if log.exists() and (force or not there):
+            warn(f"what was measured so far is in {log}, which every command opens as a recording")
+        raise
+
+
+def checked_by(model: Path) -> Callable[[Rig], None]:
+    """The pre-flight check of a rig against a model; it raises InputError where it fails."""
+    check_model(model)
+    from surgisoft.rig.preflight import preflight
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.reach import steady_key_points
+
+    arm = load_model(model)
+
+    def check(rig: Rig) -> None:
+        preflight(rig, lambda pressures: steady_key_points(arm, pressures)).require()
+
+    return check
+
+
+def written_line(path: Path, recording: Recording, hidden: Sequence[tuple[str, float]] = ()) -> str:
+    """One line about a recording that was written."""
     minutes = recording.t_s[-1] / 60
-    secret = "".join(f", hidden {name} {size:g}" for name, size in effects)
-    print(
-        f"wrote {output}: {recording.samples} {recording.kind} samples of {recording.chambers} "
+    noise = "" if recording.noise_mm is None else f", noise {recording.noise_mm:.3f} mm"
+    secret = "".join(f", hidden {name} {size:g}" for name, size in hidden)
+    return (
+        f"wrote {path}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
-        f"{minutes:.0f} min on the bench, noise {recording.noise_mm:.3f} mm{secret}"
+        f"{minutes:.0f} min on the bench{noise}{secret}"
     )
 
 
@@ -158,7 +243,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
         )
     if strengths and any(":" in text for text in given):
         raise InputError("--hidden NAME:X and --strength both give amplitudes; use one of them")
-    from surgisoft.rig.trial import hidden_effects
+    from surgisoft.rig.registry import hidden_effects
 
     pairs = hidden_effects(given)
     return (
@@ -166,7 +251,7 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
     )
 
 
-def _check_output(path: Path, force: bool) -> None:
+def check_new_recording(path: Path, force: bool) -> None:
     """Raise InputError before the work starts, where its result could not be written."""
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{path}: suffix '{path.suffix}', expected .csv or .parquet")

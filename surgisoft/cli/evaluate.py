@@ -1,4 +1,4 @@
-"""`surgisoft evaluate`: evaluate policies on a task, in simulation or on the virtual rig."""
+"""`surgisoft evaluate`: evaluate policies on a task, in simulation or on rigs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from surgisoft.cli.options import (
     JsonFile,
     Replay,
     Report,
+    RigsOfArms,
     SceneFolder,
     TaskConfig,
 )
@@ -25,7 +26,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_json
 
 PLACES = ("simulation", "rig")
-"""Plants: simulated arm models, or the virtual rig."""
+"""Plants: simulated arm models, or rigs."""
 
 
 @app.command()
@@ -46,11 +47,13 @@ def evaluate(
     ] = 20,
     seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of the episodes.")] = 0,
     on: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="|".join(PLACES), help="Plant: simulated arm models, or the virtual rig."
+            metavar="|".join(PLACES),
+            help="Plant: simulated arm models, or rigs (see --rig; default: the virtual one).",
         ),
-    ] = PLACES[0],
+    ] = None,
+    rig: RigsOfArms = None,
     referee: Annotated[
         bool,
         typer.Option(
@@ -91,7 +94,8 @@ def evaluate(
     check_free(json_file, "drivers")
     check_replay(replay)
     check_folder(report)
-    rig = _rig_config(on, robot_seed, hidden, cameras, observer_gain)
+    on = on or (PLACES[1] if rig else PLACES[0])
+    rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain)
 
     from surgisoft.agents.session import evaluate as evaluate_policies
 
@@ -103,7 +107,7 @@ def evaluate(
             on_warning=warn,
             episodes=episodes,
             seed=seed,
-            rig=rig,
+            rig=rigs,
             referee=referee,
             arm=arm,
             scene=scene,
@@ -128,31 +132,44 @@ def evaluate(
         written.append(write_page(page, report / "report.html"))
     print(f"{found.task}, {on}: {about}; mean [95 % interval]")
     _show(found.results)
+    if found.measured_arms:
+        print(
+            f"{', '.join(found.measured_arms)}: on a real bench, whose true body is not known; "
+            "errors are those of the measured key points, camera noise included"
+        )
     for path in written:
         print(f"wrote {path}")
 
 
 def _rig_config(
     on: str,
+    rigs: str | None,
     robot_seed: int | None,
     hidden: list[str] | None,
     cameras: bool,
     observer_gain: float | None,
 ):
-    """The configuration of the virtual rig; None in simulation."""
+    """The configuration of the rigs; None in simulation."""
     if on not in PLACES:
         raise unknown_name("place", on, PLACES)
     if on != "rig":
+        if rigs:
+            raise InputError("--rig names the plant, but --on is simulation; leave out --on")
         if robot_seed is not None or observer_gain is not None or hidden or not cameras:
             raise InputError(
                 "--robot-seed, --hidden, --no-cameras and --observer-gain need --on rig"
             )
         return None
-    from surgisoft.agents.on_rig import RigConfig
-    from surgisoft.rig.trial import hidden_effects
+    from surgisoft.agents.on_rig import RigConfig, rigs_in
+    from surgisoft.rig.registry import hidden_effects
 
-    rig = RigConfig(seed=robot_seed or 0, hidden=tuple(hidden_effects(hidden)), cameras=cameras)
-    return rig if observer_gain is None else replace(rig, observer_gain=observer_gain)
+    found = RigConfig(
+        seed=robot_seed or 0,
+        hidden=tuple(hidden_effects(hidden)),
+        cameras=cameras,
+        rigs=rigs_in(rigs) if rigs else RigConfig().rigs,
+    )
+    return found if observer_gain is None else replace(found, observer_gain=observer_gain)
 
 
 def _show(results) -> None:

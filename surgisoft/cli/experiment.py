@@ -8,7 +8,7 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
 from surgisoft.cli.inputs import counted
-from surgisoft.cli.options import EffectFiles, ExperimentFile
+from surgisoft.cli.options import EffectFiles, ExperimentFile, RigsOfArms
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(
@@ -43,17 +43,21 @@ def run(
     repeats: Annotated[
         int | None, typer.Option(min=1, max=100_000, help="Episodes of each setting.")
     ] = None,
+    rig: RigsOfArms = None,
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
     effect_files: EffectFiles = None,
 ) -> None:
     """Run an experiment; write tables, logs, pictures, replays and one HTML report."""
+    from surgisoft.agents.on_rig import rigs_in
     from surgisoft.experiments.page import markdown
     from surgisoft.experiments.session import finish_experiment, start_experiment
 
     check_folder(output)
-    spec, folder = start_experiment(file, output, policy or (), repeats, resume=resume, force=force)
+    spec, folder = start_experiment(
+        file, output, policy or (), repeats, rigs_in(rig or ""), resume=resume, force=force
+    )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"
         results, files = finish_experiment(spec, folder, processes, replays, about, report)

@@ -1,10 +1,10 @@
 """Checks of output paths, before a command spends its time."""
 
-import json
 import os
 from pathlib import Path
 
 from surgisoft.errors import InputError
+from surgisoft.files import read_json
 
 
 def check_free(path: Path | None, field: str) -> None:
@@ -18,7 +18,7 @@ def check_free(path: Path | None, field: str) -> None:
     if not path.exists():
         return
     try:
-        old = json.loads(path.read_text())
+        old = read_json(path)
         same = isinstance(old, dict) and field in old
     except (OSError, ValueError):
         same = False

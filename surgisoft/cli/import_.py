@@ -17,9 +17,6 @@ def import_(
     raw: Annotated[
         list[Path], typer.Argument(metavar="RAW", help="Raw files, or folders of them.")
     ],
-    map_name: Annotated[
-        str, typer.Option("--map", metavar="MAP.toml", help="Map file, or the ready map motive.")
-    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -29,6 +26,15 @@ def import_(
             help="New recording (.csv or .parquet), or a folder with one recording per raw file.",
         ),
     ],
+    map_name: Annotated[
+        str | None,
+        typer.Option(
+            "--map",
+            metavar="MAP.toml",
+            help="Map file, or the ready map motive. The log of an interrupted recording (.jsonl) "
+            "needs none.",
+        ),
+    ] = None,
     force: Force = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be written to REC, write nothing.")
@@ -46,20 +52,29 @@ def import_(
     Notes tell what cannot be right: lengths, reversed key points, clocks that are apart. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
-    from surgisoft.measurement.importing import import_files, load_map
+    from surgisoft.measurement.importing import import_files, import_log, load_map
     from surgisoft.measurement.recordings import (
         check_writable,
         find_warnings,
         save_recording,
         summary,
     )
+    from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 
     if model:
         check_model(model)
     to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
     if to_file and output.suffix not in (".csv", ".parquet"):
         raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
-    parts = import_files(raw, load_map(map_name), output.stem if to_file else None)
+    name = output.stem if to_file else None
+    if map_name is None and all(path.suffix == LOG_SUFFIX for path in raw):
+        parts = [import_log(path, name or path.stem) for path in raw]
+    elif map_name is None:
+        raise InputError("--map is missing: a map file states columns, units and frames")
+    else:
+        parts = import_files(raw, load_map(map_name), name)
+    if to_file and len(parts) > 1:
+        raise InputError(f"{output}: {len(parts)} recordings, expected a folder for them")
     targets = [output if to_file else output / f"{part.recording.name}.parquet" for part in parts]
     for target in targets if not dry_run else []:
         check_writable(target, force)

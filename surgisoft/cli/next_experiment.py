@@ -1,14 +1,16 @@
 """`surgisoft next-experiment`: the schedule that best distinguishes competing effects."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.collect import check_new_recording, log_of, record_on, written_line
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
+from surgisoft.cli.options import Rig as RigOption
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
 
@@ -42,6 +44,15 @@ def next_experiment(
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
     ] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            "--record",
+            metavar="NEW.parquet",
+            help="Run the schedule on the rig at once and write this recording.",
+        ),
+    ] = None,
+    rig: RigOption = "virtual",
     json_file: JsonFile = None,
     effect_files: EffectFiles = None,
     force: Force = False,
@@ -55,6 +66,8 @@ def next_experiment(
         raise InputError(f"{output}: exists already; choose another name or use --force")
     check_folder(output.absolute().parent)
     check_free(json_file, "separates")
+    if record:
+        check_new_recording(record, force)
     check_model(model)
     measured = read_recordings(recordings) if recordings else []
 
@@ -71,6 +84,8 @@ def next_experiment(
     if json_file:
         write_json(json_file, result.to_json())
     _show(result, arm.spec, model, recordings or [], output)
+    if record:
+        _record(result, rig, output, record, force)
 
 
 def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> None:
@@ -105,3 +120,35 @@ def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> No
     if open_:
         print(f"{len(open_)} of {len(result.pairs)} pairs stay below {SURE:g} in this time")
     print(f"wrote {output}: {len(result.protocol.run_rows)} runs, {result.protocol.unit}")
+
+
+def _record(result, rig: str, schedule: Path, record: Path, force: bool) -> None:
+    """Run the schedule on a rig, in the experimental setup that it needs, and write the recording.
+
+    A simulated rig changes its setup itself; a real one has to be changed by a person first.
+    """
+    import shlex
+
+    from surgisoft.rig.registry import parse_rig, rig_options
+
+    options: dict[str, list[float]] = {}
+    for word in shlex.split(result.options):
+        if word.startswith("--"):
+            values = options[word.removeprefix("--").replace("-", "_")] = []
+        else:
+            values.append(float(word))
+    setup: dict[str, Any] = {name: tuple(x) if len(x) > 1 else x[0] for name, x in options.items()}
+    known = rig_options(parse_rig(rig).name)
+    lacking = [name for name in setup if name not in known or name in parse_rig(rig).options]
+    if result.by_hand or lacking:
+        raise InputError(
+            f"{schedule} is written, {record} is not: first {result.steps[0]}; then "
+            f"'surgisoft collect {schedule} --rig {rig} -o {record}' (--as-it-stands asks for no "
+            "change of the experimental setup)"
+        )
+    recording = record_on(schedule, rig, record, force, **setup)
+    from surgisoft.measurement.recordings import save_recording
+
+    save_recording(recording, record, force)
+    log_of(record).unlink(missing_ok=True)
+    print(written_line(record, recording))

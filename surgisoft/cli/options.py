@@ -102,6 +102,21 @@ Replay = Annotated[
 ]
 Force = Annotated[bool, Option("--force", help="Replace the output of an earlier call.")]
 
+_RIG = (
+    "Rig: a name with its options (virtual, elastica, those of other packages; 'surgisoft rig "
+    "list' shows them), or package.module:object."
+)
+Rig = Annotated[str, Option("--rig", metavar="NAME[:option=value,...]", is_eager=True, help=_RIG)]
+RigsOfArms = Annotated[
+    str | None,
+    Option(
+        "--rig",
+        metavar="NAME[:option=value,...]",
+        help=_RIG + " One for all arms of the task, or ARM=NAME for single arms ('laser=NAME "
+        "endoscope=NAME'), the others then being virtual.",
+    ),
+]
+
 Hidden = Annotated[
     list[str] | None,
     Option(

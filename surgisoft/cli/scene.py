@@ -25,8 +25,9 @@ def new(
         list[str],
         typer.Argument(
             metavar="MESH",
-            help="Mesh files (stl, obj, ply, off, glb), the organ first. FILE:keep-out or "
-            "FILE:support sets a role; the default role of further files is keep-out.",
+            help="Mesh files (stl, obj, ply, off, glb) or a segmented image (nii, nii.gz, nrrd), "
+            "the organ first. FILE:keep-out or FILE:support sets a role; the default role of "
+            "further files is keep-out.",
         ),
     ],
     output: Annotated[
@@ -34,7 +35,31 @@ def new(
     ],
     unit: Annotated[
         str | None,
-        typer.Option(metavar="mm|cm|m", help="Unit of the files; default: inferred from the size."),
+        typer.Option(
+            metavar="mm|cm|m|inch",
+            help="Unit of the mesh files; default: mm (metres for glTF) if that is an organ's "
+            "size, else the command asks or stops.",
+        ),
+    ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="Millimetres in one unit of the files, not --unit."),
+    ] = None,
+    up: Annotated[
+        str | None,
+        typer.Option(
+            metavar="AXIS",
+            help="Axis of the files that points up: x, y, z, -x, -y or -z. Default: z; y for glTF "
+            "and, as the front of a patient in RAS, for segmented images.",
+        ),
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LABEL:ROLE[:NAME]...",
+            help="A label of the segmented image, by value or name, and its role: organ, lesion, "
+            "keep-out, support. Without it the labels are listed.",
+        ),
     ] = None,
     lesion: Annotated[
         Vector | None,
@@ -43,31 +68,70 @@ def new(
         ),
     ] = None,
     lesion_direction: Annotated[
-        Vector | None, typer.Option(metavar="X Y Z", help="Lesion on this side of the organ.")
+        Vector | None,
+        typer.Option(
+            metavar="X Y Z", help="Lesion on this side of the organ, in the first file's frame."
+        ),
     ] = None,
-    diameter: Annotated[float, typer.Option(metavar="MM", help="Diameter of the ring, mm.")] = 20.0,
+    diameter: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM",
+            help="Diameter of the ring, mm; default: around a segmented lesion, else 20.",
+        ),
+    ] = None,
+    margin: Annotated[
+        float,
+        typer.Option(metavar="MM", help="Distance of the ring from a segmented lesion, mm."),
+    ] = 5.0,
     clearance: Annotated[
         float,
         typer.Option(metavar="MM", help="Least distance between an arm and anything else, mm."),
     ] = 1.0,
+    arm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="Arm model of both mounts ('default' or a fitted model's folder), or of single "
+            "ones: laser=MODEL,endoscope=MODEL.",
+        ),
+    ] = None,
+    effect_files: EffectFiles = None,
     force: Force = False,
 ) -> int:
     """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
     _check_meshes(meshes)
 
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
-    from surgisoft.scene.spec import TOOLS, MountSpec
+    from surgisoft.scene.meshio import UnknownUnit
+    from surgisoft.scene.segmentation import parse_label
 
-    request = _request(meshes, unit, lesion, lesion_direction, diameter, clearance)
+    request = _request(
+        meshes,
+        lesion,
+        lesion_direction,
+        diameter,
+        clearance,
+        unit=unit,
+        scale=scale,
+        up=up,
+        labels=tuple(parse_label(text) for text in label or ()),
+        margin_mm=margin,
+    )
     check_target(output, force)
 
-    from surgisoft.tasks.world.reach import reach_of
+    from surgisoft.tasks.world.reach import blank_mounts, reach_of
 
-    blank = {tool: MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in TOOLS}
-    reaches = {tool: reach_of(mount) for tool, mount in blank.items()}
+    mounts = blank_mounts(_arms(arm))
+    reaches = {tool: reach_of(mount) for tool, mount in mounts.items()}
     try:
-        with progress("scene new") as report:
-            made = author(request, reaches, blank, _name(output), report)
+        try:
+            with progress("scene new") as report:
+                made = author(request, reaches, mounts, _name(output), report)
+        except UnknownUnit as error:
+            request = _ask_unit(request, error)
+            with progress("scene new") as report:
+                made = author(request, reaches, mounts, _name(output), report)
     except NoMounts as error:
         for note in error.notes:
             print(note)
@@ -156,8 +220,43 @@ def _check_meshes(meshes: list[str]) -> None:
             raise InputError(f"{path or text}: there is no such file; expected a mesh")
 
 
-def _request(meshes, unit, lesion, direction, diameter, clearance):
-    """The request for a new scene; raises InputError for contradicting or invalid options."""
+def _arms(given: str | None) -> dict[str, str]:
+    """The arm model of each tool; raises InputError for an unknown tool or one given twice."""
+    from surgisoft.errors import unknown_name
+    from surgisoft.scene.spec import TOOLS
+
+    if given is None or "=" not in given:
+        return {} if given is None else dict.fromkeys(TOOLS, given)
+    models: dict[str, str] = {}
+    for text in given.split(","):
+        tool, _, model = text.partition("=")
+        if tool not in TOOLS:
+            raise unknown_name("tool", tool, TOOLS)
+        if tool in models:
+            raise InputError(f"--arm {given}: two arms for the {tool}; expected one")
+        models[tool] = model
+    return models
+
+
+def _ask_unit(request, error):
+    """The request with the unit that the user types; the error itself where nobody can be asked."""
+    import sys
+    from dataclasses import replace
+
+    from surgisoft.scene.meshio import MM_PER_UNIT
+
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise error
+    print(error)
+    unit = typer.prompt(f"Unit of the files ({', '.join(MM_PER_UNIT)})")
+    return replace(request, unit=unit.strip())
+
+
+def _request(meshes, lesion, direction, diameter, clearance, **frame):
+    """The request for a new scene; raises InputError for contradicting or invalid options.
+
+    `frame` holds the fields of `Request` that tell how the files are to be read.
+    """
     import numpy as np
 
     from surgisoft.scene.author import Request
@@ -170,8 +269,10 @@ def _request(meshes, unit, lesion, direction, diameter, clearance):
         raise InputError(f"--lesion-direction is {direction}; expected a vector that is not zero")
     if lesion is not None and not np.isfinite(lesion).all():
         raise InputError(f"--lesion is {lesion}; expected finite coordinates")
-    if not 0.5 <= diameter <= 500.0:
+    if diameter is not None and not 0.5 <= diameter <= 500.0:
         raise InputError(f"--diameter is {diameter:g}; expected 0.5 to 500 mm")
+    if not 0.0 <= frame["margin_mm"] <= 100.0:
+        raise InputError(f"--margin is {frame['margin_mm']:g}; expected 0 to 100 mm")
     if not 0.0 <= clearance <= 100.0:
         raise InputError(f"--clearance is {clearance:g}; expected 0 to 100 mm")
     paths, roles = [], []
@@ -186,11 +287,11 @@ def _request(meshes, unit, lesion, direction, diameter, clearance):
     return Request(
         tuple(paths),
         tuple(roles),
-        unit,
-        lesion,
-        direction,
-        diameter,
+        lesion=lesion,
+        lesion_direction=direction,
+        diameter_mm=diameter,
         limits=LimitsSpec(clearance_mm=clearance),
+        **frame,
     )
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
 from surgisoft.diagnosis.evidence import EffectEvidence, Evidence
 from surgisoft.errors import InputError
+from surgisoft.files import read_json
 
 Kind = Literal[
     "identified",
@@ -445,12 +446,16 @@ def content_hash(values: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
+def _table(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
 def load_decision(path: Path = ASSET) -> DecisionModel:
     """The fitted decision of a file; raises InputError for one that is damaged or of another
     version."""
     try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as reason:
+        values = read_json(path)
+    except (OSError, InputError) as reason:
         raise InputError(f"{path.name}: no fitted decision ({reason}); install again") from None
     if not isinstance(values, dict) or values.get("schema") != SCHEMA:
         found = values.get("schema") if isinstance(values, dict) else None
@@ -461,14 +466,20 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         raise InputError(f"{path.name}: the fitted decision does not match its hash; install again")
     models = {}
     for name, features in FEATURES.items():
-        one = values["models"].get(name, {})
+        one = _table(_table(values.get("models")).get(name))
+        weights = _table(one.get("weights"))
         expected = [feature.name for feature in features]
-        if list(one.get("weights", {})) != expected:
+        if list(weights) != expected:
             raise InputError(
-                f"{path.name}: model '{name}' has the features {', '.join(one.get('weights', {}))},"
+                f"{path.name}: model '{name}' has the features {', '.join(weights)},"
                 f" expected {', '.join(expected)}; fit it again"
             )
-        models[name] = Logistic(tuple(one["weights"].values()), one["constant"])
+        numbers = (*weights.values(), one.get("constant"))
+        if not all(type(v) in (int, float) and abs(v) < math.inf for v in numbers):
+            raise InputError(
+                f"{path.name}: model '{name}' has a weight that is no finite number; fit it again"
+            )
+        models[name] = Logistic(numbers[:-1], numbers[-1])
     about = {key: value for key, value in values.items() if key != "models"}
     return DecisionModel(models, about)
 

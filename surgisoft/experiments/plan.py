@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.on_rig import RigConfig, on_rig, rigs_by_arm
 from surgisoft.config import Where, merged, to_table
 from surgisoft.errors import InputError
 from surgisoft.experiments.phases import PhasedTask
@@ -21,11 +23,17 @@ from surgisoft.experiments.spec import (
     task_config,
 )
 from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.registry import SIMULATED, hidden_of, parse_rig
 from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.circle_ablation import CircleAblationConfig
 from surgisoft.tasks.registry import with_present_names
 
 Value = int | float | str
+MOST_SETTINGS = 100_000
+"""Most settings of an experiment."""
+
+ARMS = ("laser", "endoscope")
+"""The arms of an experiment."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +73,17 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     place = where or Where(Path(spec.name))
     for i, vary in enumerate(spec.vary):
         _check_vary(spec, vary, place / "vary" / i)
+    count = math.prod([len(spec.cases), len(spec.lesions or (None,))])
+    count *= math.prod(len(vary.values) for vary in spec.vary)
+    if count > MOST_SETTINGS:
+        raise (place / "vary").error(f"{count} settings", f"at most {MOST_SETTINGS}")
     grid = [[(vary.field, value) for value in vary.values] for vary in spec.vary]
     every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
     found = [Setting(number, *parts) for number, parts in enumerate(every)]
     for setting in found:
         rig_config(setting, place)
     labels = [setting.label for setting in found]
-    if twice := {label for label in labels if labels.count(label) > 1}:
+    if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' comes twice", "values that differ")
     return found
 
@@ -141,14 +153,16 @@ def rig_config(setting: Setting, place: Where) -> RigConfig | None:
     for field, value in varied.items():
         if field.startswith("hidden."):
             hidden[field.removeprefix("hidden.")] = float(value)
+    rigs = {parse_rig(rig).name for rig in rigs_by_arm(setting.case.rigs, ARMS).values()}
     for name in hidden:
-        if name not in HIDDEN:
-            raise (place / "cases").error(
-                f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(HIDDEN))}"
-            )
+        for rig in rigs.intersection(SIMULATED):
+            if name not in hidden_of(rig):
+                raise (place / "cases").error(
+                    f"unknown hidden effect '{name}'", f"one of {', '.join(sorted(hidden_of(rig)))}"
+                )
     specimen = int(varied.get("rig.specimen", setting.case.specimen))
     pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
-    return RigConfig(seed=specimen, hidden=pairs)
+    return RigConfig(seed=specimen, hidden=pairs, rigs=setting.case.rigs)
 
 
 def scene_of(spec: Experiment, setting: Setting) -> Scene:

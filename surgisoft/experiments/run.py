@@ -6,7 +6,6 @@ one go and one that was interrupted give the same rows.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import as_completed
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from surgisoft.agents.evaluate import episode_table
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks
+from surgisoft.agents.on_rig import at_benches, real_benches
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
 from surgisoft.errors import InputError
@@ -29,12 +29,13 @@ from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
 from surgisoft.experiments.spec import (
     EXPERIMENT_TASK,
     FILE,
+    Case,
     Experiment,
     load_experiment,
     save_experiment,
 )
 from surgisoft.experiments.task import Row
-from surgisoft.files import json_safe, write_json
+from surgisoft.files import json_safe, read_json, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import register_effect_files, registered_files
 from surgisoft.tasks.episodes.file import save_episode
@@ -125,7 +126,7 @@ def check_playable(spec: Experiment) -> None:
     for setting in found:
         case = setting.case
         if (case.policy, case.arm) not in seen:
-            plain = replace(case, plant="simulation", hidden=(), specimen=0)
+            plain = replace(case, plant="simulation", hidden=(), specimen=0, rigs=Case.rigs)
             opened(spec, replace(setting, case=plain))
             seen.add((case.policy, case.arm))
 
@@ -154,11 +155,31 @@ def run_experiment(
         for job in _in_processes(spec, folder, left, processes):
             done += job.count
             report(done, total, job.setting.words)
-    return [
-        json.loads(row_file(folder, job.setting, job.first + i).read_text())
-        for job in every
-        for i in range(job.count)
-    ]
+    return read_rows(folder, every)
+
+
+def read_rows(folder: Path, every: list[Job]) -> list[Row]:
+    """The row of every episode, in order; raises InputError for one that was not written so."""
+    rows: list[Row] = []
+    for job in every:
+        for episode in range(job.first, job.first + job.count):
+            file = row_file(folder, job.setting, episode)
+            row = read_json(file)
+            place = (job.setting.label, episode)
+            known = isinstance(row, dict) and (row.get("setting"), row.get("episode")) == place
+            if not known or (rows and _kinds(row) != _kinds(rows[0])):
+                raise InputError(
+                    f"{file}: is not the row of episode {episode} of '{job.setting.label}'; "
+                    "delete it and continue with --resume"
+                )
+            rows.append(row)
+    return rows
+
+
+def _kinds(row: Row) -> dict[str, type]:
+    """Text or number, by the name of each value; what is neither is no row's."""
+    kinds = {str: str, int: float, float: float, type(None): float}
+    return {name: kinds.get(type(value), object) for name, value in row.items()}
 
 
 def _is_done(folder: Path, job: Job) -> bool:
@@ -214,7 +235,12 @@ def roll_out_block(
         checks(now)
         recorders(now)
 
-    result = rollout(task, controllers, count, spec.seed, count, progress, watch, first)
+    try:
+        with at_benches(task):
+            result = rollout(task, controllers, count, spec.seed, count, progress, watch, first)
+    finally:
+        if real_benches(task):  # they are closed now: the next block opens them anew
+            opened.cache_clear()
     rows = _rows(task, setting, first, result, checks.checks())
     worst = max(rows, key=EXPERIMENT_TASK.badness)["episode"]
     kept = {0, worst} & {row["episode"] for row in rows}

@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from surgisoft.agents.on_rig import rigs_by_arm
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import settings
+from surgisoft.experiments.plan import ARMS, settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, TASK, Experiment, load_experiment
@@ -19,6 +20,7 @@ from surgisoft.files import write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
+from surgisoft.rig.registry import SIMULATED, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import PHANTOM, packaged_scene
 
@@ -71,11 +73,27 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     return replace(spec, cases=(*spec.cases, *twins))
 
 
+def with_rigs(spec: Experiment, rigs: Iterable[str]) -> Experiment:
+    """The experiment with other rigs in every case whose plant is `rig`.
+
+    rigs: `NAME[:option=value,...]`, or `ARM=NAME[:...]` for single arms. A bench that may be real
+    runs one episode after the other.
+    """
+    rigs = tuple(rigs)
+    if not any(case.plant == "rig" for case in spec.cases):
+        raise InputError(f"--rig: {spec.name} has no case with plant = 'rig' that could use it")
+    cases = tuple(replace(case, rigs=rigs) if case.plant == "rig" else case for case in spec.cases)
+    names = {parse_rig(text).name for text in rigs_by_arm(rigs, ARMS).values()}
+    together = spec.together if names <= set(SIMULATED) else 1
+    return replace(spec, cases=cases, together=together)
+
+
 def start_experiment(
     name: str | Path,
     output: str | Path | None = None,
     policies: Iterable[str | Path] = (),
     repeats: int | None = None,
+    rigs: Iterable[str] = (),
     *,
     resume: bool = False,
     force: bool = False,
@@ -83,13 +101,18 @@ def start_experiment(
     """The experiment and its folder of results, new or ready to be resumed.
 
     output: default `results/NAME`. policies: folders of training runs, each added as a case.
-    repeats: episodes of each setting. resume: continue existing results; force: replace them.
+    repeats: episodes of each setting. rigs: in place of those of the cases on rigs. resume:
+    continue existing results; force: replace them.
     """
     if resume and force:
         raise InputError("--resume continues results, --force replaces them: give one of the two")
     spec = open_experiment(name)
     for folder in policies:
         spec = with_policy(spec, folder)
+    rigs = tuple(rigs)
+    if rigs:
+        spec = with_rigs(spec, rigs)
+        settings(spec)
     spec = spec if repeats is None else replace(spec, repeats=repeats)
     place = Path(output) if output else Path("results") / spec.name
     open_results(spec, place, resume, force)

@@ -96,14 +96,16 @@ class Case:
     name: Name
     """Its name, unique in the experiment."""
     plant: Annotated[str, _one_of(PLANTS)] = PLANTS[0]
-    """Plant: `simulation` for the arm models, `rig` for each arm on the virtual rig."""
+    """Plant: `simulation` for the arm models, `rig` for each arm on a rig."""
     policy: str = SCRIPTED
     """Policy of phases with the controller `policy`: scripted, nominal, or a training run's folder.
     """
     hidden: tuple[str, ...] = ()
     """On the rig: hidden effects, NAME or NAME:AMPLITUDE."""
     specimen: Seed = 0
-    """On the rig: seed of the virtual robot."""
+    """On a simulated rig: seed of the robot."""
+    rigs: tuple[str, ...] = ("virtual",)
+    """On the rig: `NAME[:option=value,...]` for both arms, or `ARM=NAME[:...]` for one of them."""
     arm: str = ""
     """Arm model of both arms: default or a folder; without it the scene's."""
 
@@ -315,9 +317,9 @@ def _check_whole(spec: Experiment, where: Where) -> None:
             f"got '{spec.limits.retreat}'", f"one of the phases: {', '.join(known)}"
         )
     for i, case in enumerate(spec.cases):
-        if case.plant != "rig" and (case.hidden or case.specimen):
+        if case.plant != "rig" and (case.hidden or case.specimen or case.rigs != Case.rigs):
             raise (where / "cases" / i).error(
-                "hidden or specimen in simulation", "them with plant = 'rig' only"
+                "hidden, specimen or rigs in simulation", "them with plant = 'rig' only"
             )
 
 

@@ -27,8 +27,15 @@ MISSING = ("", "NaN", "nan", "NAN")
 """Texts that mean a missing value."""
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?inf(inity)?", re.I)
 """A number as text files write it, with a decimal point."""
+LARGEST = 1e100
+"""A number of this size or more is no measurement: its square and cube would be infinite."""
 BLOCK_BYTES = 1 << 20
 """Text of up to this size is read cell by cell where pyarrow refuses it; more goes in parts."""
+MOST_UNPACKED = 1 << 28
+"""Largest text in a compressed file, bytes; a small file can claim a thousand times its size."""
+MOST_PACKED = 100
+"""Most bytes of numbers in each byte of a Parquet file, where they are more than `MOST_UNPACKED`:
+measured positions have noise and do not compress."""
 _COMPRESSED = {b"\x1f\x8b": gzip, b"BZh": bz2, b"\xfd7zXZ": lzma}
 
 
@@ -46,6 +53,11 @@ class Cells(Protocol):
     def place(self, row: int) -> str:
         """File and place of a row, counted from 0, for messages."""
         ...
+
+
+def too_large(cells: np.ndarray) -> np.ndarray:
+    """Which cells are infinite or of a size that no measurement has; NaN is not."""
+    return np.abs(cells) >= LARGEST
 
 
 def label(names: Sequence[str], position: int) -> str:
@@ -69,9 +81,17 @@ class ParquetTable:
     def open(cls, path: Path) -> "ParquetTable":
         """Open a Parquet file without reading its columns; InputError if it is unreadable."""
         try:
-            return cls(path, list(pq.read_schema(path).names))
-        except (pa.ArrowException, OSError) as error:
+            content = pq.read_metadata(path)
+            names = list(content.schema.to_arrow_schema().names)
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"{path}: not a readable Parquet file") from error
+        claimed, most = 8 * content.num_rows * len(names), MOST_PACKED * path.stat().st_size
+        if claimed > max(most, MOST_UNPACKED):
+            raise InputError(
+                f"{path}: claims {content.num_rows} rows of {len(names)} columns in "
+                f"{path.stat().st_size} bytes; expected a Parquet file with measurements"
+            )
+        return cls(path, names)
 
     def numbers(self, positions: Sequence[int]) -> np.ndarray:
         """Cells (T, len(positions)) float64 of columns; raises InputError for other types."""
@@ -102,7 +122,7 @@ class ParquetTable:
         names = [self.names[i] for i in positions]
         try:
             table = pq.ParquetFile(self.path).read(columns=names)
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise InputError(f"{self.path}: not a readable Parquet file") from error
         return [table.column(name) for name in names]
 
@@ -113,7 +133,13 @@ def read_text(path: Path) -> bytes:
         data = path.read_bytes()
         for magic, module in _COMPRESSED.items():
             if data.startswith(magic):
-                data = module.decompress(data)
+                with module.open(path) as file:
+                    data = file.read(MOST_UNPACKED + 1)
+                if len(data) > MOST_UNPACKED:
+                    raise InputError(
+                        f"{path}: holds more than {MOST_UNPACKED >> 20} MiB when it is unpacked; "
+                        "unpack it first if that is right"
+                    )
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (EOFError, lzma.LZMAError, zlib.error, ValueError) as error:

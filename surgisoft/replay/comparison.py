@@ -17,9 +17,10 @@ from surgisoft.replay.colours import (
     SHAFT_COLOUR,
     error_colours,
 )
+from surgisoft.replay.contents import TIME
 from surgisoft.replay.episode_view import Replay
 from surgisoft.replay.plots import Line, series_colour
-from surgisoft.replay.recording import TIME, Columns, new_recording
+from surgisoft.replay.recording import Columns, new_recording
 from surgisoft.replay.shapes import finer
 
 MOST_ROWS = 6000

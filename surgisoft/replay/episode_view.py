@@ -25,9 +25,10 @@ from surgisoft.replay.colours import (
     paler,
     tissue_colours,
 )
+from surgisoft.replay.contents import TIME
 from surgisoft.replay.endoscope import CAMERA, PICTURES_HZ, log_camera
 from surgisoft.replay.plots import Plot, plots_of
-from surgisoft.replay.recording import STEP, TIME, Columns, new_recording
+from surgisoft.replay.recording import STEP, Columns, new_recording
 from surgisoft.replay.shapes import creased
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames

@@ -12,12 +12,13 @@ import rerun.blueprint as rrb
 
 from surgisoft.errors import InputError
 from surgisoft.files import new_file
+from surgisoft.replay.contents import TIME
 from surgisoft.replay.plots import Line
 
 SUFFIX = ".rrd"
 """Suffix of a Rerun recording."""
-TIME, STEP = "time", "step"
-"""Timelines of every replay: s since the start, and rows of the log."""
+STEP = "step"
+"""Timeline of the rows of the log; that of seconds is `contents.TIME`."""
 
 
 @contextlib.contextmanager

@@ -4,12 +4,11 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import pyarrow.compute as pc
-
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
+from surgisoft.replay.contents import TIME, contents
 from surgisoft.replay.episode_view import Replay, layout_names, write_replay
-from surgisoft.replay.recording import SUFFIX, TIME
+from surgisoft.replay.recording import SUFFIX
 from surgisoft.replay.viewer import (
     check_view,
     open_viewer,
@@ -57,7 +56,7 @@ def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:
 
     None for a recording without a timeline of seconds, such as a scene's.
     """
-    end = duration_s(recording)
+    end = contents(recording).duration_s
     if end is None:
         if time_s is not None:
             raise InputError(f"{recording}: has no timeline '{TIME}'; leave --time out")
@@ -65,20 +64,6 @@ def moment(recording: Path, time_s: float | None) -> tuple[str, float] | None:
     if time_s is not None and not 0.0 <= time_s <= end + 1e-6:
         raise InputError(f"time is {time_s:g} s, expected 0 to {end:g} s as {recording} lasts")
     return TIME, float(end * 2.0 / 3.0 if time_s is None else time_s)
-
-
-def duration_s(recording: Path) -> float | None:
-    """Duration of a replay on its timeline of seconds; None if it has no such timeline."""
-    from rerun.chunk import RrdReader
-
-    ends = []
-    try:
-        for chunk in RrdReader(recording).stream():
-            if TIME in chunk.timeline_names and chunk.num_rows:
-                ends.append(pc.max(chunk.to_record_batch().column(TIME).cast("int64")).as_py())
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{recording}: cannot be read as a Rerun recording ({error})") from None
-    return max(ends) * 1e-9 if ends else None
 
 
 WINDOW = "1600x1000"
@@ -131,6 +116,7 @@ def open_replay(
 def _recording(found: Path, progress: Progress) -> Iterator[Path]:
     """The replay itself, or the replay of a log in a temporary file."""
     if found.suffix == ".rrd":
+        contents(found)  # the viewer ends without a word where the file is damaged
         yield found
         return
     with temporary_recording() as recording:

@@ -21,6 +21,7 @@ import rerun as rr
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_atomically
+from surgisoft.replay.contents import contents
 
 LOCAL = "127.0.0.1"
 """The only address that the viewer serves on: this machine."""
@@ -153,23 +154,6 @@ def parse_size(text: str) -> tuple[int, int]:
     return size
 
 
-def view_names(recording: Path) -> tuple[str, ...]:
-    """Names of the views in the layout of an .rrd file; empty where it holds no layout."""
-    from rerun.chunk import RrdReader
-
-    column, names = "ViewBlueprint:display_name", []
-    try:
-        reader = RrdReader(recording)
-        for layout in reader.blueprints():
-            for chunk in reader.stream(store=layout):
-                batch = chunk.to_record_batch()
-                if column in batch.schema.names:
-                    names += [name for row in batch.column(column).to_pylist() for name in row]
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{recording}: cannot be read as a Rerun recording ({error})") from None
-    return tuple(names)
-
-
 def check_view(view: str, names: Sequence[str]) -> None:
     """Raise an InputError that lists the known views, unless `view` is one or none is known."""
     if names and view not in names:
@@ -192,7 +176,7 @@ def take_screenshot(
     """
     picture = Path(picture)
     if view is not None:
-        check_view(view, view_names(recording))
+        check_view(view, contents(recording).views)
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: suffix '{picture.suffix}', expected .png")
     if not picture.parent.is_dir():

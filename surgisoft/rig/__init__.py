@@ -4,11 +4,27 @@
 into a recording. `virtual` is the simulated rig: `arm` (with `rod`, `wall`, `friction`),
 `pneumatics`, `motion_capture` and the hidden `effects`, stepped together in `bench`. It shares no
 code and no formula with the arm models and imports neither them nor torch. `elastica` is a second
-simulated rig, with PyElastica's mechanics; `trial` records on either by name.
+simulated rig, with PyElastica's mechanics. `registry` opens a rig by its name and options, and
+`trial` records on it. `safety` stands between any program and a real rig.
 """
 
 from surgisoft.rig.collect import collect
 from surgisoft.rig.interface import Rig, Sample, SimulatedRig, Truth
+from surgisoft.rig.registry import open_rig
+from surgisoft.rig.safety import RigStopped, SafeRig, Safety, guarded
 from surgisoft.rig.virtual import VirtualRig, VirtualRigConfig
 
-__all__ = ["Rig", "Sample", "SimulatedRig", "Truth", "VirtualRig", "VirtualRigConfig", "collect"]
+__all__ = [
+    "Rig",
+    "RigStopped",
+    "SafeRig",
+    "Safety",
+    "Sample",
+    "SimulatedRig",
+    "Truth",
+    "VirtualRig",
+    "VirtualRigConfig",
+    "collect",
+    "guarded",
+    "open_rig",
+]

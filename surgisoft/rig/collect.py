@@ -1,39 +1,55 @@
 """Collection of recordings: drive any rig, real or virtual, through a protocol."""
 
 from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.log import (
+    LogHeader,
+    RecordingLog,
+    average,
+    recording_log,
+)
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.interface import Rig, Sample
+from surgisoft.rig.safety import SafeRig
 
 
-def collect(rig: Rig, protocol: Protocol, progress: Progress = silent) -> Recording:
+def collect(
+    rig: Rig,
+    protocol: Protocol,
+    progress: Progress = silent,
+    log: str | Path | None = None,
+    force: bool = False,
+) -> Recording:
     """Record a protocol on any object that satisfies `Rig`, sample after sample.
 
-    progress: called with the number of samples done and to do.
+    progress: called with the number of samples done and to do. log: file to which each sample is
+    appended as it is measured (`surgisoft.measurement.recordings.log`); it stays there. force:
+    replace a log that is there.
     """
     check_fits(rig, protocol)
-    per_run = [commands for _, commands in runs_of(protocol, rig.period_s)]
-    total, done = sum(map(len, per_run)), 0
-    samples: list[Sample] = []
-    start = None
-    for commands in per_run:
-        rig.reset()
-        for row in commands:
-            rig.command(row)
-            if protocol.kind == "settled":
-                rig.wait(protocol.settle_s)
-                count = samples_in(protocol.average_s, rig.period_s)
-                taken = mean_sample([rig.read() for _ in range(count)])
-            else:
-                taken = rig.read()
-            samples.append(taken)
-            done += 1
-            progress(done, total)
+    per_run = list(runs_of(protocol, rig.period_s))
+    total = sum(len(commands) for _, commands in per_run)
+    header = LogHeader(
+        name=protocol.name,
+        kind=protocol.kind,
+        unit=rig.unit,
+        chambers=rig.chambers,
+        key_points=rig.key_planes,
+        arm=rig.arm,
+        gravity=None if rig.gravity is None else np.asarray(rig.gravity).tolist(),
+        payload_g=rig.payload_g,
+        note=f"protocol {protocol.name}",
+        rows=total,
+    )
+    with recording_log(log, header, force) if log else nullcontext() as writer:
+        samples = _samples(rig, protocol, per_run, total, progress, writer)
     start = samples[0].t_s
     temperatures = [s.temp_C for s in samples]
     return describe(
@@ -45,6 +61,56 @@ def collect(rig: Rig, protocol: Protocol, progress: Progress = silent) -> Record
         np.array([s.commanded for s in samples]),
         temp_C=None if None in temperatures else np.array(temperatures),
     )
+
+
+def _samples(
+    rig: Rig,
+    protocol: Protocol,
+    per_run: list[tuple[int, np.ndarray]],
+    total: int,
+    progress: Progress,
+    log: RecordingLog | None,
+) -> list[Sample]:
+    """One sample for each command of each run; each that the rig gives is logged at once."""
+    samples: list[Sample] = []
+    settled = protocol.kind == "settled"
+    count = samples_in(protocol.average_s, rig.period_s) if settled else 1
+    for run, commands in per_run:
+        rig.reset()
+        for row in commands:
+            rig.command(row)
+            if settled:
+                rig.wait(protocol.settle_s)
+            taken = []
+            for _ in range(count):
+                one = rig.read()
+                taken.append(one)
+                if log:
+                    log.sample(
+                        len(samples),
+                        run,
+                        one.t_s,
+                        one.measured,
+                        one.key_points_mm,
+                        one.commanded,
+                        one.temp_C,
+                    )
+            samples.append(mean_sample(taken) if settled else taken[0])
+            progress(len(samples), total)
+    return samples
+
+
+def show_commands(rig: SafeRig, protocol: Protocol) -> None:
+    """Show every command of a protocol as it would be sent; nothing is sent, nothing is waited for.
+
+    rig: a rig whose `show` is set.
+    """
+    check_fits(rig, protocol)
+    for _, commands in runs_of(protocol, rig.period_s):
+        rig.reset()
+        for row in commands:
+            rig.command(row)
+            rig.wait(protocol.settle_s if protocol.kind == "settled" else rig.period_s)
 
 
 def check_fits(rig: Rig, protocol: Protocol) -> None:
@@ -77,17 +143,6 @@ def runs_of(protocol: Protocol, period_s: float) -> Iterator[tuple[int, np.ndarr
 def samples_in(seconds: float, period_s: float) -> int:
     """Samples in a time [s]; at least one."""
     return max(1, round(seconds / period_s))
-
-
-def average(frames: np.ndarray) -> np.ndarray:
-    """Mean of (P, F, ...) over F, frame by frame; missing values are left out."""
-    total = np.zeros_like(frames[:, 0])
-    count = np.zeros(total.shape, np.int64)
-    for k in range(frames.shape[1]):
-        known = np.isfinite(frames[:, k])
-        total += np.where(known, frames[:, k], 0.0)
-        count += known
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def mean_sample(samples: list[Sample]) -> Sample:

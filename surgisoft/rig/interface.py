@@ -1,11 +1,12 @@
 """What a rig offers: a bench with one soft arm that takes pressures and gives samples.
 
-`Rig` has four methods and eight attributes. Any object that has them can be driven by `collect`;
-it needs to inherit from nothing. `SimulatedRig` adds the truth that only a simulation knows.
+`Rig` is a real bench: four methods and eight attributes. Any object that has them can be driven; it
+needs to inherit from nothing. It may also have `vent()` and `close()`, see `vent` and `close`.
+`SimulatedRig` adds the truth that only a simulation knows.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 
@@ -81,10 +82,44 @@ class Rig(Protocol):
 
 
 class SimulatedRig(Rig, Protocol):
-    """A rig that can also give the true state, as tasks on a rig need it to score errors."""
+    """A rig that also gives the true state, so that errors are scored without sensor noise."""
 
     def read_beside_truth(self) -> tuple[Sample, Truth]:
         """Do what `read` does, and return the true state of the same instant (T = 1) with it."""
+
+
+def is_simulated(rig: Rig) -> TypeGuard[SimulatedRig]:
+    """Whether a rig knows its true state."""
+    return hasattr(rig, "read_beside_truth")
+
+
+def vented(limits: np.ndarray) -> np.ndarray:
+    """(m,) the actuation within limits (m, 2) that is nearest to zero [unit of the limits]."""
+    low, high = np.asarray(limits, np.float64).T
+    return np.clip(0.0, low, high)
+
+
+def vent(rig: Rig) -> None:
+    """Let the air out of every chamber at once, without waiting for it.
+
+    A rig with a method `vent()` does it itself, and that method may be called from another thread
+    at any time; any other rig is commanded the pressures nearest to zero.
+    """
+    own = getattr(rig, "vent", None)
+    if callable(own):
+        own()
+    else:
+        rig.command(vented(rig.limits))
+
+
+def close(rig: Rig) -> None:
+    """Vent a rig and give its devices back; a rig without a method `close()` is only vented."""
+    try:
+        vent(rig)
+    finally:
+        own = getattr(rig, "close", None)
+        if callable(own):
+            own()
 
 
 def checked_command(pressures: np.ndarray, limits: np.ndarray, unit: str) -> np.ndarray:

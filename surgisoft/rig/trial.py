@@ -1,109 +1,134 @@
-"""`collect`: record a protocol on a rig: the virtual one, the PyElastica rig, or a given object."""
+"""`collect`: record a protocol on a rig that is given by name or as an object."""
 
-import importlib
-import importlib.util
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from surgisoft.errors import InputError, unknown_name
+from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress, silent
 from surgisoft.rig.collect import collect as collect_samples
-from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.collect import show_commands
 from surgisoft.rig.interface import Rig
-from surgisoft.rig.virtual import VirtualRig
+from surgisoft.rig.registry import open_rig, parse_rig, rig_options
+from surgisoft.rig.safety import SafeRig, guarded
 
 TRIAL_STEP = 1_000_003
 """Distance between the schedule seeds of two trials on one robot, larger than any robot seed."""
 
 
-RIGS = ("virtual", "elastica")
-"""Names of the simulated rigs."""
-
-
-def simulated_rig(name: str, seed: int, **fields: Any) -> Any:
-    """The simulated rig of a name with the robot of a seed; fields: of its configuration."""
-    if name == "virtual":
-        return VirtualRig(seed, **fields)
-    return _elastica(name).ElasticaRig(seed, **fields)
-
-
-def hidden_of(name: str) -> dict[str, Any]:
-    """The hidden effects of the simulated rig of a name; each has a `place` and `about`."""
-    return HIDDEN if name == "virtual" else _elastica(name).HIDDEN
-
-
-def _elastica(name: str) -> ModuleType:
-    """The package of the PyElastica rig; raises InputError where PyElastica is not installed."""
-    if name != "elastica":
-        raise unknown_name("rig", name, RIGS)
-    if importlib.util.find_spec("elastica") is None:
-        raise InputError(
-            "the rig 'elastica' needs PyElastica, which is not installed: "
-            "pip install 'surgisoft[elastica]'"
-        )
-    return importlib.import_module("surgisoft.rig.elastica")
-
-
-def hidden_effects(
-    given: Iterable[str | tuple[str, float]] | None,
-) -> list[tuple[str, float]]:
-    """Hidden effects as (name, amplitude), from text such as `creep:0.5`; default amplitude 1.
-
-    Raises InputError for an amplitude that is no number.
-    """
-    found = []
-    for item in given or ():
-        if not isinstance(item, str):
-            found.append((item[0], float(item[1])))
-            continue
-        name, colon, strength = item.partition(":")
-        try:
-            found.append((name, float(strength) if colon else 1.0))
-        except ValueError:
-            raise InputError(f"--hidden {item}: expected NAME or NAME:STRENGTH") from None
-    return found
+def rig_of_trial(
+    rig: str,
+    protocol: str | Path | Protocol,
+    seed: int | None = None,
+    trial: int = 0,
+    hidden: Iterable[str | tuple[str, float]] = (),
+    **mount: Any,
+) -> Rig:
+    """Open the rig of a name with the robot and the noise of one trial; see `collect`."""
+    number = zlib.crc32(f"{protocol} {trial}".encode())
+    given: dict[str, Any] = dict(mount)
+    if tuple(hidden):
+        given["hidden"] = tuple(hidden)
+    defaults: dict[str, Any] = {"noise_seed": number}
+    if seed is not None:
+        defaults["seed"] = seed
+        known = rig_options(parse_rig(rig).name)
+        if "seed" in known:
+            given["seed"] = seed
+    return open_rig(rig, defaults, **given)
 
 
 def collect(
     protocol: str | Path | Protocol,
     rig: Rig | str | None = None,
     *,
-    seed: int = 0,
+    seed: int | None = None,
     trial: int = 0,
     points: int | None = None,
     hidden: Iterable[str | tuple[str, float]] = (),
     progress: Progress = silent,
+    log: str | Path | None = None,
+    force: bool = False,
+    before: Callable[[Rig], None] | None = None,
     **mount: Any,
 ) -> Recording:
     """Record a protocol: its name, a schedule file (.csv), or a `Protocol`.
 
-    rig: the rig to record on: an object (`surgisoft.rig.interface.Rig`), or the name of a simulated
-    rig, `virtual` (the default) or `elastica`, which these options describe:
-    seed: seed of the robot. trial: number of the trial, with other noise and random schedule on the
-    same robot. hidden: hidden effects, by name or (name, amplitude). mount: `gravity`,
-    `roll_deg`, `payload_g` and `noise` of the simulated rig.
+    rig: the rig to record on: an object (`surgisoft.rig.interface.Rig`), or text
+    `NAME[:option=value,...]` (`surgisoft.rig.registry`); default: `virtual`. A real rig runs inside
+    `SafeRig` and is vented at the end.
+    seed: seed of the random schedule and, on a simulated rig, of the robot; default 0, or the
+    option `seed` of the rig's text. trial: number of the trial, with other noise and random
+    schedule on the same robot. hidden: hidden effects of a simulated rig, by name or (name,
+    amplitude). mount: further options of the rig, such as `gravity`, `roll_deg`, `payload_g` and
+    `noise` of a simulated one.
     points: number of steady-state points, or of frames; default: by the protocol.
+    log: on a real rig, file to which each sample is appended as it is measured; force: replace it.
+    before: is called with the rig before the protocol begins, such as a pre-flight check; an
+    exception from it ends the run.
     """
+    bench, plan = _opened(protocol, rig, seed, trial, points, tuple(hidden), mount)
+    # A simulated rig records in compiled code; each sample is equal to that of `read`.
+    if isinstance(rig, str | None) and hasattr(bench, "record") and before is None:
+        return bench.record(plan, progress)[0]
+    with guarded(bench) as driven:
+        if before is not None:
+            before(driven)
+        return collect_samples(driven, plan, progress, log, force)
+
+
+def dry_run(
+    protocol: str | Path | Protocol,
+    rig: Rig | str,
+    show: Callable[[str], None],
+    *,
+    seed: int | None = None,
+    trial: int = 0,
+    points: int | None = None,
+    **mount: Any,
+) -> None:
+    """Show each command that `collect` would send to a real rig; nothing is sent.
+
+    show: is called with each command in words. Other arguments: as for `collect`.
+    """
+    bench, plan = _opened(protocol, rig, seed, trial, points, (), mount)
+    with guarded(bench) as driven:
+        if not isinstance(driven, SafeRig):
+            raise InputError("a dry run is for real rigs, and this one is simulated")
+        driven.show = show
+        show_commands(driven, plan)
+
+
+def _opened(
+    protocol: str | Path | Protocol,
+    rig: Rig | str | None,
+    seed: int | None,
+    trial: int,
+    points: int | None,
+    hidden: tuple[str | tuple[str, float], ...],
+    mount: dict[str, Any],
+) -> tuple[Rig, Protocol]:
+    """The rig and the protocol of the arguments of `collect`."""
     if rig is None or isinstance(rig, str):
-        number = zlib.crc32(f"{protocol} {trial}".encode())
-        effects = hidden_effects(hidden)
-        simulated = simulated_rig(rig or "virtual", seed, take=number, hidden=effects, **mount)
-        bench: Rig = simulated
+        bench = rig_of_trial(rig or "virtual", protocol, seed, trial, hidden, **mount)
+        if seed is None:
+            seed = getattr(getattr(bench, "config", None), "seed", None)
     elif mount or hidden:
         given = ", ".join([*mount, *(["hidden"] if hidden else [])])
         raise InputError(
             f"{given}: options of the virtual rig and of elastica, but another rig is given"
         )
     else:
-        bench, simulated = rig, None
-    if not isinstance(protocol, Protocol):
-        drawn = seed + TRIAL_STEP * trial
-        protocol = make_protocol(protocol, bench.limits, points, seed=drawn)
-    if simulated is not None:
-        return simulated.record(protocol, progress)[0]
-    return collect_samples(bench, protocol, progress)
+        bench = rig
+    if isinstance(protocol, Protocol):
+        return bench, protocol
+    try:
+        drawn = (seed or 0) + TRIAL_STEP * trial
+        return bench, make_protocol(protocol, bench.limits, points, seed=drawn)
+    except InputError:
+        if isinstance(bench, SafeRig):
+            bench.close()
+        raise

@@ -14,6 +14,7 @@ import numpy as np
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import ArmInfo, Recording
+from surgisoft.measurement.recordings.log import average
 from surgisoft.progress import Progress, silent
 from surgisoft.rig import bench
 from surgisoft.rig.arm import (
@@ -25,7 +26,6 @@ from surgisoft.rig.arm import (
     plain_loads,
 )
 from surgisoft.rig.collect import (
-    average,
     check_fits,
     describe,
     runs_of,

@@ -17,20 +17,30 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.check import PLANNING_NODES, SceneCheck, check_scene, sentence
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.inside import buried_faces
-from surgisoft.scene.lesion import OrganSurface, Site, directed_site, good_sites, pointed_site
+from surgisoft.scene.lesion import (
+    OrganSurface,
+    Site,
+    directed_site,
+    good_sites,
+    nearest_on_surface,
+    patch_normal,
+    pointed_site,
+)
 from surgisoft.scene.mesh import ROLES, Body, Mesh, used_indices
 from surgisoft.scene.meshio import (
+    GLTF,
     MM_PER_UNIT,
+    LengthUnit,
     Part,
-    check_organ_size,
     given_unit,
     read_parts,
-    recognise_unit,
+    stored_unit,
     write_ply,
 )
 from surgisoft.scene.mounts import Pair, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
+from surgisoft.scene.segmentation import Label, is_segmentation, read_segmentation
 from surgisoft.scene.spec import (
     FILE,
     BodySpec,
@@ -47,6 +57,20 @@ FAR_OFF = 20.0
 """A mesh whose middle is farther from the origin than this many times its size is moved there."""
 REPORTED_FROM_MM = 1.0
 """If a given lesion is moved farther than this onto the surface, the distance is printed (mm)."""
+UP = {
+    "z": np.eye(3),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "-x": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
+}
+"""Rotations that turn an axis of a file up, along the world's z; keys are the axes."""
+MARGIN_MM = 5.0
+"""Healthy tissue between a segmented lesion and its ring (mm): the margin that ablation of liver
+tumours aims at (Ahmed et al. 2014, Radiology 273:241)."""
+DIAMETER_MM = 20.0
+"""Diameter of the ring where the user gives none and the image holds no lesion (mm)."""
 COARSE_RING = 36
 """Number of ring points during the search for mounts."""
 CROSSING = "the surface intersects itself, only its outermost part counts; faces inside the solid"
@@ -62,13 +86,23 @@ class Request:
     roles: tuple[str, ...]
     """Role of each file's bodies: organ, keep-out or support."""
     unit: str | None = None
-    """Unit of every file; None: inferred from the size."""
+    """Unit of every mesh file; None: the one that the format prescribes, else mm."""
+    scale: float | None = None
+    """Millimetres in one unit of every mesh file, in place of `unit`."""
+    up: str | None = None
+    """Axis of the files that points up, a key of UP; None: y for glTF, which prescribes it, y
+    (anterior) for segmented images, else z."""
+    labels: tuple[Label, ...] = ()
+    """Labels of a segmented image that become bodies, and the lesion."""
+    margin_mm: float = MARGIN_MM
+    """Distance of the ring from a segmented lesion (mm)."""
     lesion: tuple[float, float, float] | None = None
     """Point near which the lesion goes, in the first file's own frame and unit."""
     lesion_direction: tuple[float, float, float] | None = None
     """Side of the organ on which the lesion goes."""
-    diameter_mm: float = 20.0
-    """Diameter of the ring (mm)."""
+    diameter_mm: float | None = None
+    """Diameter of the ring (mm); None: around a segmented lesion with its margin, else
+    DIAMETER_MM."""
     laser: LaserSpec = field(default_factory=LaserSpec)
     """The laser."""
     camera: CameraSpec = field(default_factory=CameraSpec)
@@ -89,12 +123,14 @@ class Prepared:
     """Closed meshes, world frame, mm."""
     holes_mm: tuple[np.ndarray, ...]
     """For each mesh (F,) mm: width of the hole that a face closes, 0 for a face of the file."""
-    mm_per_unit: float
-    """Millimetres in one unit of the first file."""
+    to_world: np.ndarray
+    """(3, 3) from the first file's own frame and unit to the world frame, mm, before the shift."""
     shift_mm: np.ndarray
     """(3,) by which everything was moved (mm)."""
+    lesion_mm: np.ndarray | None
+    """(V, 3) surface of a segmented lesion, world frame, mm; None without one."""
     notes: tuple[str, ...]
-    """Inferred units and repairs, one line each."""
+    """Units, directions and repairs, one line each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +142,7 @@ class Authored:
     check: SceneCheck
     """Result of checking it with FCL."""
     notes: tuple[str, ...]
-    """Inferred units, repairs and choices, one line each."""
+    """Units, repairs and choices, one line each."""
 
 
 _NamedBody = tuple[str, Mesh, np.ndarray]
@@ -117,7 +153,7 @@ class NoMounts(InputError):
     """No pair of mounts was found for the lesion; the message gives the best one and its flaw."""
 
     def __init__(self, message: str, notes: tuple[str, ...] = ()):
-        """`notes` are the inferred units and repairs, which may be the reason."""
+        """`notes` are the units and repairs, which may be the reason."""
         super().__init__(message)
         self.notes = notes
 
@@ -131,39 +167,44 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
         raise InputError(
             f"the first mesh has the role '{request.roles[0]}'; expected the organ first"
         )
-    if request.unit is not None and request.unit not in MM_PER_UNIT:
-        raise unknown_name("unit", request.unit, MM_PER_UNIT)
+    _check_frame(request)
     notes: list[str] = []
     names: list[str] = []
-    roles, meshes, holes_mm, scales = [], [], [], []
+    roles, meshes, holes_mm, frames_to_world = [], [], [], []
+    lesion_mm: np.ndarray | None = None
+    unit: LengthUnit | None = None
     for i, (path, role) in enumerate(zip(request.meshes, request.roles, strict=True)):
         on_step = partial(_report_step, report, i, len(request.meshes), path.name)
         on_step("reading")
-        parts = read_parts(path)
-        corners = np.concatenate([part.vertices[used_indices(part.faces)[0]] for part in parts])
-        size = float(np.ptp(corners, axis=0).max())
-        if size == 0.0:
-            raise InputError(f"{path}: all vertices are one point; expected a surface")
-        if request.unit is None:
-            guess = recognise_unit(size, path.suffix.lower() in (".glb", ".gltf"))
-            unit, unit_note = guess.unit, guess.sentence
+        up = request.up or ("y" if is_segmentation(path) or path.suffix.lower() in GLTF else "z")
+        if is_segmentation(path):
+            image = read_segmentation(path, request.labels, on_step)
+            parts, part_roles, scale = image.parts, image.roles, 1.0
+            notes += image.notes
+            if image.lesion_mm is not None:
+                lesion_mm = image.lesion_mm @ UP[up].T
         else:
-            unit, unit_note = request.unit, given_unit(size, request.unit)
-        scales.append(MM_PER_UNIT[unit])
-        if role == "organ":
-            check_organ_size(path, size * scales[-1], unit_note)
-        notes.append(f"{path.name}: unit {unit_note}")
-        found = _closed_bodies(path, parts, scales[-1], notes, on_step)
-        found = sorted(found, key=lambda body: -_area(body[1]))
-        for i, (name, mesh, hole_mm) in enumerate(found):
-            names.append(_free_name(name, names))
-            roles.append(role if i == 0 or role != "organ" else "keep-out")
-            meshes.append(mesh)
-            holes_mm.append(hole_mm)
+            parts = read_parts(path)
+            part_roles = tuple(role for _ in parts)
+            unit = _unit(request, path, _size(path, parts), unit if i else None)
+            scale = unit.mm
+            notes.append(f"{path.name}: unit {unit.sentence}")
+        if up != "z":
+            what = "anterior (y)" if is_segmentation(path) and up == "y" else up
+            notes.append(f"{path.name}: {what} points up; another axis needs --up")
+        frames_to_world.append(scale * UP[up])
+        for group, group_role in _by_role(parts, part_roles):
+            found = _closed_bodies(path, group, frames_to_world[-1], notes, on_step)
+            found = sorted(found, key=lambda body: -_area(body[1]))
+            for k, (name, mesh, hole_mm) in enumerate(found):
+                names.append(_free_name(name, names))
+                roles.append(group_role if k == 0 or group_role != "organ" else "keep-out")
+                meshes.append(mesh)
+                holes_mm.append(hole_mm)
     bounds = meshes[0].bounds_mm
     middle, size = bounds.mean(axis=0), np.ptp(bounds, axis=0).max()
     shift = np.zeros(3)
-    if np.linalg.norm(middle) > FAR_OFF * size:
+    if np.linalg.norm(middle) > FAR_OFF * size or lesion_mm is not None:
         shift = -middle
         meshes = [Mesh(mesh.vertices_mm + shift, mesh.faces) for mesh in meshes]
         notes.append(f"moved by {tuple(shift.round(3).tolist())} mm to the origin")
@@ -175,18 +216,67 @@ def prepare(request: Request, report: Progress = silent) -> Prepared:
         tuple(roles),
         tuple(meshes),
         tuple(holes_mm),
-        scales[0],
+        frames_to_world[0],
         shift,
+        None if lesion_mm is None else lesion_mm + shift,
         tuple(notes),
     )
 
 
-def _closed_bodies(path, parts, scale, notes, on_step) -> list[_NamedBody]:
+def _check_frame(request: Request) -> None:
+    """Raise an InputError for an unknown or contradicting unit, scale or axis, or idle labels."""
+    if request.unit is not None and request.unit not in MM_PER_UNIT:
+        raise unknown_name("unit", request.unit, MM_PER_UNIT)
+    if request.unit is not None and request.scale is not None:
+        raise InputError("both --unit and --scale are given; expected one of them")
+    if request.scale is not None and not 1e-6 <= request.scale <= 1e6:
+        raise InputError(f"--scale is {request.scale:g}; expected 1e-6 to 1e6 mm in one unit")
+    if request.up is not None and request.up not in UP:
+        raise unknown_name("axis", request.up, UP)
+    images = [path for path in request.meshes if is_segmentation(path)]
+    if images and images != [request.meshes[0]]:
+        raise InputError(f"{images[-1]}: a segmented image; expected it as the first file")
+    if request.labels and not images:
+        raise InputError("--label is given for meshes; expected a segmented image (NIfTI, NRRD)")
+
+
+def _size(path: Path, parts: Sequence[Part]) -> float:
+    """The largest side of a file's meshes, in the file's unit."""
+    corners = np.concatenate([part.vertices[used_indices(part.faces)[0]] for part in parts])
+    size = float(np.ptp(corners, axis=0).max())
+    if size == 0.0:
+        raise InputError(f"{path}: all vertices are one point; expected a surface")
+    return size
+
+
+def _unit(request: Request, path: Path, size: float, first: LengthUnit | None) -> LengthUnit:
+    """The unit of a mesh file: the one given, that of the first file, or the format's own."""
+    if first is not None:
+        if path.suffix.lower() in GLTF and request.unit is None and request.scale is None:
+            return stored_unit(path, size)
+        return LengthUnit(first.mm, f"that of {request.meshes[0].name}")
+    if request.unit is not None or request.scale is not None:
+        return given_unit(path, size, request.unit, request.scale)
+    return stored_unit(path, size)
+
+
+def _by_role(parts: Sequence[Part], roles: Sequence[str]) -> list[tuple[list[Part], str]]:
+    """Parts with one role in a row, together with that role."""
+    groups: list[tuple[list[Part], str]] = []
+    for part, role in zip(parts, roles, strict=True):
+        if groups and groups[-1][1] == role:
+            groups[-1][0].append(part)
+        else:
+            groups.append(([part], role))
+    return groups
+
+
+def _closed_bodies(path, parts, to_world, notes, on_step) -> list[_NamedBody]:
     """Repair every part; if one cannot be repaired, take all parts as one surface.
 
     If that cannot be repaired either, the broken parts are left out; an error if nothing is left.
     """
-    found, failures, done = _repaired(path, parts, scale, on_step)
+    found, failures, done = _repaired(path, parts, to_world, on_step)
     if failures and len(parts) > 1:
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         whole = Part(
@@ -194,7 +284,7 @@ def _closed_bodies(path, parts, scale, notes, on_step) -> list[_NamedBody]:
             np.concatenate([part.vertices for part in parts]),
             np.concatenate([part.faces + i for part, i in zip(parts, starts, strict=True)]),
         )
-        together, broken, done_together = _repaired(path, [whole], scale, on_step)
+        together, broken, done_together = _repaired(path, [whole], to_world, on_step)
         if not broken:
             notes.append(f"{path.name}: its {len(parts)} parts make up one surface")
             found, failures, done = together, [], done_together
@@ -213,14 +303,14 @@ def _report_step(report: Progress, number: int, count: int, name: str, what: str
     report(5.0 * number / count, 100, f"{name}: {what}")
 
 
-def _repaired(path, parts, scale, on_step) -> tuple[list[_NamedBody], list[InputError], dict]:
+def _repaired(path, parts, to_world, on_step) -> tuple[list[_NamedBody], list[InputError], dict]:
     """Named closed bodies of the parts, errors of parts beyond repair, counts of repairs."""
     found, failures = [], []
     done: dict[str, int] = {}
     for part in parts:
         what = str(path) if len(parts) == 1 else f"{path} ({part.name})"
         try:
-            repaired = repair(part.vertices * scale, part.faces, what, on_step)
+            repaired = repair(part.vertices @ to_world.T, part.faces, what, on_step)
         except InputError as error:
             failures.append(error)
             continue
@@ -229,7 +319,8 @@ def _repaired(path, parts, scale, on_step) -> tuple[list[_NamedBody], list[Input
         on_step("looking for faces inside the solid")
         if inside := sum(buried_faces(mesh) for mesh in repaired.bodies):
             done[CROSSING] = done.get(CROSSING, 0) + inside
-        name = path.stem if len(parts) == 1 else Path(part.name).stem
+        named = len(parts) > 1 or is_segmentation(path)
+        name = Path(part.name).stem if named else path.stem
         found += [
             (name, mesh, hole_mm)
             for mesh, hole_mm in zip(repaired.bodies, repaired.holes_mm, strict=True)
@@ -253,7 +344,7 @@ def _free_name(name: str, taken: Sequence[str]) -> str:
 
 
 def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
-    """Places for the lesion: the one that the request gives, otherwise several good ones."""
+    """Places for the lesion: the given or segmented one, otherwise several good ones."""
     surfaces = [
         OrganSurface(mesh, hole_mm)
         for mesh, hole_mm in zip(prepared.meshes, prepared.holes_mm, strict=True)
@@ -261,15 +352,49 @@ def choose_sites(request: Request, prepared: Prepared) -> list[Site]:
     operable = [
         surface for surface, role in zip(surfaces, prepared.roles, strict=True) if role != "support"
     ]
+    diameter_mm = ring_diameter(request, prepared)
     if request.lesion is not None:
-        point = np.asarray(request.lesion) * prepared.mm_per_unit + prepared.shift_mm
+        point = prepared.to_world @ np.asarray(request.lesion) + prepared.shift_mm
         given = f"--lesion {' '.join(f'{x:g}' for x in request.lesion)}"
-        if prepared.mm_per_unit != 1.0 or prepared.shift_mm.any():
+        if not np.allclose(point, request.lesion):
             given += f" (in the scene {', '.join(f'{x:.4g}' for x in point)} mm)"
-        return [pointed_site(operable, point, request.diameter_mm, given)]
+        return [pointed_site(operable, point, diameter_mm, given)]
     if request.lesion_direction is not None:
-        return [directed_site(operable, np.asarray(request.lesion_direction), request.diameter_mm)]
-    return good_sites(surfaces, request.diameter_mm)
+        direction = prepared.to_world @ np.asarray(request.lesion_direction)
+        return [directed_site(operable, direction, diameter_mm)]
+    if prepared.lesion_mm is not None:
+        point, _, _ = segmented_lesion(prepared)
+        return [pointed_site(operable[:1], point, diameter_mm, "the segmented lesion")]
+    return good_sites(surfaces, diameter_mm)
+
+
+def ring_diameter(request: Request, prepared: Prepared) -> float:
+    """Diameter of the ring (mm): the given one, or around the segmented lesion, or DIAMETER_MM."""
+    if request.diameter_mm is not None:
+        return request.diameter_mm
+    if prepared.lesion_mm is None or request.lesion or request.lesion_direction:
+        return DIAMETER_MM
+    _, radius, _ = segmented_lesion(prepared)
+    return round(2.0 * (radius + request.margin_mm), 1)
+
+
+def segmented_lesion(prepared: Prepared) -> tuple[np.ndarray, float, float]:
+    """Where a segmented lesion meets the organ's surface: point, radius and depth.
+
+    The point (3,) mm of the organ's surface nearest to the lesion's middle; the largest distance
+    of the lesion from the surface's normal through that point (mm); and the lesion's smallest
+    depth below the surface (mm).
+    """
+    lesion, organ = prepared.lesion_mm, prepared.meshes[0]
+    assert lesion is not None, "the image holds a lesion"
+    middle = lesion.mean(axis=0)
+    points, faces = nearest_on_surface(organ, middle[None])
+    normal = patch_normal(organ, points[0], int(faces[0]), MARGIN_MM)
+    away = lesion - points[0]
+    across = away - np.outer(away @ normal, normal)
+    near, _ = nearest_on_surface(organ, lesion[:: max(1, len(lesion) // 500)])
+    depth = np.linalg.norm(near - lesion[:: max(1, len(lesion) // 500)], axis=1).min()
+    return points[0], float(np.linalg.norm(across, axis=1).max()), float(depth)
 
 
 def author(
@@ -285,6 +410,7 @@ def author(
     """
     prepared = prepare(request, report)
     report(5, 100, "meshes read")
+    request = replace(request, diameter_mm=ring_diameter(request, prepared))
     sites = choose_sites(request, prepared)
     report(10, 100, "lesion placed")
     failures: list[tuple[float, str]] = []
@@ -312,7 +438,8 @@ def author(
             scene = _scene(request, prepared, site, bodies, pair, mounts, name)
             check = check_scene(scene, reaches)
             if check.good:
-                return Authored(scene, check, (*prepared.notes, *_chosen(scene, check, site)))
+                chosen = _chosen(scene, check, site, prepared)
+                return Authored(scene, check, (*prepared.notes, *chosen))
             failures.append((check.work.covered if check.work else 0.0, sentence(check)))
         if shortfall is not None:
             failures.append((shortfall.covered, shortfall.sentence))
@@ -384,13 +511,20 @@ def rounded_mount(position_mm: np.ndarray, rotation: np.ndarray) -> dict[str, An
     }
 
 
-def _chosen(scene: Scene, check: SceneCheck, site: Site) -> list[str]:
+def _chosen(scene: Scene, check: SceneCheck, site: Site, prepared: Prepared) -> list[str]:
     assert check.work is not None, "a scene that was chosen has its arms at work"
     cut = check.work.cut
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the given point was {site.moved_mm:.3g} mm off the surface and was moved onto it"
+    segmented = prepared.lesion_mm is not None
+    if segmented:
+        _, radius, depth = segmented_lesion(prepared)
+        moved = (
+            f"segmented lesion: {2.0 * radius:.3g} mm across seen from the surface, its top "
+            f"{depth:.2g} mm below it"
+        )
     return [
-        *([moved] if site.moved_mm > REPORTED_FROM_MM else []),
+        *([moved] if segmented or site.moved_mm > REPORTED_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
         f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "

@@ -118,9 +118,10 @@ def check_scene(
 
     `reaches` holds the arms' reach tables by tool.
     """
-    findings = (*_mesh_findings(scene), _lesion_finding(scene))
+    findings: tuple[Finding, ...] = (*_mesh_findings(scene), _lesion_finding(scene))
     if not findings[-1].good:
         return SceneCheck(findings, None)
+    findings = (*findings, *_neighbour_findings(scene))
     checker, arms = CollisionChecker(scene.bodies), mounted_arms(scene, reaches)
     work = _work(scene, checker, arms, report)
     report(len(work.reason) + 1, len(work.reason) + 2, "paths from rest")
@@ -164,7 +165,7 @@ def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
         rows.append(
             Finding(
                 f"{body.role} '{body.name}'",
-                f"{len(mesh.faces)} faces, {kind}, {mesh.volume_mm3 / 1000.0:.3g} ml",
+                f"{len(mesh.faces)} faces, {kind}, {mesh.volume_mm3 / 1000.0:.4g} ml",
                 "closed, wound outwards",
                 closed,
             )
@@ -190,6 +191,20 @@ def _lesion_finding(scene: Scene) -> Finding:
     if lesion.path_mm:
         wanted = f"{ON_SURFACE_MM:g} mm, path {path_slack_mm(lesion):g} mm"
     return Finding("lesion on the surface", value, wanted, lies)
+
+
+def _neighbour_findings(scene: Scene) -> tuple[Finding, ...]:
+    """Distance of the cut from each body that must not be touched, such as a vessel below it."""
+    least = scene.spec.limits.clearance_mm
+    rows = []
+    for body in scene.bodies:
+        if body.role == "keep-out":
+            nearest, _ = nearest_on_surface(body.world_mesh, scene.ring.points_mm)
+            away = float(np.linalg.norm(nearest - scene.ring.points_mm, axis=1).min())
+            rows.append(
+                Finding(f"ring to '{body.name}'", f"{away:.1f} mm", f"{least:g} mm", away >= least)
+            )
+    return tuple(rows)
 
 
 def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:

@@ -1,5 +1,6 @@
-"""Mesh files: read STL, OBJ, PLY, OFF and GLB, infer the unit of length, write exact PLY."""
+"""Mesh files: read STL, OBJ, PLY, OFF and GLB, decide their unit of length, write exact PLY."""
 
+import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +12,13 @@ from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
 from surgisoft.scene.mesh import Mesh, used_indices
 
-MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb", ".gltf")
+MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+GLTF = (".glb", ".gltf")
+SUFFIXES = (".stl", ".obj", ".ply", ".off", *GLTF)
 PLAUSIBLE_MM = (20.0, 600.0)
 """Plausible largest side of an organ or an organ phantom: from a gland to a whole abdomen (mm)."""
 ABSURD = 10.0
 """Factor below or above the plausible range at which a size is an error, not only a warning."""
-TYPICAL_MM = 180.0
-"""Largest side of a liver (mm), Gray's Anatomy, 42nd ed., chapter 67: 15 to 20 cm across."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +48,8 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: the file is empty; expected a mesh")
     if path.suffix.lower() == ".stl":
         _check_stl(path)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        _check_gltf(path)
     pieces, points = _load(path)
     if not pieces and points:
         raise InputError(
@@ -89,6 +91,38 @@ def _check_text_stl(path: Path, size: int) -> None:
             f"{path}: the text STL ends with '{last}'; expected 'endsolid' at its end: it is cut "
             "off, export or copy it again"
         )
+
+
+def _check_gltf(path: Path) -> None:
+    """Raise for a glTF file whose parts claim more than the file holds, before memory is taken.
+
+    GLB: a header of 12 bytes (magic, version, length), then chunks, each with its length and type
+    before it; the first one is JSON (glTF 2.0 specification, sec. 4.4).
+    """
+    size, wanted = path.stat().st_size, "the file is damaged or has another type"
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        magic, _, length = struct.unpack("<4sII", content[:12].ljust(12, b"\0"))
+        if magic != b"glTF" or length != size:
+            raise InputError(f"{path}: cannot be read as GLB (its length is wrong); {wanted}")
+        at, chunks = 12, []
+        while at + 8 <= size:
+            length = struct.unpack("<I", content[at : at + 4])[0]
+            chunks.append(content[at + 8 : at + 8 + length])
+            at += 8 + length
+        if at != size or not chunks:
+            raise InputError(f"{path}: cannot be read as GLB (a chunk is cut off); {wanted}")
+        content = chunks[0]
+    try:
+        table = json.loads(content)
+        accessors = table.get("accessors", [])
+        counts = [accessor["count"] for accessor in accessors if "bufferView" not in accessor]
+        most = max([0, *counts])
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: cannot be read as glTF ({reason[:120]}); {wanted}") from None
+    if most > size:
+        raise InputError(f"{path}: claims {most} numbers in {size} bytes; {wanted}")
 
 
 def _load(path: Path) -> tuple[list[Part], int]:
@@ -138,71 +172,65 @@ def _checked(path: Path, part: Part) -> Part:
     return part
 
 
+class UnknownUnit(InputError):
+    """A mesh file stores no unit, and its size in mm is not that of an organ."""
+
+
 @dataclass(frozen=True)
-class UnitGuess:
-    """The inferred unit of a file's coordinates, and the reason for it."""
+class LengthUnit:
+    """The unit of a file's coordinates, and where it comes from."""
 
-    unit: str
-    """`mm`, `cm` or `m`."""
+    mm: float
+    """Millimetres in one unit."""
     sentence: str
-    """The reason, as printed for the user."""
-
-    @property
-    def mm(self) -> float:
-        """Millimetres in one unit."""
-        return MM_PER_UNIT[self.unit]
+    """The unit and its origin, as printed for the user."""
 
 
-def recognise_unit(size: float, is_gltf: bool = False) -> UnitGuess:
-    """Infer the unit of a file from its largest side `size`, which should be that of an organ.
+def stored_unit(path: Path, size: float) -> LengthUnit:
+    """The unit of a file whose user gave none; `size` is the largest side in the file's unit.
 
-    If two units fit, mm is preferred (metres for glTF, whose standard prescribes them). If none
-    fits, the unit is chosen that comes nearest to a liver.
+    glTF prescribes metres. The other formats store no unit, and mm is what medical software
+    writes. Nothing is scaled by a guess: a size that this unit makes no organ's raises
+    UnknownUnit, which lists what each unit would give.
     """
+    unit = "m" if path.suffix.lower() in GLTF else "mm"
+    why = "glTF prescribes metres" if unit == "m" else f"{path.suffix[1:].upper()} stores no unit"
     low, high = PLAUSIBLE_MM
-    fits = [unit for unit, mm in MM_PER_UNIT.items() if low <= size * mm <= high]
-    preferred = ("m", "mm", "cm") if is_gltf else ("mm", "cm", "m")
-    if fits:
-        unit = next(unit for unit in preferred if unit in fits)
-        other = [u for u in fits if u != unit]
-        doubt = (
-            f"; {other[0]} would give {size * MM_PER_UNIT[other[0]]:.4g} mm, use --unit {other[0]}"
-            if other
-            else ""
+    size_mm = size * MM_PER_UNIT[unit]
+    if low <= size_mm <= high:
+        return LengthUnit(
+            MM_PER_UNIT[unit],
+            f"{unit} ({why}; the mesh is {size_mm:.4g} mm across, another unit needs --unit)",
         )
-        return UnitGuess(unit, f"{unit} (inferred: the mesh is {size:.4g} {unit} across{doubt})")
-    unit = min(MM_PER_UNIT, key=lambda u: abs(np.log(size * MM_PER_UNIT[u] / TYPICAL_MM)))
-    return UnitGuess(
-        unit,
-        f"{unit} (uncertain: the mesh would be {size * MM_PER_UNIT[unit]:.4g} mm across; organs "
-        f"measure {low:g} to {high:g} mm, which no unit gives; check with --unit)",
+    options = ", ".join(f"--unit {u} ({size * mm:.4g} mm)" for u, mm in MM_PER_UNIT.items())
+    raise UnknownUnit(
+        f"{path}: the mesh would be {size_mm:.4g} mm across in {unit} ({why}), and organs measure "
+        f"{low:g} to {high:g} mm; give its unit: {options}, or --scale MM_PER_UNIT"
     )
 
 
-def given_unit(size: float, unit: str) -> str:
-    """The line that reports the unit which the user gave, for a largest side of `size` units.
+def given_unit(path: Path, size: float, unit: str | None, scale: float | None) -> LengthUnit:
+    """The unit that the user gave, by name or as `scale` mm in one unit.
 
-    It is a warning if that is not an organ's size, with the units that would give one.
-    """
-    (low, high), mm = PLAUSIBLE_MM, size * MM_PER_UNIT[unit]
-    if low <= mm <= high:
-        return f"'{unit}' as given"
-    fits = [u for u, scale in MM_PER_UNIT.items() if low <= size * scale <= high]
-    advice = "".join(f"; --unit {u} would give {size * MM_PER_UNIT[u]:.4g} mm" for u in fits)
-    return (
-        f"'{unit}' was given, but the mesh would be {mm:.4g} mm across; organs measure {low:g} to "
-        f"{high:g} mm; check --unit{advice}"
-    )
-
-
-def check_organ_size(path: str | Path, size_mm: float, unit: str) -> None:
-    """Raise an InputError for a size so far from any organ's that the unit must be wrong.
-
-    `unit` is the line that reports the unit, with the size and the range of organs.
+    `size` is the organ's largest side in that unit. A size that is no organ's becomes a warning in
+    the sentence, and one more than ABSURD times outside the range an InputError.
     """
     low, high = PLAUSIBLE_MM
+    mm = MM_PER_UNIT[unit] if unit is not None else scale
+    assert mm is not None, "either the unit or the scale was given"
+    what = f"{unit} as given" if unit is not None else f"{mm:g} mm as given"
+    size_mm = size * mm
+    if low <= size_mm <= high:
+        return LengthUnit(mm, f"{what} ({size_mm:.4g} mm across)")
+    fits = [u for u, factor in MM_PER_UNIT.items() if low <= size * factor <= high]
+    advice = "".join(f"; --unit {u} would give {size * MM_PER_UNIT[u]:.4g} mm" for u in fits)
+    sentence = (
+        f"{what}, but the mesh would be {size_mm:.4g} mm across; organs measure {low:g} to "
+        f"{high:g} mm{advice}"
+    )
     if not low / ABSURD <= size_mm <= high * ABSURD:
-        raise InputError(f"{path}: unit {unit}")
+        raise InputError(f"{path}: unit {sentence}")
+    return LengthUnit(mm, sentence)
 
 
 def write_ply(mesh: Mesh, path: str | Path) -> None:

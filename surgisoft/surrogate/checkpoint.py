@@ -10,14 +10,15 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 from safetensors.torch import save as safetensors_bytes
+from torch import Tensor
 
 from surgisoft import __version__
+from surgisoft.config import Where, describe, from_table
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.files import new_folder
+from surgisoft.files import new_folder, read_json
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
-from surgisoft.surrogate.interval import ErrorInterval
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
@@ -25,6 +26,10 @@ from surgisoft.surrogate.training_residuals import TrainingResiduals
 
 FORMAT = 1
 """Version of the folder's layout."""
+LARGEST_CONFIG = 1_000_000
+"""A larger `config.json` is not read, bytes."""
+MOST_UNITS = 100_000
+"""Most key points, members, arcs or units of a network that `config.json` may name."""
 
 DEFAULT, DEFAULT_FOLDER = "default", Path(__file__).parents[1] / "assets" / "default_arm"
 """Name and folder of the arm that comes with the package."""
@@ -153,24 +158,23 @@ def load_model(
             f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
             "folder that 'surgisoft fit' made"
         )
+    file = folder / "config.json"
     try:
-        config = json.loads((folder / "config.json").read_text())
+        config = read_json(file, LARGEST_CONFIG)
         weights = load_file(folder / "weights.safetensors")
         if config["format"] != FORMAT:
             raise InputError(
-                f"{folder}: model format {config['format']}, expected {FORMAT}; fit it again"
+                f"{folder}: model format {describe(config['format'])}, expected {FORMAT}; fit it "
+                "again"
             )
-        spec = ArmSpec(
-            **{
-                key: tuple(value) if isinstance(value, list) else value
-                for key, value in config["arm"].items()
-            }
-        )
+        _check_finite(folder, weights)
+        spec = from_table(ArmSpec, config["arm"], Where(file) / "arm")
         low, high = torch.tensor(spec.low), torch.tensor(spec.high)
         network = dict(config["network"])
         kind = network.pop("kind")
         if kind not in NETWORKS:
-            raise unknown_name("network", kind, NETWORKS)
+            raise unknown_name("network", str(kind), NETWORKS)
+        _check_size(folder, NETWORKS[kind][0], low, high, network, weights)
         check_files(config.get("effect_files", {}), str(folder))
         facts = arm_facts(spec, weights["rest_mm"])
         versions = config.get("effect_versions", {})
@@ -178,18 +182,11 @@ def load_model(
             name: _opened(folder, name, facts, arguments, versions.get(name))
             for name, arguments in config["effects"].items()
         }
-        validation = dict(config["validation"])
-        points = tuple(validation.pop("per_key_point_mm", ()))
-        stated = config.get("interval")
-        interval = None if stated is None else ErrorInterval.from_json(stated)
-        model = ArmModel(
-            spec,
-            NETWORKS[kind][0](low, high, **network),
-            effects,
-            None,
-            Validation(per_key_point_mm=points, interval=interval, **validation),
-        )
+        stated = {"interval": config["interval"]} if config.get("interval") else {}
+        validation = from_table(Validation, config["validation"] | stated, Where(file))
+        model = ArmModel(spec, NETWORKS[kind][0](low, high, **network), effects, None, validation)
         model.load_state_dict(weights)
+        _check_finite(folder, model.state_dict())
     except InputError:
         raise
     except Exception as error:
@@ -198,6 +195,39 @@ def load_model(
         ) from error
     model.training_residuals = load_training_residuals(folder)
     return model.to(device).eval().requires_grad_(False)
+
+
+def _check_finite(folder: Path, weights: dict[str, Tensor]) -> None:
+    """Raise InputError for weights that are NaN or infinite: such a model answers with NaN."""
+    for name, value in weights.items():
+        if value.is_floating_point() and not value.isfinite().all():
+            bad = int((~value.isfinite()).sum())
+            raise InputError(
+                f"{folder}: {bad} of {value.numel()} numbers of '{name}' are NaN or infinite; "
+                "fit the model again"
+            )
+
+
+def _check_size(
+    folder: Path, network: type, low: Tensor, high: Tensor, arguments: dict, weights: dict
+) -> None:
+    """Raise InputError where the network that `config.json` names is not that of the weights.
+
+    The network is laid out without memory for its numbers, so that a false size costs nothing.
+    """
+    numbers = [n for n in arguments.values() if isinstance(n, int)]
+    layers = arguments.get("hidden", [])
+    if max(numbers, default=0) > MOST_UNITS or len(layers) > len(weights):
+        raise InputError(f"{folder}: the network of config.json is not that of the weights")
+    with torch.device("meta"):
+        expected = network(low, high, **arguments).state_dict()
+    found = {name.removeprefix("network."): value.shape for name, value in weights.items()}
+    for name, value in expected.items():
+        if found.get(name) != value.shape:
+            raise InputError(
+                f"{folder}: '{name}' has shape {list(found.get(name, ()))} in the weights and "
+                f"{list(value.shape)} by config.json; fit the model again"
+            )
 
 
 def load_training_residuals(folder: str | Path) -> TrainingResiduals | None:

@@ -80,12 +80,6 @@ class ErrorInterval:
         """Plain values, for a model's `config.json`."""
         return asdict(self)
 
-    @classmethod
-    def from_json(cls, values: dict) -> "ErrorInterval":
-        """The interval that `to_json` wrote."""
-        quantiles = tuple(tuple(row) for row in values["quantiles_mm"])
-        return cls(**values | {"levels": tuple(values["levels"]), "quantiles_mm": quantiles})
-
     def sentence(self) -> str:
         """What it says on a row like those of the training, in one line."""
         radii = " ".join(f"{value:.2f}" for value in self._quantile(LEVEL))

@@ -38,3 +38,19 @@ def model_table(
         _, key_points = model.step(state, torch.zeros_like(pressure), 1.0)
         lines, directions = backbone.centreline(key_points), backbone.tip_direction(key_points)
     return axes, lines.double().numpy(), directions.double().numpy()
+
+
+def steady_key_points(model: ArmModel, actuation: np.ndarray) -> np.ndarray:
+    """Steady-state key points (K, n, 3) [mm], base frame, at constant actuation (K, m).
+
+    actuation: in the arm's unit; each is reached from an arm that has stood there without history.
+    """
+    if np.shape(actuation)[1:] != (model.spec.chambers,):
+        raise InputError(
+            f"the model has {model.spec.chambers} chambers, got {np.shape(actuation)[-1]}"
+        )
+    with torch.no_grad():
+        pressure = torch.as_tensor(np.asarray(actuation), dtype=torch.float32)
+        state = model.initial_state(len(pressure), pressure)
+        _, points = model.step(state, torch.zeros_like(pressure), 1.0)
+    return points.double().numpy()

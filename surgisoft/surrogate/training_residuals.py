@@ -38,4 +38,13 @@ class TrainingResiduals:
         """The residuals in a model's folder; None where the folder has none."""
         if not (folder / FILE).is_file():
             return None
-        return cls(**load_file(folder / FILE))
+        known = cls(**load_file(folder / FILE))
+        rows, points = known.actuation.shape[:1], known.residual_mm.shape[1:]
+        fits = known.actuation.ndim == 2 and known.direction.shape == known.actuation.shape
+        if not fits or known.residual_mm.shape != (*rows, *points) or points[1:] != (3,):
+            raise ValueError("its arrays do not have the same rows")
+        if not (known.actuation.isfinite().all() and known.direction.isfinite().all()):
+            raise ValueError("its actuation is NaN or infinite")
+        if known.residual_mm.isinf().any():
+            raise ValueError("its residuals are infinite")
+        return known

@@ -4,12 +4,14 @@ import gc
 import weakref
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
-from surgisoft.agents.on_rig import RigConfig, on_rig, virtual_rig
+from surgisoft.agents.on_rig import RigConfig, at_benches, named_rig, on_rig, real_benches, rigs_in
 from surgisoft.agents.policies import Random, Scripted
 from surgisoft.agents.rollout import rollout
+from surgisoft.agents.session import evaluate
 from surgisoft.errors import InputError
 from surgisoft.rig import VirtualRig
 from surgisoft.tasks.base import Episodes
@@ -18,6 +20,7 @@ from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
+from tests.rig.own_rig import OwnRig
 
 SHORT = TrackConfig(FollowConfig(loop_s=5.0, approach_s=2.0, size_mm=5.0))
 
@@ -81,7 +84,7 @@ def test_memory_is_constant_over_episodes():
 
     def counted(config, trial):
         nonlocal most
-        rig = virtual_rig(config, trial)
+        rig = named_rig(config, trial)
         alive.add(rig)
         most = max(most, len(alive))
         return rig
@@ -168,3 +171,70 @@ def test_a_step_that_the_rig_cannot_keep_is_one_line():
         on_rig(task)
     with pytest.raises(InputError, match="observer_gain is 2"):
         RigConfig(observer_gain=2.0)
+
+
+REAL = "tests.rig.own_rig:OwnRig:port=x"
+
+
+def test_a_real_bench_runs_one_episode_after_the_other_and_is_scored_by_measurements():
+    short = TrackConfig(FollowConfig(loop_s=0.4, approach_s=0.1))
+    config = RigConfig(rigs=(REAL,), settle_s=0.05)
+    moved = on_rig(track_circle(short), config)
+    (bench,) = real_benches(moved).values()
+    with pytest.raises(InputError, match="2 episodes were to run side by side"):
+        rollout(moved, Random(), 2, seed=0)
+    with at_benches(moved):
+        state = Episodes(moved).seeded(0, 1)
+        assert state.world.arms["arm"].plant.rigs.items == (bench,)
+        sample = bench.read()
+    measured = torch.tensor(sample.key_points_mm, dtype=torch.float32)
+    assert (state.world.arms["arm"].points_mm[0] - measured).norm(dim=1).max() < 1.5
+    assert (bench.rig.vents, bench.rig.closes) == (1, 1), "left vented and given back"
+    found = evaluate("random", "track_circle", episodes=2, rig=config, config=short)
+    assert found.measured_arms == ("arm",)
+    assert found.to_json()["measured_arms"] == ["arm"]
+    assert (
+        evaluate(
+            "random", "track_circle", episodes=2, rig=RigConfig(settle_s=0.05), config=short
+        ).measured_arms
+        == ()
+    )
+
+
+def test_a_lost_key_point_of_a_real_bench_is_estimated():
+    class Blind(OwnRig):
+        def read(self):
+            sample = super().read()
+            return replace(sample, key_points_mm=np.full((5, 3), np.nan))
+
+    brief = track_circle(TrackConfig(FollowConfig(loop_s=0.4, approach_s=0.1)))
+    moved = on_rig(brief, RigConfig(settle_s=0.05), lambda config, trial: Blind("x"))
+    rolled = rollout(moved, Random(), 1, seed=0, batch=1)
+    assert not rolled.failed.any()
+    assert rolled.measures["error_mm"].isfinite().any()
+
+
+@pytest.mark.parametrize(
+    ("rigs", "message"),
+    [
+        ((REAL,), "is one bench, and circle_ablation has the arms laser, endoscope"),
+        (("virtual", "elastica"), "expected one rig for all arms, or ARM=NAME"),
+        (("knife=virtual",), "no arm 'knife', expected one of laser, endoscope"),
+        (("laser=virtual", "laser=virtual"), "arm 'laser' has the rig 'virtual' already"),
+        (("virtual:seed=1,hidden=x:y",), "hidden effect 'x:y': expected NAME or NAME:AMPLITUDE"),
+        ((f"laser={REAL},chambers=2",), "arm 'laser' has 3 chambers .* the rig's has 2 and 5"),
+    ],
+)
+def test_rigs_that_do_not_fit_the_arms_are_one_line(rigs, message):
+    with pytest.raises(InputError, match=message):
+        on_rig(CircleAblation(), RigConfig(rigs=rigs))
+
+
+def test_one_arm_is_on_a_real_bench_and_the_other_on_a_virtual_one():
+    texts = rigs_in(f"laser={REAL} endoscope=virtual:seed=2")
+    moved = on_rig(CircleAblation(), RigConfig(rigs=texts, settle_s=0.05))
+    assert list(real_benches(moved)) == ["laser"]
+    endoscope = moved.world.arms["endoscope"]
+    assert endoscope.config.rigs == ("virtual:seed=2",)
+    assert isinstance(endoscope.build(endoscope.config, 0), VirtualRig)
+    assert rigs_in("virtual") == ("virtual",)

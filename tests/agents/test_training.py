@@ -241,3 +241,57 @@ def test_opening_a_checkpoint_runs_no_code(run, tmp_path):
     with pytest.raises(InputError, match="damaged"):
         LearnedPolicy(copy)
     assert not mark.exists()
+
+
+def test_damaged_folders_are_one_line(run, tmp_path):
+    """Cases that `python -m benchmarks.fuzz` found; each is tried on a whole folder."""
+    copy = tmp_path / "run"
+    shutil.copytree(run.path, copy)
+    config = json.loads((copy / "config.json").read_text())
+
+    def refused(said, call=resume, **fields):
+        (copy / "config.json").write_text(json.dumps(config | fields))
+        with pytest.raises(InputError, match=said):
+            call(copy, Processes(), CPU) if call is resume else call(copy)
+        (copy / "config.json").write_text(json.dumps(config))
+
+    numbers = config["hyper_parameters"]
+    refused("hidden", hyper_parameters=numbers | {"hidden": [10**9]})
+    refused("more than", hyper_parameters=numbers | {"rollout": 10**6})
+    refused("activation", hyper_parameters=numbers | {"activation": "ta h"})
+    refused("unknown field", hyper_parameters=numbers | {"new": 1})
+    refused("8 episodes, expected 16", hyper_parameters=numbers | {"envs": 16})
+    refused("seed: got text '1'", seed="1")
+    refused("task_config", task_config=[])
+    wide = {agent: size | {"observation": 10**7} for agent, size in config["agents"].items()}
+    refused("expected .*10000000", call=LearnedPolicy, agents=wide)
+    refused("observation", call=LearnedPolicy, agents={"arm": {"observation": "x"}})
+    (copy / "config.json").write_text("[" * 10**5)
+    with pytest.raises(InputError, match="nested too deeply"):
+        RunFolder(copy)
+
+
+@pytest.mark.parametrize(
+    ("which", "path", "value", "said"),
+    [
+        (BEST, ("agents", "arm", "mlp.0.bias"), torch.full((64,), torch.nan), "NaN or infinite"),
+        (BEST, ("agents", "arm", "mlp.0.bias"), torch.zeros(1, 64), r"\[1, 64\] numbers"),
+        (BEST, ("agents", "arm"), 3, "damaged checkpoint"),
+        (BEST, ("agents",), None, "damaged checkpoint"),
+        (LAST, ("processes", 0, "world", 0), torch.zeros(8, 7), "a part of the world has shape"),
+        (LAST, ("processes", 0, "random", "cpu"), 5, "damaged checkpoint"),
+        (LAST, ("processes",), 5, "damaged checkpoint"),
+        (LAST, ("best",), [1], "damaged checkpoint"),
+        (LAST, ("agents", "arm", "optimizer_state_dict", "param_groups"), [], "damaged checkpoint"),
+    ],
+)
+def test_damaged_checkpoints_are_one_line(run, tmp_path, which, path, value, said):
+    copy = tmp_path / "run"
+    shutil.copytree(run.path, copy, ignore=shutil.ignore_patterns("replays", "tensorboard"))
+    node = saved = RunFolder(copy).load(which)
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = value
+    RunFolder(copy).save(which, saved)
+    with pytest.raises(InputError, match=said):
+        LearnedPolicy(copy) if which == BEST else resume(copy, Processes(), CPU)

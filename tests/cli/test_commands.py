@@ -4,9 +4,11 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from surgisoft.cli import MANY, run, spread
+from surgisoft.measurement.recordings import load_recording
 
 
 @pytest.fixture(scope="module")
@@ -242,3 +244,35 @@ def test_packaged_names_work_anywhere(tmp_path, monkeypatch, capsys):
     assert run(["experiment", "list"]) == 0
     assert capsys.readouterr().out == listed
     assert run(["scene", "show", "phantom_liver", "--save", "x.rrd"]) == 0
+
+
+def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_one(
+    tmp_path, monkeypatch, capsys
+):
+    from surgisoft.diagnosis.design import next_experiment as designing
+    from surgisoft.diagnosis.design.next_experiment import Pair, Recommendation
+    from surgisoft.measurement.protocols import Protocol
+
+    schedule = Protocol(
+        "s", "continuous", np.tile([5.0, 10.0, 15.0], (4, 1)), np.zeros(4), np.arange(4.0)
+    )
+    found = Recommendation(
+        "roll_90: ramps",
+        schedule,
+        "roll_90",
+        1.0,
+        (Pair(("payload", "drift"), 0.5, 0.9),),
+        ("turn the base",),
+        "--roll-deg 90",
+        None,
+    )
+    monkeypatch.setattr(designing, "next_experiment", lambda *_: found)
+    plan, new = tmp_path / "s.csv", tmp_path / "new.parquet"
+    command = ["next-experiment", "default", "-o", str(plan), "--force", "--record", str(new)]
+    assert run([*command, "--rig", "tests.rig.own_rig:OwnRig:port=x"]) == 2
+    assert "is not: first turn the base; then 'surgisoft collect" in capsys.readouterr().err
+    assert plan.exists()
+    assert not new.exists()
+    assert run([*command, "--rig", "virtual:seed=3"]) == 0
+    recording = load_recording(new)
+    assert recording.gravity == pytest.approx([0.0, -0.42, 0.9075], abs=1e-3), "rolled by 90 deg"

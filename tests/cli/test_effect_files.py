@@ -12,9 +12,11 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.rig import VirtualRig
+from surgisoft.scene.meshio import write_ply
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from surgisoft.surrogate.effects import make_effect, register_effect_file, user_defined
 from surgisoft.surrogate.model import ArmModel
+from tests.scene.shapes import ball
 from tests.surrogate.effects.test_user_defined import EXAMPLE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,8 +45,8 @@ NO_MODEL = {
     "collect": "makes a recording of the virtual rig",
     "import": "reads raw files",
     "recording": "reads recordings",
+    "rig list": "lists rigs and their options",
     "replay": "shows what was recorded",
-    "scene new": "places the default arm",
     "experiment list": "reads experiment files",
     "export": "opens policies, which hold no arm",
 }
@@ -56,8 +58,10 @@ COMMANDS = {
     "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
     "improve": "improve arm bench.parquet --max-effects 1 -o improved",
     "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
+    "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
     "evaluate": "evaluate scripted --task track_circle --arm arm --episodes 1",
+    "scene new": "scene new ball.ply --unit mm --arm arm -o placed",
     "scene check": "scene check scene",
     "scene show": "scene show scene --save view.rrd",
     "experiment check": "experiment check short.toml",
@@ -85,6 +89,7 @@ def lab(tmp_path_factory):
     rig = VirtualRig(0, take=7)
     recording = rig.record(make_protocol("mixed", rig.limits, 1200, seed=2))[0]
     save_recording(recording, folder / "bench.parquet")
+    write_ply(ball(60.0, 2), folder / "ball.ply")
     shutil.copytree(ROOT / "scenes" / "phantom_liver", folder / "scene")
     scene = (folder / "scene" / "scene.toml").read_text()
     (folder / "scene" / "scene.toml").write_text(scene.replace('"default"', '"../arm"'))

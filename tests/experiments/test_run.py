@@ -1,6 +1,7 @@
 """Whole runs: interrupted or not, by one process or two, give the same rows and one report."""
 
 import json
+import shutil
 
 import pyarrow.parquet as pq
 import pytest
@@ -98,3 +99,19 @@ def test_list_names_what_is_shipped(capsys):
     out = capsys.readouterr().out
     for name in ("liver", "multi_lesion", "fault", "sweep"):
         assert f"{name}.toml: " in out
+
+
+def test_a_damaged_row_is_one_line(whole, tmp_path):
+    file, folder = whole
+    shutil.copytree(folder, tmp_path / "results")
+    spec = load_experiment(file)
+    row = sorted((tmp_path / "results" / "rows").iterdir())[1]
+    content = json.loads(row.read_text())
+    texts = ["[]", "[" * 10**5, json.dumps(content | {"episode": 7})]
+    texts += [json.dumps(content | {"clearance_mm": "x"}), json.dumps(content | {"new": 1})]
+    for text in texts:
+        row.write_text(text)
+        with pytest.raises(InputError, match=row.name):
+            run_experiment(spec, tmp_path / "results")
+    row.write_text(json.dumps(content))
+    assert len(run_experiment(spec, tmp_path / "results")) == 3

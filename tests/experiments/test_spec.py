@@ -5,9 +5,10 @@ import dataclasses
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.config import read_toml
+from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError
-from surgisoft.experiments.plan import settings
+from surgisoft.experiments.plan import rig_config, settings
+from surgisoft.experiments.session import with_rigs
 from surgisoft.experiments.spec import load_experiment, save_experiment
 from surgisoft.scene.spec import PHANTOM
 from tests.experiments.tiny import FAULT, TINY, write
@@ -87,7 +88,7 @@ def test_what_varies_makes_a_grid(tmp_path):
 
 def test_hidden_effects_are_for_the_rig(tmp_path):
     case = '[[cases]]\nname = "a"\nhidden = ["creep"]\n'
-    with pytest.raises(InputError, match=r"cases\[0\]: hidden or specimen in simulation"):
+    with pytest.raises(InputError, match=r"cases\[0\]: hidden, specimen or rigs in simulation"):
         load_experiment(write(tmp_path, TINY + case))
     text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
     with pytest.raises(InputError, match="unknown hidden effect 'grep'"):
@@ -98,3 +99,32 @@ def test_specs_are_values(tmp_path):
     spec = load_experiment(write(tmp_path))
     assert hash(spec) == hash(load_experiment(write(tmp_path)))
     assert spec != dataclasses.replace(spec, seed=4)
+
+
+def test_settings_without_bound_are_refused(tmp_path):
+    rows = "".join(
+        f"\n[[vary]]\nfield = '{name}'\nvalues = [{', '.join(map(str, range(1, 101)))}]\n"
+        for name in ("task.cut_s", "task.fire_mm", "task.far_mm")
+    )
+    with pytest.raises(InputError, match="1000000 settings; expected at most 100000"):
+        settings(load_experiment(write(tmp_path, TINY + rows)))
+
+
+def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
+    text = TINY.replace("together = 1", "together = 3")
+    text += '[[cases]]\nname = "a"\n[[cases]]\nname = "b"\nplant = "rig"\n'
+    spec = load_experiment(write(tmp_path, text))
+    changed = with_rigs(spec, ("virtual:seed=3",))
+    assert [case.rigs for case in changed.cases] == [("virtual",), ("virtual:seed=3",)]
+    assert (spec.together, changed.together) == (3, 3)
+    found = settings(changed)
+    assert rig_config(found[1], Where(tmp_path)).rigs == ("virtual:seed=3",)
+    real = with_rigs(spec, ("laser=tests.rig.own_rig:OwnRig:port=x",))
+    assert real.together == 1, "one bench runs one episode after the other"
+    save_experiment(real, tmp_path / "saved.toml")
+    assert load_experiment(tmp_path / "saved.toml") == real
+    simulated = load_experiment(write(tmp_path))
+    with pytest.raises(InputError, match="no case with plant = 'rig'"):
+        with_rigs(simulated, ("virtual",))
+    with pytest.raises(InputError, match="no arm 'knife'"):
+        with_rigs(spec, ("knife=virtual",))

@@ -1,11 +1,15 @@
 """Bad maps and raw files that do not fit them: one line each, with its place."""
 
+import gzip
 import re
 
 import pytest
 
 from surgisoft.errors import InputError
+from surgisoft.measurement import tables
 from surgisoft.measurement.importing import import_files, load_map
+from surgisoft.measurement.tables import read_text
+from tests.measurement.test_importing import BASE
 
 GOOD = """\
 [file.log]
@@ -201,3 +205,20 @@ def test_command_and_measurement_must_fit(tmp_path):
         map_path.write_text(f"{GOOD}[commanded]\n{extra}\n")
         spec = load_map(str(map_path))
         assert expected in message_of(lambda spec=spec: import_files([path], spec, "x"))
+
+
+def test_a_compressed_file_cannot_unpack_without_bound(tmp_path, monkeypatch):
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"t,u\n" + b"0,0\n" * 10**6))
+    assert len(read_text(tmp_path / "a.csv.gz")) == 4 + 4 * 10**6
+    monkeypatch.setattr(tables, "MOST_UNPACKED", 1 << 20)
+    with pytest.raises(InputError, match="more than 1 MiB when it is unpacked"):
+        read_text(tmp_path / "a.csv.gz")
+
+
+def test_a_number_that_no_measurement_has(tmp_path):
+    text = "t,u1,u2,x,y,z\n0,1,2,3,4,5\n1,1,2,3,4,-1e101\n"
+    (tmp_path / "a.csv").write_text(text)
+    (tmp_path / "map.toml").write_text(BASE)
+    said = r"line 3, column 'z': got -1e\+101, expected a finite number of a size below 1e\+100"
+    with pytest.raises(InputError, match=said):
+        import_files([tmp_path / "a.csv"], load_map(str(tmp_path / "map.toml")), "x")

@@ -223,3 +223,9 @@ def test_bad_names_and_sizes_get_one_line(tmp_path):
         make_protocol("grid", LIMITS, 3)
     with pytest.raises(InputError, match="cannot be read"):
         load_schedule(tmp_path / "none.csv")
+
+
+def test_a_schedule_with_a_channel_of_thousands_of_digits(tmp_path):
+    (tmp_path / "s.csv").write_text(f"t_s,c{'1' * 5000}_kPa\n0,1\n1,2\n")
+    with pytest.raises(InputError, match="unknown column"):
+        load_schedule(tmp_path / "s.csv")

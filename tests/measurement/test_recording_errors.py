@@ -226,3 +226,20 @@ def test_one_unusual_cell_far_down_is_read_with_its_neighbours(tmp_path):
     lines[59_000] = "59000,1,2,3"
     path.write_text("\n".join([HEAD, *lines]))
     assert "long.csv, line 59002: 4 cells, expected 5 as in the header" in error_of(path)
+
+
+def test_a_parquet_file_cannot_claim_gigabytes(tmp_path):
+    """Constant columns of many rows take next to no space: 400 MB in 200 kB."""
+    path = tmp_path / "bad.parquet"
+    names = HEAD.split(",")
+    zeros = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**7, np.int8)), pa.array([0.0]))
+    pq.write_table(pa.table([zeros] * len(names), names=names), path, row_group_size=10**7)
+    assert path.stat().st_size < 300_000
+    assert "claims 10000000 rows of 5 columns" in error_of(path)
+
+
+@pytest.mark.parametrize("name", ["p" + "1" * 5000 + "_kPa", "k" + "9" * 5000 + "_x_mm"])
+def test_numbers_of_thousands_of_digits_in_names(tmp_path, name):
+    path = tmp_path / "bad.csv"
+    path.write_text(f"{HEAD},{name}\n{ROW},1\n")
+    assert "not a column's name" in error_of(path)

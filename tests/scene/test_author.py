@@ -12,6 +12,7 @@ import trimesh
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.scene.author import (
+    UP,
     Request,
     check_target,
     choose_sites,
@@ -25,10 +26,14 @@ from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
 from surgisoft.scene.spec import FILE, LesionSpec, MountSpec, save_spec
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import ConstantCurvature
 from surgisoft.tasks.world.arm import Pneumatics, Randomisation
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.reach import reaches_of
-from surgisoft.tasks.world.world import WorldConfig, single_arm_world
+from surgisoft.tasks.world.world import WorldConfig, scene_world, single_arm_world
 from tests.scene.shapes import ball, box, lumpy
 
 
@@ -50,7 +55,7 @@ def made(tmp_path_factory):
     rod = trimesh.creation.cylinder(0.008, 0.2)
     rod.apply_translation([0.09, 0.0, 0.05])
     rod.export(folder / "rod.obj")
-    code = new(folder / "scene", folder / "organ.stl", folder / "rod.obj")
+    code = new(folder / "scene", folder / "organ.stl", folder / "rod.obj", "--unit", "m")
     return code, folder / "scene"
 
 
@@ -96,7 +101,7 @@ def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
 
 def test_the_same_meshes_give_the_same_scene(made, tmp_path):
     source = made[1].parent
-    assert new(tmp_path / "again", source / "organ.stl", source / "rod.obj") == 0
+    assert new(tmp_path / "again", source / "organ.stl", source / "rod.obj", "--scale", 1e3) == 0
     assert (tmp_path / "again" / FILE).read_text().splitlines()[1:] == (
         made[1] / FILE
     ).read_text().splitlines()[1:]
@@ -262,7 +267,7 @@ def test_a_lid_over_the_lesion_leaves_no_mount(tmp_path, capsys):
     arguments = (tmp_path / "ball.ply", tmp_path / "lid.ply", "--unit", "mm", "--lesion", 0, 0, 60)
     assert new(tmp_path / "scene", *arguments) == 1
     said = capsys.readouterr().out
-    assert "ball.ply: unit 'mm' as given\n" in said
+    assert "ball.ply: unit mm as given (120 mm across)\n" in said
     assert "No scene was written" in said
     assert "the best covers 0 %" in said
     assert not (tmp_path / "scene").exists()
@@ -290,7 +295,18 @@ BAD = [
         "in the scene 0, 0, 810 mm) lies 210 mm",
     ),
     (("nowhere.stl",), "there is no such file"),
-    (("ball.ply", "--unit", "inch"), "unknown unit 'inch'"),
+    (("ball.ply", "--unit", "yard"), "unknown unit 'yard'"),
+    (("small.ply",), "14 mm across in mm (PLY stores no unit), and organs measure 20 to 600 mm"),
+    (("small.ply",), "--unit cm (140 mm), --unit m (1.4e+04 mm), --unit inch (355.6 mm), or --sca"),
+    (("ball.ply", "--unit", "mm", "--scale", "2"), "both --unit and --scale"),
+    (("ball.ply", "--scale", "0"), "--scale is 0"),
+    (("ball.ply", "--up", "w"), "unknown axis 'w'"),
+    (("ball.ply", "--label", "1:organ"), "--label is given for meshes"),
+    (("ball.ply", "--label", "1"), "expected LABEL:ROLE[:NAME]"),
+    (("ball.ply", "--margin", "-1"), "--margin is -1"),
+    (("ball.ply", "--arm", "scope=default"), "unknown tool 'scope'"),
+    (("ball.ply", "--arm", "laser=default,laser=default"), "two arms for the laser"),
+    (("ball.ply", "--arm", "nowhere"), "no arm model there"),
     (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; organs measure 20 to 600 mm"),
     (("ball.ply:knife",), "role 'knife'"),
     (("ball.ply:support",), "expected the organ first"),
@@ -312,11 +328,66 @@ def test_a_bad_wish_is_one_line_and_writes_nothing(arguments, says, tmp_path, ca
         Mesh(organ.vertices_mm, organ.faces[organ.triangles_mm[:, :, 2].mean(1) < 0]),
         tmp_path / "half.ply",
     )
+    write_ply(ball(7.0, 2), tmp_path / "small.ply")
+    files = sorted(path.name for path in tmp_path.iterdir())
     assert new("scene", *arguments) == 2
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "half.ply"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == files
+
+
+@pytest.mark.parametrize("up", UP)
+def test_the_axis_that_the_user_names_points_up(up, tmp_path):
+    """A lesion given in the file's own frame lies on top of the world's organ."""
+    write_ply(ball(60.0, 3), tmp_path / "ball.ply")
+    sign, axis = (-1.0 if up[0] == "-" else 1.0), "xyz".index(up[-1])
+    lesion = tuple(sign * 60.0 * (i == axis) for i in range(3))
+    for place in ({"lesion": lesion}, {"lesion_direction": lesion}):
+        request = Request((tmp_path / "ball.ply",), ("organ",), up=up, diameter_mm=20.0, **place)
+        (site,) = choose_sites(request, prepare(request))
+        np.testing.assert_allclose(site.point_mm, [0.0, 0.0, 60.0], atol=0.5)
+        assert np.linalg.det(UP[up]) == pytest.approx(1.0)  # a mirrored organ is another patient's
+
+
+def test_gltf_comes_in_metres_with_y_up(tmp_path):
+    """As its standard has it (Khronos, glTF 2.0, 3.4)."""
+    shape = trimesh.creation.box((0.1, 0.04, 0.06))
+    shape.apply_translation((0.0, 1.0, 0.0))
+    shape.export(tmp_path / "organ.glb")
+    prepared = prepare(Request((tmp_path / "organ.glb",), ("organ",)))
+    size = np.ptp(prepared.meshes[0].bounds_mm, axis=0)
+    np.testing.assert_allclose(size, [100.0, 60.0, 40.0], rtol=1e-6)
+    assert any("y points up" in note for note in prepared.notes)
+
+
+def test_mounts_are_found_for_an_arm_of_another_length(tmp_path, monkeypatch, capsys):
+    """The laser's arm is 120 mm long and bends as an arc; the endoscope's is the default one.
+
+    A terminal is asked for the unit of the mesh, which is 12 units across.
+    """
+    spec = ArmSpec(3, 5, (0.0,) * 3, (40.0,) * 3, length_mm=120.0, diameter_mm=12.0)
+    bends = ConstantCurvature(torch.zeros(3), torch.full((3,), 40.0), key_points=5)
+    rest = torch.tensor([[0.0, 0.0, 30.0 * k] for k in range(5)])
+    bends.set_rest(rest)
+    around = 2.0 * torch.pi * torch.arange(3) / 3
+    bends.table.data[0, :2, :3] = 0.8 * torch.stack((around.cos(), around.sin()))
+    save_model(ArmModel(spec, bends, rest_mm=rest), tmp_path / "long")
+    write_ply(ball(6.0, 3), tmp_path / "ball.ply")
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.prompt", lambda question: "cm")
+    arm = f"laser={tmp_path / 'long'}"
+    assert new(tmp_path / "scene", tmp_path / "ball.ply", "--arm", arm) == 0
+    assert "PLY stores no unit" in capsys.readouterr().out
+    scene = open_scene(tmp_path / "scene")
+    assert np.ptp(scene.organ.mesh.bounds_mm[:, 0]) == pytest.approx(120.0, rel=0.01)
+    laser, endoscope = scene.spec.mount("laser"), scene.spec.mount("endoscope")
+    assert (laser.length_mm, laser.diameter_mm, endoscope.length_mm) == (120.0, 12.0, 70.0)
+    assert run(["scene", "check", str(tmp_path / "scene")]) == 0
+    # the long arm in place of the scene's own would begin inside the organ
+    with pytest.raises(InputError, match=r"is 120 mm long, and the scene .* 70 mm as the endosco"):
+        scene_world(scene, arm=tmp_path / "long")
 
 
 def test_an_existing_folder_is_kept(made, tmp_path, capsys):

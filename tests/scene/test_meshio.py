@@ -1,4 +1,9 @@
-"""Mesh files: every format gives the same mesh, units are inferred, broken files get one line."""
+"""Mesh files: one mesh from every format, no guess of the unit, one line for broken files."""
+
+import json
+import struct
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +13,15 @@ from hypothesis import strategies as st
 
 from surgisoft.errors import InputError
 from surgisoft.scene.mesh import Mesh
-from surgisoft.scene.meshio import given_unit, read_mesh, read_parts, recognise_unit, write_ply
+from surgisoft.scene.meshio import (
+    LengthUnit,
+    UnknownUnit,
+    given_unit,
+    read_mesh,
+    read_parts,
+    stored_unit,
+    write_ply,
+)
 from tests.scene.shapes import lumpy
 
 
@@ -55,27 +68,30 @@ def test_ply_keeps_every_bit(tmp_path):
     assert read_mesh(tmp_path / "m.ply").content_hash == mesh.content_hash
 
 
-@given(size=st.floats(61.0, 600.0))
-def test_the_unit_is_inferred_from_an_organs_size(size):
-    assert recognise_unit(size).unit == "mm"
-    assert recognise_unit(size / 10.0).unit == ("cm" if size < 200.0 else "mm")
-    assert recognise_unit(size / 1000.0).unit == "m"
+@given(size=st.floats(1e-3, 1e4), suffix=st.sampled_from([".stl", ".ply", ".obj", ".glb"]))
+def test_no_size_is_scaled_by_a_guess(size, suffix):
+    """A file's own unit is mm, metres for glTF; where that is no organ's size, the user decides."""
+    own = 1000.0 if suffix == ".glb" else 1.0
+    file = Path(f"organ{suffix}")
+    if 20.0 <= size * own <= 600.0:
+        assert stored_unit(file, size).mm == own
+        return
+    with pytest.raises(UnknownUnit) as stopped:
+        stored_unit(file, size)
+    assert f"--unit cm ({size * 10.0:.4g} mm)" in str(stopped.value)
 
 
 def test_a_given_unit_that_makes_no_organ_is_warned_of():
-    assert given_unit(180.0, "mm") == "'mm' as given"
-    said = given_unit(180.0, "cm")
-    assert "the mesh would be 1800 mm across; organs measure 20 to 600 mm; check --unit" in said
+    file = Path("organ.stl")
+    assert given_unit(file, 180.0, "mm", None) == LengthUnit(1.0, "mm as given (180 mm across)")
+    assert given_unit(file, 7.0, "inch", None).mm == 25.4
+    assert given_unit(file, 50.0, None, 2.5).sentence == "2.5 mm as given (125 mm across)"
+    said = given_unit(file, 180.0, "cm", None).sentence
+    assert "the mesh would be 1800 mm across; organs measure 20 to 600 mm" in said
     assert said.endswith("--unit mm would give 180 mm")
-    assert "would be 15 mm" in given_unit(15.0, "mm")
-
-
-def test_an_uncertain_unit_is_reported():
-    assert "--unit cm" in recognise_unit(35.0).sentence
-    for odd in (5000.0, 1.2, 0.004):
-        assert "uncertain" in recognise_unit(odd).sentence
-    # the nearest to a liver of 180 mm, by factor: 1.2 m, 5 m and 4 mm
-    assert [recognise_unit(odd).unit for odd in (5000.0, 1.2, 0.004)] == ["mm", "m", "m"]
+    assert "would be 15 mm" in given_unit(file, 15.0, "mm", None).sentence
+    with pytest.raises(InputError, match=r"1.8e\+05 mm across"):
+        given_unit(file, 180.0, "m", None)
 
 
 POINTS = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n" + (
@@ -113,3 +129,26 @@ def test_a_file_that_is_not_there_and_a_folder(tmp_path):
         read_parts(tmp_path / "a.stl")
     with pytest.raises(InputError, match="is a folder"):
         read_parts(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["chunk", "accessor", "json"])
+def test_a_glb_that_claims_more_than_it_holds_takes_no_memory(tmp_path, damage):
+    write(tmp_path / "a.glb", trimesh.creation.box())
+    content = bytearray((tmp_path / "a.glb").read_bytes())
+    length = struct.unpack("<I", content[12:16])[0]
+    table, rest = json.loads(content[20 : 20 + length]), content[20 + length :]
+    if damage == "accessor":
+        table["accessors"][0] = {"count": 10**9, "componentType": 5126, "type": "VEC3"}
+    text = b"[" * 10**5 if damage == "json" else json.dumps(table).encode()
+    text = text.ljust(-(-len(text) // 4) * 4)
+    body = bytearray(struct.pack("<I4s", len(text), b"JSON") + text + rest)
+    if damage == "chunk":
+        body[:4] = struct.pack("<I", 2**31)
+    head = struct.pack("<4sII", b"glTF", 2, 12 + len(body))
+    (tmp_path / "a.glb").write_bytes(head + body)
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"claims 1000000000|chunk is cut off|read as glTF"):
+        read_mesh(tmp_path / "a.glb")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6

@@ -253,7 +253,7 @@ def test_what_is_no_episode_is_one_line(tmp_path):
     with pytest.raises(InputError, match="not a complete episode"):
         load_episode(path)
     np.savez(path, table=np.array([{"format": 1}], dtype=object))
-    with pytest.raises(InputError, match="not a complete episode"):  # nothing is unpickled
+    with pytest.raises(InputError, match="holds Python objects"):  # nothing is unpickled
         load_episode(path)
     save_episode(log, path)
     whole = path.read_bytes()

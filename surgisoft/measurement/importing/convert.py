@@ -40,6 +40,7 @@ from surgisoft.measurement.importing.spec import (
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.importing.units import factor
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.log import read_log
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 
@@ -65,6 +66,12 @@ def import_files(paths: Sequence[Path], spec: ImportMap, name: str | None) -> li
         _check_names(named)
         return [_finished(part, spec) for part in named]
     return [_finished(_as_runs(parts, spec, name), spec)]
+
+
+def import_log(path: Path, name: str) -> Imported:
+    """The recording in a log of a recording, such as one that was interrupted; it needs no map."""
+    recording, lacking = read_log(path)
+    return Imported(replace(recording, name=name), [lacking] if lacking else [])
 
 
 def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path]]:

@@ -11,7 +11,7 @@ import numpy as np
 from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.units import SECONDS_PER
-from surgisoft.measurement.tables import Cells, label
+from surgisoft.measurement.tables import LARGEST, Cells, label, too_large
 
 A_COLUMN = Rule(
     "a column's name or its number, counted from 1",
@@ -125,11 +125,11 @@ class RawTable:
                 f"{self.path}: got fewer columns than the {len(self.names)} that its reader names "
                 f"({', '.join(self.names[:8])})"
             ) from error
-        if np.isinf(cells).any():
-            row, i = np.argwhere(np.isinf(cells))[0].tolist()
+        if too_large(cells).any():
+            row, i = np.argwhere(too_large(cells))[0].tolist()
             raise InputError(
                 f"{self.cells.place(row)}, column {label(self.names, positions[i])}: "
-                f"got {cells[row, i]}, expected a finite number"
+                f"got {cells[row, i]}, expected a finite number of a size below {LARGEST:g}"
             )
         return cells
 

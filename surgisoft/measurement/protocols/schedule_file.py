@@ -9,7 +9,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.protocols.protocol import Protocol
 from surgisoft.measurement.tables import DelimitedText, read_text
 
-COMMAND = re.compile(r"c(\d+)_(\w+)")
+COMMAND = re.compile(r"c([0-9]{1,6})_(\w{1,40})")
 
 
 def load_schedule(path: str | Path) -> Protocol:

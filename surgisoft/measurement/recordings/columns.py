@@ -9,8 +9,8 @@ MM_PER = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Millimetres in each unit that key points may come in."""
 
 _UNIT = r"([A-Za-z%][A-Za-z0-9%]*)"
-_ACTUATION = re.compile(rf"([pc])([1-9][0-9]*)_{_UNIT}")
-_KEY_POINT = re.compile(rf"k(0|[1-9][0-9]*)_([xyz])_{_UNIT}")
+_ACTUATION = re.compile(rf"([pc])([1-9][0-9]{{0,5}})_{_UNIT}")
+_KEY_POINT = re.compile(rf"k(0|[1-9][0-9]{{0,5}})_([xyz])_{_UNIT}")
 _CONTEXT = ("t_s", "run", "temp_C", "payload_g")
 _LOOKS_KNOWN = re.compile(
     r"\s*([pck][_ ]?[0-9].*|(t|time|temp|temperature|payload)([_ ].*)?|run(s|_id| id)?)\s*",

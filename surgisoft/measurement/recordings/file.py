@@ -14,6 +14,8 @@ import pyarrow.parquet as pq
 from surgisoft.errors import InputError
 from surgisoft.files import new_file, new_folder
 from surgisoft.measurement.recordings.columns import Layout, parse_header
+from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
+from surgisoft.measurement.recordings.log import read_log
 from surgisoft.measurement.recordings.quality import find_warnings
 from surgisoft.measurement.recordings.recording import (
     Recording,
@@ -90,6 +92,13 @@ def _in_folder(folder: Path) -> list[Path]:
 
 def _read(path: Path, warn: Warn) -> Recording:
     """One recording with every check of the format."""
+    if path.suffix == LOG_SUFFIX and path.is_file():
+        recording, lacking = read_log(path)
+        if lacking:
+            warn(f"{path}: {lacking}")
+        for found in find_warnings(recording):
+            warn(f"{path}, sample {found.sample + 1}: {found.text}")
+        return recording
     table = _open(path)
     header = f"{path}, line 1" if path.suffix == ".csv" else f"{path}"
     layout = parse_header(table.names, header)

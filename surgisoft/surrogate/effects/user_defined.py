@@ -59,7 +59,10 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     sys.modules[module_name] = module
     try:
         exec(compile(content, str(path), "exec"), module.__dict__)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        del sys.modules[module_name]
+        raise
+    except BaseException as error:
         del sys.modules[module_name]
         raise InputError(
             f"{path}: does not run ({type(error).__name__}: {str(error)[:120]}); correct it"
@@ -95,7 +98,9 @@ def load_offered(name: str) -> type[Effect]:
     entry = offered()[name]
     try:
         kind = entry.load()
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise InputError(
             f"effect '{name}' ({entry.value}): does not load ({type(error).__name__}: "
             f"{str(error)[:120]}); correct or remove that package"

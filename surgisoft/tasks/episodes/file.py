@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -12,11 +14,19 @@ from typing import Any
 
 import numpy as np
 
+from surgisoft.config import describe
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
+from surgisoft.tasks.episodes.consistency import contradiction
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import ArmLog, BeamLog, BodyLog, CameraLog, DoseLog, Event
 
+MOST_BYTES = 1 << 29
+"""Most bytes that the arrays of an episode may claim; ten minutes of two arms are a tenth of it."""
+_HEADERS: dict[tuple[int, int], Any] = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 SUFFIX = ".npz"
 """Suffix of the file of an episode."""
 FORMAT = "surgisoft episode 1"
@@ -44,18 +54,55 @@ def load_episode(path: str | Path) -> EpisodeLog:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; {wanted}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = _arrays(path)
+    except (OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read as .npz ({error}); {wanted}") from None
+    except (zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as .npz ({error}); {wanted}") from None
+    try:
         table = json.loads(arrays.pop("table").tobytes())
         if table["format"] != FORMAT:
-            raise InputError(f"{path}: format '{table['format']}', expected '{FORMAT}'")
-        return _log(_joined(table["log"], arrays))
-    except (OSError, EOFError, zipfile.BadZipFile):
-        raise InputError(f"{path}: cannot be read as .npz; {wanted}") from None
+            raise InputError(f"{path}: format {describe(table['format'])}, expected '{FORMAT}'")
+        log = _log(_joined(table["log"], arrays))
     except InputError:
         raise
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
         raise InputError(f"{path}: is not a complete episode; {wanted}") from None
+    complaint = contradiction(log)
+    if complaint is not None:
+        raise InputError(f"{path}: {complaint}; {wanted}")
+    return log
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, none of which claims more than the file holds.
+
+    A ValueError states the first one that does; nothing is allocated for it.
+    """
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        total = sum(member.file_size for member in members)
+        if total > MOST_BYTES:
+            raise ValueError(f"it claims {total} bytes, expected at most {MOST_BYTES}")
+        for member in members:
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                if version not in _HEADERS:
+                    raise ValueError(f"'{member.filename}' has an unknown version of .npy")
+                shape, fortran, kind = _HEADERS[version](file)
+                claimed = math.prod(shape) * kind.itemsize
+                if kind.hasobject:
+                    raise ValueError(f"'{member.filename}' holds Python objects, not numbers")
+                if min(shape, default=0) < 0 or claimed > member.file_size:
+                    raise ValueError(f"'{member.filename}' claims an array that is not in it")
+                content = file.read(claimed)
+            if len(content) < claimed:
+                raise ValueError(f"'{member.filename}' is cut off")
+            flat = np.frombuffer(content, kind)
+            order = "F" if fortran else "C"
+            arrays[member.filename.removesuffix(".npy")] = flat.reshape(shape, order=order)
+    return arrays
 
 
 def _split(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Any:

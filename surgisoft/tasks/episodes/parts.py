@@ -11,6 +11,8 @@ import numpy as np
 
 LEVELS = ("info", "warning", "error")
 """How grave an event is."""
+ROLES = ("organ", "keep-out", "support")
+"""Roles of bodies, as in a scene."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,7 @@
 """Reach tables of a scene's arms: centrelines of the arm models as plain geometry."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +11,7 @@ from surgisoft.config import Where, read_toml
 from surgisoft.errors import InputError
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import FILE, MountSpec
+from surgisoft.scene.spec import FILE, TOOLS, MountSpec
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.reach import model_table
@@ -30,6 +32,33 @@ def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None =
     (axes, lines, directions), spec = _default_table() if place is None else _table(place)
     _check_length(mount, spec, where)
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
+
+
+def blank_mounts(models: Mapping[str, str] | None = None) -> dict[str, MountSpec]:
+    """Mounts without a place yet for each tool, with the length and diameter of its arm model.
+
+    models: the arm model of a tool, `default` or a fitted model's folder; a tool that is left out
+    has the default arm. Raises InputError where a folder holds no model, or one without a length.
+    """
+    mounts = {}
+    for tool in TOOLS:
+        name = (models or {}).get(tool, "default")
+        mount = MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        if name != "default":
+            spec = load_model(name).spec
+            if spec.length_mm is None:
+                raise InputError(
+                    f"{name}: the arm model states no length; fit it to recordings whose sidecar "
+                    "has length_mm"
+                )
+            mount = replace(
+                mount,
+                arm=str(Path(name).absolute()),
+                length_mm=spec.length_mm,
+                diameter_mm=spec.diameter_mm or mount.diameter_mm,
+            )
+        mounts[tool] = mount
+    return mounts
 
 
 def reaches_of(scene: Scene) -> dict[str, ArmReach]:

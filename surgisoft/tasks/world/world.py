@@ -18,6 +18,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.scene.folder import Scene, open_scene
+from surgisoft.scene.spec import MountSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.world.arm import (
@@ -36,6 +37,10 @@ from surgisoft.tasks.world.scene import (
     SceneEngineConfig,
     SceneState,
 )
+
+OTHER_LENGTH = 0.1
+"""An arm that takes the place of a scene's own may differ by this share of the mount's length: a
+longer one begins inside the organ, a shorter one does not reach the lesion."""
 
 
 @dataclass(frozen=True)
@@ -192,10 +197,25 @@ def scene_world(
     for mount in scene.spec.mounts:
         pose = torch.tensor(mount.pose(), dtype=torch.float32)
         name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
-        arms[mount.tool] = Mounted(named_arm(name, device, folder), pose, shaft_mm=mount.shaft_mm)
+        model = named_arm(name, device, folder)
+        if arm is not None:
+            _check_length(model, mount, scene, arm)
+        arms[mount.tool] = Mounted(model, pose, shaft_mm=mount.shaft_mm)
     vary = config.randomisation
     around = SceneEngine(scene, config.scene_engine, device, engine, vary)
     return World(arms, config, around, device)
+
+
+def _check_length(model: ArmModel, mount: MountSpec, scene: Scene, arm: str | Path) -> None:
+    """Raise where the mounts of a scene were found for an arm of another length."""
+    length = model.spec.length_mm
+    if length is None or abs(length - mount.length_mm) <= OTHER_LENGTH * mount.length_mm:
+        return
+    raise InputError(
+        f"arm '{arm}' is {length:g} mm long, and the scene '{scene.spec.name}' mounts an arm of "
+        f"{mount.length_mm:g} mm as the {mount.tool}; make a scene for it: surgisoft scene new "
+        f"MESH --arm {arm} -o DIR"
+    )
 
 
 def named_arm(

@@ -219,3 +219,18 @@ def test_installed_packages_offer_effects_and_hide_none_of_ours(monkeypatch):
     monkeypatch.setattr(user_defined, "offered", lambda: {"seep": wrong})
     with pytest.raises(InputError, match="expected a subclass of"):
         make_effect("seep", FACTS)
+
+
+@pytest.mark.parametrize("raised", ["GeneratorExit()", "type('Odd', (BaseException,), {})('no')"])
+def test_a_file_that_raises_no_exception_is_one_line(tmp_path, raised):
+    """What derives from BaseException alone passes `except Exception`."""
+    (tmp_path / "odd.py").write_text(f"raise {raised}")
+    with pytest.raises(InputError, match=r"odd.py: does not run \((GeneratorExit|Odd)"):
+        register_effect_file(tmp_path / "odd.py")
+    assert "odd" not in user_defined.FILES
+
+
+def test_ctrl_c_in_a_file_is_ctrl_c(tmp_path):
+    (tmp_path / "slow.py").write_text("raise KeyboardInterrupt")
+    with pytest.raises(KeyboardInterrupt):
+        register_effect_file(tmp_path / "slow.py")

@@ -1,0 +1,329 @@
+"""Runs of the fuzzer: worker processes with limits, the record of what they find.
+
+The parent imports the readers and forks a worker for each batch of inputs, so that a crash, a hang
+or an allocation ends a worker and not the run. Input number i of a target is the same for the same
+seed and the same corpus.
+"""
+
+import contextlib
+import json
+import mmap
+import os
+import random
+import resource
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.fuzz.mutations import mutated
+from benchmarks.fuzz.targets import TARGETS, Target
+from surgisoft.errors import InputError
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What reading one file may take."""
+
+    hang_s: float = 5.0
+    """Processor time of one input, s."""
+    wall_s: float = 120.0
+    """Wall time of one input, s: for a reader that waits; a loaded machine has to stay below."""
+    memory_bytes: int = 1 << 30
+    """Address space beyond that of a worker which has read the valid files."""
+    batch_s: float = 30.0
+    """Time of one worker, s."""
+    message: int = 1000
+    """Longest message, characters."""
+
+
+READ_ONLY_IMPORTS = (
+    "numba",
+    "pyarrow.csv",
+    "pyarrow.parquet",
+    "rerun",
+    "torch",
+    "trimesh",
+    "surgisoft.agents.learned",
+    "surgisoft.agents.report",
+    "surgisoft.agents.training",
+    "surgisoft.diagnosis.decision",
+    "surgisoft.experiments.plan",
+    "surgisoft.measurement.importing",
+    "surgisoft.measurement.protocols",
+    "surgisoft.replay.episode_view",
+    "surgisoft.replay.show",
+    "surgisoft.scene.folder",
+)
+"""Modules that the parent imports once for all workers."""
+
+
+def fuzz(
+    names: Sequence[str],
+    seconds: float,
+    workers: int,
+    seed: int,
+    limits: Limits,
+    note: Callable[[dict], None],
+) -> None:
+    """Fuzz the named targets for some time; `note` is given the record of each batch."""
+    os.environ.update(OMP_NUM_THREADS="1", MALLOC_ARENA_MAX="1")
+    for name in READ_ONLY_IMPORTS:
+        __import__(name)
+    with scratch() as folder:
+        corpus = folder / "corpus"
+        for name in names:
+            in_child(lambda name=name: make_corpus(corpus, name))
+        end = time.monotonic() + seconds
+        queue, position = turns_of(names), dict.fromkeys(names, 0)
+        running: dict[int, Batch] = {}
+        while time.monotonic() < end or running:
+            busy = {batch.target for batch in running.values()}
+            if len(running) < workers and time.monotonic() < end:
+                name = next(name for name in queue if name not in busy or len(names) <= len(busy))
+                batch = Batch(name, seed, position[name], corpus / name, folder, limits, end)
+                running[batch.start()] = batch
+                # Numbers of another worker of the same target must not overlap.
+                position[name] += 1_000_000 if len(names) < workers else 0
+                continue
+            for pid in list(running):
+                record = running[pid].finished()
+                if record is not None:
+                    done = running.pop(pid)
+                    position[done.target] = max(position[done.target], record.pop("next"))
+                    note(record)
+            time.sleep(0.1)
+
+
+def turns_of(names: Sequence[str]) -> Iterator[str]:
+    """The targets in turn for ever, each as often as its weight says."""
+    due = dict.fromkeys(names, 0.0)
+    while True:
+        name = min(due, key=due.__getitem__)
+        due[name] += 1.0 / TARGETS[name].weight
+        yield name
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A folder in memory where there is one, deleted at the end."""
+    memory = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+        yield Path(folder)
+
+
+def in_child(call: Callable[[], None]) -> None:
+    """Run a call in a forked process, so that the parent starts no threads."""
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            call()
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    if os.waitpid(pid, 0)[1] != 0:
+        raise RuntimeError("the corpus could not be made")
+
+
+def make_corpus(corpus: Path, name: str) -> None:
+    """The valid files of a target; they must be readable."""
+    target = TARGETS[name]
+    with contextlib.redirect_stdout(sys.stderr), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        target.make(corpus / name)
+        for sample in samples_of(corpus / name):
+            target.read(sample)
+
+
+def samples_of(folder: Path) -> list[Path]:
+    """The samples of a corpus."""
+    return sorted(path for path in folder.iterdir() if path.is_dir())
+
+
+class Inputs:
+    """The inputs of a target by number, put into a folder one after another."""
+
+    def __init__(self, target: Target, corpus: Path, work: Path, seed: int):
+        self.seed, self.samples = seed, []
+        for sample in samples_of(corpus):
+            copy = work / sample.name
+            shutil.copytree(sample, copy)
+            files = sorted({f for p in target.mutable for f in copy.rglob(p) if f.is_file()})
+            self.samples.append((copy, {file: file.read_bytes() for file in files}))
+
+    @contextlib.contextmanager
+    def put(self, number: int) -> Iterator[Path]:
+        """The sample with the mutated files of input `number`; whole again afterwards."""
+        own = random.Random(f"{self.seed} {number}")
+        sample, files = own.choice(self.samples)
+        chosen = own.sample(list(files), min(len(files), own.choice((1, 1, 1, 1, 2))))
+        for file in chosen:
+            file.write_bytes(mutated(own, file.name, files[file]))
+        try:
+            yield sample
+        finally:
+            for file in chosen:
+                file.write_bytes(files[file])
+
+
+@dataclass
+class Batch:
+    """One worker and its inputs."""
+
+    target: str
+    seed: int
+    first: int
+    corpus: Path
+    folder: Path
+    limits: Limits
+    end: float
+
+    def start(self) -> int:
+        """Fork the worker; returns its process id."""
+        self.now = mmap.mmap(-1, 16)
+        self.now[:16] = struct.pack("<qd", self.first, time.monotonic())
+        self.out = Path(tempfile.mkdtemp(dir=self.folder))
+        sys.stdout.flush()
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                self._work()
+                os._exit(0)
+            except BaseException:
+                traceback.print_exc()
+                os._exit(70)
+        return self.pid
+
+    def finished(self) -> dict | None:
+        """The record of the worker when it has ended; None while it runs."""
+        number, since = struct.unpack("<qd", self.now[:16])
+        stuck = time.monotonic() - since > self.limits.wall_s
+        if stuck:
+            os.kill(self.pid, signal.SIGKILL)
+        pid, status = os.waitpid(self.pid, 0 if stuck else os.WNOHANG)
+        if pid == 0:
+            return None
+        findings = [json.loads(line) for line in self._lines()]
+        code = os.waitstatus_to_exitcode(status)
+        if code != 0:
+            kind = "hang" if stuck or -code in (signal.SIGPROF, signal.SIGXCPU) else "crash"
+            name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            findings.append(_finding(self.target, number, kind, name, "", name))
+            number += 1
+        shutil.rmtree(self.out, ignore_errors=True)
+        return {
+            "target": self.target,
+            "first": self.first,
+            "inputs": number - self.first,
+            "next": number,
+            "findings": findings,
+        }
+
+    def _lines(self) -> list[str]:
+        file = self.out / "findings.jsonl"
+        return file.read_text().splitlines() if file.is_file() else []
+
+    def _work(self) -> None:
+        target = TARGETS[self.target]
+        warnings.simplefilter("ignore")
+        sink = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, 1)
+        os.dup2(sink, 2)
+        inputs = Inputs(target, self.corpus, self.out / "work", self.seed)
+        for sample, _ in inputs.samples:
+            target.read(sample)
+        with (self.out / "findings.jsonl").open("w") as file:
+            _limit(self.limits)
+            number, end = self.first, min(self.end, time.monotonic() + self.limits.batch_s)
+            while time.monotonic() < end:
+                self.now[:16] = struct.pack("<qd", number, time.monotonic())
+                with inputs.put(number) as sample:
+                    signal.setitimer(signal.ITIMER_PROF, self.limits.hang_s)
+                    found = examine(self.target, number, sample, self.limits)
+                    signal.setitimer(signal.ITIMER_PROF, 0.0)
+                if found is not None:
+                    file.write(json.dumps(found) + "\n")
+                    file.flush()
+                number += 1
+            self.now[:16] = struct.pack("<qd", number, time.monotonic())
+
+
+def _limit(limits: Limits) -> None:
+    """Limit the address space, and let the timer of processor time end the process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + limits.memory_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+
+
+def examine(name: str, number: int, sample: Path, limits: Limits) -> dict | None:
+    """Read one sample; None where it ends in a value or in one line."""
+    try:
+        TARGETS[name].read(sample)
+    except InputError as error:
+        if _out_of_memory(error):
+            return _finding(name, number, "memory", "InputError", _place(error), str(error))
+        bad = "\n" in str(error) or len(str(error)) > limits.message or not str(error).isprintable()
+        if bad:
+            return _finding(name, number, "message", "InputError", _place(error), repr(str(error)))
+    except OSError:
+        pass  # the command line prints these in one line, with the file
+    except MemoryError as error:
+        return _finding(name, number, "memory", "MemoryError", _place(error), str(error))
+    except BaseException as error:
+        kind = type(error).__name__
+        return _finding(name, number, "traceback", kind, _place(error), str(error))
+    return None
+
+
+def _out_of_memory(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _place(error: BaseException) -> str:
+    """The innermost line of the project, and the innermost line at all."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "/surgisoft/" in frame.filename]
+    last = [own[-1]] if own else []
+    if frames and frames[-1] not in last:
+        last.append(frames[-1])
+    return " < ".join(
+        f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno}" for frame in reversed(last)
+    )
+
+
+def _finding(target: str, number: int, kind: str, error: str, place: str, message: str) -> dict:
+    text = message[:300].encode("utf-8", "replace").decode()
+    about = {"target": target, "input": number, "kind": kind}
+    return about | {"type": error, "place": place, "message": text}
+
+
+def again(name: str, seed: int, number: int, keep: Path | None) -> None:
+    """Read one input in this process, without limits, so that its traceback is shown."""
+    with scratch() as folder:
+        make_corpus(folder / "corpus", name)
+        inputs = Inputs(TARGETS[name], folder / "corpus" / name, folder / "work", seed)
+        with inputs.put(number) as sample:
+            if keep is not None:
+                shutil.copytree(sample, keep)
+            try:
+                TARGETS[name].read(sample)
+            except InputError as error:
+                print(f"one line: {error}")
+            else:
+                print("it is read")

@@ -1,0 +1,77 @@
+"""`surgisoft rig`: the rigs that commands can drive, their options, and a pre-flight check."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.inputs import check_model
+from surgisoft.cli.options import EffectFiles
+
+commands = typer.Typer(no_args_is_help=True, help="Rigs that commands can drive: list, check.")
+app.add_typer(commands, name="rig")
+
+
+@commands.command("list")
+def list_(
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="Show this rig only, or package.module:object."),
+    ] = None,
+) -> None:
+    """List the rigs and the options of each: NAME:option=value,..."""
+    from surgisoft.rig.registry import (
+        SIMULATED,
+        rig_about,
+        rig_names,
+        rig_options,
+        safety_options,
+    )
+
+    names = [name] if name else rig_names()
+    for each in names:
+        print(f"{each}: {rig_about(each)}")
+        _show(rig_options(each).values())
+    if set(names) - set(SIMULATED):
+        print("every rig that is not simulated also has the limits of the safety wrapper:")
+        _show(safety_options().values())
+
+
+def _show(options) -> None:
+    from surgisoft.rig.registry import REQUIRED, describe_kind
+
+    for option in options:
+        default = "required" if option.default is REQUIRED else f"default {option.shown}"
+        about = f"{option.about}; " if option.about else ""
+        print(f"  {option.name:14s}{about}{describe_kind(option.kind)}, {default}")
+
+
+@commands.command("check")
+def check(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME[:option=value,...]", help="The rig, as in --rig.")
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="MODEL", help="Model of the arm that is on the rig.")
+    ] = "default",
+    effect_files: EffectFiles = None,
+) -> None:
+    """Try each chamber of a rig alone, a little, and compare the motion with a model's prediction.
+
+    It finds swapped tubes, chambers that do not move and a frame of the cameras that is turned.
+    """
+    check_model(Path(model))
+    from surgisoft.rig import guarded, open_rig
+    from surgisoft.rig.preflight import preflight
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.reach import steady_key_points
+
+    arm = load_model(model)
+    with guarded(open_rig(name)) as rig:
+        found = preflight(rig, lambda pressures: steady_key_points(arm, pressures))
+    print("chamber   tip moved   predicted   cosine")
+    for i, (moved, predicted) in enumerate(zip(found.moved_mm, found.predicted_mm, strict=True)):
+        print(f"{i + 1:7d} {moved:8.2f} mm {predicted:8.2f} mm {found.cosines[i, i]:8.2f}")
+    found.require()
+    print("the arm moves as predicted")

@@ -1,0 +1,261 @@
+"""A recording's log: samples are appended to a file as they are measured, and survive a power cut.
+
+The log is text, one JSON object a line. The first line describes the recording, each further line
+is one sample of sensors and cameras. The program hands every line to the system at once, and a
+thread has the disk write it out every `SYNC_S`, so that a crash of the program loses nothing and a
+power cut less than a second. A last line that is torn is left out when the log is read.
+"""
+
+import contextlib
+import json
+import os
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from surgisoft.errors import InputError
+from surgisoft.files import json_safe
+from surgisoft.measurement.recordings.recording import ArmInfo, Recording
+
+SUFFIX = ".jsonl"
+"""Suffix of a log's file."""
+FORMAT = "surgisoft recording log"
+"""Name of the format in the first line."""
+VERSION = 1
+"""Version of the format."""
+SYNC_S = 0.5
+"""Time between two calls that have the disk write the log out [s]."""
+
+
+@dataclass(frozen=True)
+class LogHeader:
+    """What the first line of a log states."""
+
+    name: str
+    """Name of the recording."""
+    kind: str
+    """"continuous", or "settled" where the samples of a row are averaged."""
+    unit: str
+    """Unit of the actuation."""
+    chambers: int
+    """Number m of actuation channels."""
+    key_points: int
+    """Number n of key points."""
+    arm: ArmInfo
+    """Size of the arm."""
+    gravity: list[float] | None = None
+    """Unit vector along the weight, arm base frame."""
+    payload_g: float | None = None
+    """Known mass at the arm [g]."""
+    note: str = ""
+    """Free text, for people."""
+    rows: int | None = None
+    """Number of rows that the whole recording will have; None where it is open."""
+
+
+class RecordingLog:
+    """A log that is being written."""
+
+    def __init__(self, file: TextIO, header: LogHeader) -> None:
+        self._file = file
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._keep_synced, daemon=True)
+        self._line({"format": FORMAT, "version": VERSION, **asdict(header)})
+        self._thread.start()
+
+    def sample(
+        self,
+        row: int,
+        run: int,
+        t_s: float,
+        measured: np.ndarray,
+        key_points_mm: np.ndarray,
+        commanded: np.ndarray | None = None,
+        temp_C: float | None = None,
+    ) -> None:
+        """Append one sample; several of one row are one averaged sample of the recording.
+
+        run: id of its run. measured, commanded: (m,). key_points_mm: (n, 3), NaN where missing.
+        """
+        found: dict[str, Any] = {"row": row, "run": run, "t_s": t_s, "p": measured}
+        if commanded is not None:
+            found["c"] = commanded
+        found["k"] = key_points_mm
+        if temp_C is not None:
+            found["temp_C"] = temp_C
+        self._line(found)
+
+    def close(self) -> None:
+        """Write the log out; it stays where it is."""
+        self._over.set()
+        self._thread.join()
+        if not self._file.closed:
+            self._sync()
+            self._file.close()
+
+    def _line(self, content: dict[str, Any]) -> None:
+        self._file.write(json.dumps(json_safe(content), separators=(",", ":")) + "\n")
+        self._file.flush()
+
+    def _keep_synced(self) -> None:
+        while not self._over.wait(SYNC_S):
+            self._sync()
+
+    def _sync(self) -> None:
+        with contextlib.suppress(OSError, ValueError):  # a device that cannot, or closed meanwhile
+            os.fsync(self._file.fileno())
+
+
+@contextlib.contextmanager
+def recording_log(
+    path: str | Path, header: LogHeader, force: bool = False
+) -> Iterator[RecordingLog]:
+    """Begin a log; the file stays when the block ends, however it ends."""
+    path = Path(path)
+    if path.exists() and not force:
+        raise InputError(
+            f"{path}: the log of an interrupted recording is there; use it ('surgisoft recording "
+            f"{path}' reads it), remove it, or use --force"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8") as file:
+        log = RecordingLog(file, header)
+        try:
+            yield log
+        finally:
+            log.close()
+
+
+def average(frames: np.ndarray) -> np.ndarray:
+    """Mean of (P, F, ...) over F, frame by frame; missing values are left out."""
+    total = np.zeros_like(frames[:, 0])
+    count = np.zeros(total.shape, np.int64)
+    for k in range(frames.shape[1]):
+        known = np.isfinite(frames[:, k])
+        total += np.where(known, frames[:, k], 0.0)
+        count += known
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def read_log(path: str | Path) -> tuple[Recording, str]:
+    """The recording in a log, and what is missing of it in words (empty: nothing).
+
+    Raises InputError for a file that is no log, or holds no sample.
+    """
+    path = Path(path)
+    lines, torn = _lines(path)
+    header = _header(path, lines[0])
+    rows: dict[int, list[dict]] = {}
+    for number, line in enumerate(lines[1:], 2):
+        _check_sample(path, number, line, header)
+        rows.setdefault(line["row"], []).append(line)
+    if not rows:
+        raise InputError(f"{path}: the log has no sample yet; expected at least one")
+    ordered = list(rows.values())
+
+    def column(name: str, *shape: int) -> np.ndarray:
+        return np.array([average(_floats(group, name, shape))[0] for group in ordered])
+
+    t_s = column("t_s")
+    recording = Recording(
+        name=header.name,
+        t_s=t_s - t_s[0],
+        measured=column("p", header.chambers),
+        key_points_mm=column("k", header.key_points, 3),
+        commanded=_last(ordered, "c", header.chambers),
+        run=np.array([group[-1]["run"] for group in ordered], np.int64),
+        unit=header.unit,
+        temp_C=column("temp_C") if all("temp_C" in g[0] for g in ordered) else None,
+        payload_g=None if header.payload_g is None else np.full(len(t_s), header.payload_g),
+        arm=header.arm,
+        gravity=None if header.gravity is None else np.array(header.gravity),
+        kind=header.kind,
+        note=header.note,
+        source=path,
+    )
+    lacking = []
+    if header.rows is not None and len(rows) < header.rows:
+        lacking.append(f"it was interrupted after {len(rows)} of {header.rows} samples")
+    if torn:
+        lacking.append("its last line is torn and left out")
+    return recording, "; ".join(lacking)
+
+
+def _lines(path: Path) -> tuple[list[dict], bool]:
+    """The JSON objects of the file's lines, and whether the last one was torn and left out."""
+    found: list[dict] = []
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    raw = text.split(b"\n")
+    torn = raw[-1] != b""
+    raw.pop()
+    if torn:  # whole but for the line's end, or torn inside
+        with contextlib.suppress(ValueError):
+            json.loads(text.rpartition(b"\n")[2])
+            raw.append(text.rpartition(b"\n")[2])
+            torn = False
+    while raw and not raw[-1].strip(b"\0 "):  # blocks that the disk had reserved, not written
+        raw.pop()
+    for number, line in enumerate(raw, 1):
+        try:
+            found.append(json.loads(line))
+        except ValueError as error:
+            if number == len(raw) and found:
+                return found, True
+            raise InputError(
+                f"{path}, line {number}: not a line of a {FORMAT}, expected a JSON object"
+            ) from error
+        if not isinstance(found[-1], dict):
+            raise InputError(f"{path}, line {number}: expected a JSON object, not a value")
+    if not found:
+        raise InputError(f"{path}: is empty, expected a {FORMAT}")
+    return found, torn
+
+
+def _header(path: Path, first: dict) -> LogHeader:
+    if first.get("format") != FORMAT:
+        raise InputError(f"{path}, line 1: no {FORMAT}; 'surgisoft import' reads other files")
+    if first.get("version") != VERSION:
+        raise InputError(
+            f"{path}, line 1: version {first.get('version')}, expected {VERSION}; use the "
+            "surgisoft that wrote it"
+        )
+    fields = {name: value for name, value in first.items() if name not in ("format", "version")}
+    try:
+        return LogHeader(**{**fields, "arm": ArmInfo(**fields["arm"])})
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}, line 1: not a whole header ({error})") from error
+
+
+def _check_sample(path: Path, number: int, line: dict, header: LogHeader) -> None:
+    shapes = {"row": (), "run": (), "t_s": (), "p": (header.chambers,)}
+    shapes["k"] = (header.key_points, 3)
+    if "c" in line:
+        shapes["c"] = (header.chambers,)
+    for name, shape in shapes.items():
+        try:
+            good = np.shape(np.array(line[name], np.float64)) == shape
+        except (KeyError, TypeError, ValueError):
+            good = False
+        if not good:
+            raise InputError(
+                f"{path}, line {number}: '{name}' is {line.get(name)!r:.60}, expected numbers of "
+                f"shape {shape}"
+            )
+
+
+def _floats(group: list[dict], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """(1, F, *shape) values of the F samples of one row; null is NaN."""
+    return np.array([line[name] for line in group], np.float64).reshape(1, len(group), *shape)
+
+
+def _last(rows: list[list[dict]], name: str, size: int) -> np.ndarray | None:
+    if any(name not in group[-1] for group in rows):
+        return None
+    return np.array([group[-1][name] for group in rows], np.float64).reshape(len(rows), size)

@@ -1,0 +1,425 @@
+"""Rigs by name: `NAME[:option=value,...]`, with options that are typed and checked.
+
+A rig is opened by a callable whose keyword parameters are its options: a class, a dataclass or a
+function, with an annotation of `str`, `int`, `float`, `bool`, `Path`, or a tuple of one of them,
+for each parameter. The package's rigs are in `RIGS`. Another package offers one in the entry point
+group `surgisoft.rigs`; any other callable is named as `package.module:object`.
+"""
+
+import importlib
+import importlib.util
+import inspect
+import math
+import os
+import re
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.interface import Rig, is_simulated
+from surgisoft.rig.safety import SafeRig, Safety
+from surgisoft.rig.virtual import MOUNT, VirtualRig
+
+GROUP = "surgisoft.rigs"
+"""Entry point group of rigs in other packages."""
+LIST_SEPARATOR = "/"
+"""Separates the items of an option with several values: `gravity=0/0/1`."""
+
+Gravity = Annotated[
+    tuple[float, float, float], "direction of weight, arm base frame before the roll"
+]
+HiddenEffects = Annotated[tuple[str, ...], "hidden effects, NAME or NAME:AMPLITUDE"]
+RobotSeed = Annotated[int, "seed of the robot"]
+NoiseSeed = Annotated[int, "seed of the noise of sensors and cameras"]
+RollDeg = Annotated[float, "rotation of the base about its axis [deg]"]
+PayloadG = Annotated[float, "known mass at the tip [g]"]
+NoiseFactor = Annotated[float, "factor on all noise of sensors and cameras"]
+
+
+def virtual(
+    seed: RobotSeed = 0,
+    noise_seed: NoiseSeed = 0,
+    hidden: HiddenEffects = (),
+    gravity: Gravity = MOUNT,
+    roll_deg: RollDeg = 0.0,
+    payload_g: PayloadG = 0.0,
+    noise: NoiseFactor = 1.0,
+) -> Rig:
+    """The project's own simulated bench: a quasi-static rod, syringe pumps, motion capture."""
+    return VirtualRig(
+        seed,
+        take=noise_seed,
+        hidden=tuple(hidden_effects(hidden)),
+        gravity=gravity,
+        roll_deg=roll_deg,
+        payload_g=payload_g,
+        noise=noise,
+    )
+
+
+def elastica(
+    seed: RobotSeed = 0,
+    noise_seed: NoiseSeed = 0,
+    hidden: HiddenEffects = (),
+    gravity: Gravity | None = None,
+    roll_deg: RollDeg = 0.0,
+    payload_g: PayloadG = 0.0,
+    noise: NoiseFactor = 1.0,
+    elements: Annotated[int, "elements of the rod"] = 12,
+) -> Rig:
+    """A simulated bench with PyElastica's Cosserat rod: other robots, other physics."""
+    return _elastica().ElasticaRig(
+        seed,
+        take=noise_seed,
+        hidden=tuple(hidden_effects(hidden)),
+        gravity=gravity,
+        roll_deg=roll_deg,
+        payload_g=payload_g,
+        noise=noise,
+        elements=elements,
+    )
+
+
+RIGS: dict[str, Callable[..., Rig]] = {"virtual": virtual, "elastica": elastica}
+"""The rigs of this package by name."""
+SIMULATED = ("virtual", "elastica")
+"""Those of them that are simulated, with hidden effects."""
+
+
+def hidden_of(name: str) -> dict[str, Any]:
+    """The hidden effects of the simulated rig of a name; each has a `place` and `about`."""
+    name = parse_rig(name).name
+    if name == "virtual":
+        return HIDDEN
+    if name == "elastica":
+        return _elastica().HIDDEN
+    if name not in rig_names():
+        raise unknown_name("rig", name, rig_names())
+    raise InputError(f"rig '{name}' has no hidden effects; {' and '.join(SIMULATED)} have")
+
+
+def _elastica() -> ModuleType:
+    """The package of the PyElastica rig; raises InputError where PyElastica is not installed."""
+    if importlib.util.find_spec("elastica") is None:
+        raise InputError(
+            "the rig 'elastica' needs PyElastica, which is not installed: "
+            "pip install 'surgisoft[elastica]'"
+        )
+    return importlib.import_module("surgisoft.rig.elastica")
+
+
+def hidden_effects(
+    given: Iterable[str | tuple[str, float]] | None,
+) -> list[tuple[str, float]]:
+    """Hidden effects as (name, amplitude), from text such as `creep:0.5`; default amplitude 1.
+
+    Raises InputError for an amplitude that is no number.
+    """
+    found = []
+    for item in given or ():
+        if not isinstance(item, str):
+            found.append((item[0], float(item[1])))
+            continue
+        name, colon, strength = item.partition(":")
+        try:
+            found.append((name, float(strength) if colon else 1.0))
+        except ValueError:
+            raise InputError(f"hidden effect '{item}': expected NAME or NAME:AMPLITUDE") from None
+    return found
+
+
+@dataclass(frozen=True)
+class RigText:
+    """What a text `NAME[:option=value,...]` names."""
+
+    name: str
+    """Name of a rig, or `package.module:object`."""
+    options: Mapping[str, str]
+    """Option -> value as it was written."""
+
+
+@dataclass(frozen=True)
+class RigOption:
+    """One option of a rig."""
+
+    name: str
+    """Name of the parameter."""
+    kind: Any
+    """Type of its value: str, int, float, bool, Path, or a tuple of one of them."""
+    default: Any
+    """Value without the option; `REQUIRED` where there is none."""
+    about: str
+    """What the option means; empty where its author does not say."""
+
+    @property
+    def shown(self) -> str:
+        """The default as it is written in a rig's text."""
+        if isinstance(self.default, tuple):
+            items = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in self.default)
+            return LIST_SEPARATOR.join(items) or "none"
+        return "none" if self.default in (None, "") else str(self.default)
+
+
+REQUIRED: Any = inspect.Parameter.empty
+"""Default of an option that must be given."""
+
+
+def rig_names() -> list[str]:
+    """Names of the package's rigs and of those that other packages offer."""
+    return [*RIGS, *(name for name in _offered() if name not in RIGS)]
+
+
+def parse_rig(text: str) -> RigText:
+    """Name and options of `NAME[:option=value,...]` or `package.module:object[:...]`."""
+    name, colon, rest = text.strip().partition(":")
+    if rest and "=" not in rest.partition(":")[0] and name not in rig_names():
+        attribute, more, rest = rest.partition(":")
+        name, colon = f"{name}:{attribute}", more
+    options: dict[str, str] = {}
+    for part in rest.split(",") if colon else ():
+        option, equals, value = part.partition("=")
+        option = option.strip()
+        if not equals or not option.isidentifier():
+            raise InputError(f"rig '{text}': got '{part}', expected option=value after '{name}:'")
+        if option in options:
+            raise InputError(f"rig '{text}': option '{option}' is given twice")
+        options[option] = value.strip()
+    if not re.fullmatch(r"[\w.-]+(:[\w.]+)?", name):
+        raise InputError(
+            f"rig '{text}': expected NAME[:option=value,...] or package.module:object; "
+            f"known names are {', '.join(rig_names())}"
+        )
+    return RigText(name, options)
+
+
+def rig_factory(name: str) -> Callable[..., Rig]:
+    """The callable that opens the rig of a name; its keyword parameters are the options."""
+    if name in RIGS:
+        return RIGS[name]
+    if ":" in name:
+        return _checked_factory(name, _object(name))
+    offered = _offered()
+    if name not in offered:
+        raise unknown_name("rig", name, rig_names())
+    entry = offered[name]
+    try:
+        found = entry.load()
+    except Exception as error:
+        raise InputError(
+            f"rig '{name}' ({entry.value}): does not load ({type(error).__name__}: {error}); "
+            "correct or remove that package"
+        ) from error
+    return _checked_factory(name, found)
+
+
+def rig_options(name: str) -> dict[str, RigOption]:
+    """The options of the rig of a name, in the order of its parameters."""
+    return _options(name, rig_factory(name))
+
+
+def rig_about(name: str) -> str:
+    """The first sentence of the documentation of the rig of a name."""
+    text = inspect.getdoc(rig_factory(name)) or ""
+    return " ".join(text.partition("\n\n")[0].split())
+
+
+def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any) -> Rig:
+    """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names.
+
+    A real rig comes inside `SafeRig`, whose limits (`Safety`) are options of every real rig. Use it
+    in a block `with guarded(rig)` (`surgisoft.rig.safety`), which vents it at the end.
+    fields: options that are given apart from the text, such as `payload_g=2.0`. defaults: options
+    that count where the rig has them and nothing else gives them. Raises InputError for an unknown
+    option, a value of another type, and what the rig itself refuses.
+    """
+    asked = parse_rig(text)
+    factory = rig_factory(asked.name)
+    own = _options(asked.name, factory)
+    known = (
+        own
+        if asked.name in SIMULATED
+        else own | {name: option for name, option in safety_options().items() if name not in own}
+    )
+    unknown = [name for name in (*asked.options, *fields) if name not in known]
+    if unknown:
+        has = ", ".join(known) or "none"
+        raise InputError(f"rig '{asked.name}': unknown option '{unknown[0]}'; its options: {has}")
+    values = {
+        option: _value(asked.name, known[option], written)
+        for option, written in asked.options.items()
+    }
+    for option, value in fields.items():
+        if option in values and values[option] != value:
+            raise InputError(
+                f"rig '{asked.name}': option '{option}' is {values[option]!r} in the rig's text "
+                f"and {value!r} beside it; give it once"
+            )
+        values[option] = value
+    for option, value in (defaults or {}).items():
+        if option in known:
+            values.setdefault(option, value)
+    missing = [o.name for o in known.values() if o.default is REQUIRED and o.name not in values]
+    if missing:
+        raise InputError(
+            f"rig '{asked.name}': option '{missing[0]}' is missing; "
+            f"expected {asked.name}:{','.join(f'{name}=...' for name in missing)}"
+        )
+    limits = {option: values.pop(option) for option in list(values) if option not in own}
+    rig = factory(**values)
+    if not is_simulated(rig):
+        return SafeRig(rig, _safety(asked.name, limits))
+    if limits:
+        raise InputError(
+            f"rig '{asked.name}': option '{next(iter(limits))}' is a safety limit of real rigs, "
+            "and this one is simulated"
+        )
+    return rig
+
+
+def _safety(name: str, limits: dict[str, Any]) -> Safety:
+    try:
+        return Safety(**limits)
+    except InputError as error:
+        raise InputError(f"rig '{name}': {error}") from None
+
+
+def safety_options() -> dict[str, RigOption]:
+    """The options of the safety wrapper, which every real rig has beside its own."""
+    return _options("safety", Safety)
+
+
+def _offered() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _object(name: str) -> Any:
+    """The object `package.module:object`; modules of the working folder count, too."""
+    module_name, _, path = name.partition(":")
+    here = os.getcwd()
+    if here not in sys.path and "" not in sys.path:
+        sys.path.append(here)
+    try:
+        found: Any = importlib.import_module(module_name)
+    except Exception as error:
+        raise InputError(
+            f"rig '{name}': module '{module_name}' does not load "
+            f"({type(error).__name__}: {error}); expected package.module:object"
+        ) from error
+    for part in path.split("."):
+        if not hasattr(found, part):
+            raise InputError(f"rig '{name}': '{module_name}' has no '{path}'")
+        found = getattr(found, part)
+    return found
+
+
+def _checked_factory(name: str, found: Any) -> Callable[..., Rig]:
+    if not callable(found):
+        raise InputError(
+            f"rig '{name}': is a {type(found).__name__}; expected a class or a function that "
+            "opens the rig"
+        )
+    return found
+
+
+def _options(name: str, factory: Callable[..., Any]) -> dict[str, RigOption]:
+    target = factory.__init__ if inspect.isclass(factory) else factory
+    try:
+        hints = get_type_hints(target, include_extras=True)
+    except Exception:  # names that exist for a type checker only
+        hints = {}
+    found = {}
+    for parameter in inspect.signature(factory).parameters.values():
+        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            continue
+        if parameter.kind is parameter.POSITIONAL_ONLY:
+            raise InputError(
+                f"rig '{name}': parameter '{parameter.name}' has no name for a caller; expected "
+                "keyword parameters, which are the rig's options"
+            )
+        kind, about = _plain(hints.get(parameter.name, _of_default(parameter.default)))
+        found[parameter.name] = RigOption(parameter.name, kind, parameter.default, about)
+    return found
+
+
+def _of_default(default: Any) -> Any:
+    """Type of an option without an annotation."""
+    return str if default is REQUIRED or default is None else type(default)
+
+
+def _plain(hint: Any) -> tuple[Any, str]:
+    """The type of an annotation without `Annotated` and `None`, and the text beside it."""
+    about = ""
+    while True:
+        if get_origin(hint) is Annotated:
+            about = next((x for x in hint.__metadata__ if isinstance(x, str)), about)
+            hint = hint.__origin__
+        elif get_origin(hint) in (Union, types.UnionType):
+            rest = [part for part in get_args(hint) if part is not type(None)]
+            if len(rest) != 1:
+                return hint, about
+            hint = rest[0]
+        else:
+            return hint, about
+
+
+KINDS = {
+    str: "text",
+    int: "a whole number",
+    float: "a finite number",
+    bool: "true or false",
+    Path: "a path",
+}
+"""Types of an option's value -> their names in messages."""
+WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+"""Values of an option that is true or false."""
+
+
+def describe_kind(kind: Any) -> str:
+    """Name of the type of an option's value for people."""
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if len(parts) == 2 and parts[1] is Ellipsis:
+            return f"{_several(parts[0])} separated by '{LIST_SEPARATOR}'"
+        return f"{len(parts)} of {_several(parts[0])} separated by '{LIST_SEPARATOR}'"
+    return KINDS.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def _several(kind: Any) -> str:
+    return {str: "texts", int: "whole numbers", float: "numbers"}.get(kind, "values")
+
+
+def _value(rig: str, option: RigOption, written: str) -> Any:
+    """The value of an option from its text."""
+    kind = option.kind
+    try:
+        if get_origin(kind) is tuple:
+            parts = get_args(kind)
+            items = written.split(LIST_SEPARATOR) if written else []
+            if not (len(parts) == 2 and parts[1] is Ellipsis) and len(items) != len(parts):
+                raise ValueError
+            return tuple(_scalar(parts[0], item) for item in items)
+        return _scalar(kind, written)
+    except ValueError:
+        raise InputError(
+            f"rig '{rig}': option '{option.name}' is '{written}', expected {describe_kind(kind)}"
+        ) from None
+
+
+def _scalar(kind: Any, written: str) -> Any:
+    if kind is bool:
+        if written.lower() not in WORDS:
+            raise ValueError
+        return WORDS[written.lower()]
+    if kind is float:
+        value = float(written)
+        if not math.isfinite(value):
+            raise ValueError
+        return value
+    return kind(written) if kind in (int, Path) else written

@@ -1,0 +1,26 @@
+"""Shell completion: what the shell asks the installed command for."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"), [("surgisoft scene n", "new"), ("surgisoft diagnose --bef", "--before")]
+)
+def test_the_shell_completes_commands_and_options(words, expected):
+    asked = {
+        "_SURGISOFT_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "surgisoft"],
+        env=os.environ | asked,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.split() == [expected]

@@ -1,0 +1,144 @@
+"""Logs of recordings: what was measured survives a crash, and opens as a recording."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.measurement.protocols import Protocol
+from surgisoft.measurement.recordings import load_recording
+from surgisoft.measurement.recordings.log import LogHeader, read_log, recording_log
+from surgisoft.measurement.recordings.recording import ArmInfo
+from surgisoft.rig import VirtualRig, collect
+
+SETTLED = Protocol("p", "settled", [[5.0, 0, 0], [9.0, 0, 3], [0, 0, 7]], [0, 0, 1], None, 0.2, 0.2)
+MOVING = Protocol("w", "continuous", [[0, 0, 0], [8.0, 2, 0]], [3, 3], [0.0, 0.5])
+
+
+def same(a, b):
+    for name in ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g"):
+        one, other = getattr(a, name), getattr(b, name)
+        assert (one is None) == (other is None), name
+        if one is not None:
+            np.testing.assert_allclose(one, other, atol=1e-12, err_msg=name)
+    assert (a.kind, a.unit, a.arm, a.note, a.name) == (b.kind, b.unit, b.arm, b.note, b.name)
+    np.testing.assert_allclose(a.gravity, b.gravity)
+
+
+@pytest.mark.parametrize("protocol", [SETTLED, MOVING], ids=["settled", "continuous"])
+def test_a_log_is_the_recording(protocol, tmp_path):
+    log = tmp_path / "r.log.jsonl"
+    rig = VirtualRig(1, payload_g=1.0, hidden=[("thermal_drift", 1.0)])
+    recording = collect(rig, protocol, log=log)
+    read, lacking = read_log(log)
+    assert lacking == ""
+    same(read, recording)
+
+
+def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
+    log = tmp_path / "r.log.jsonl"
+    whole = collect(VirtualRig(1), SETTLED, log=log)
+    text = log.read_bytes()
+    lines = text.splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:10]) + lines[10][:25])
+    read, lacking = read_log(log)
+    assert lacking == "its last line is torn and left out"
+    assert read.samples == 3
+    np.testing.assert_allclose(read.measured[:2], whole.measured[:2])
+    log.write_bytes(b"".join(lines[:6]) + b"\0" * 40)
+    assert read_log(log)[1] == (
+        "it was interrupted after 2 of 3 samples; its last line is torn and left out"
+    )
+    out = tmp_path / "r.parquet"
+    assert run(["import", str(log), "-o", str(out)]) == 0
+    assert "note: it was interrupted after 2 of 3 samples" in capsys.readouterr().out
+    assert load_recording(out).samples == 2
+    with pytest.warns(UserWarning, match="interrupted after 2 of 3"):
+        assert load_recording(log).samples == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "is empty, expected a surgisoft recording log"),
+        ('{"a": 1}\n', "line 1: no surgisoft recording log"),
+        ('{"format": "surgisoft recording log", "version": 9}\n', "line 1: version 9, expected 1"),
+        ('{"format": "surgisoft recording log", "version": 1}\n', "line 1: not a whole header"),
+        ("{head}\n", "the log has no sample yet"),
+        ('{head}\n{"row": 0}\n{"row": 1}\n', "line 2: 'run' is None, expected numbers of shape"),
+        (
+            '{head}\n{"row":0,"run":0,"t_s":0,"p":[1,2],"k":[[0,0,0]]}\n{}\n',
+            r"line 2: 'p' is \[1, 2\], expected numbers of shape \(1,\)",
+        ),
+        ("{head}\nx\n{}\n", "line 2: not a line of a surgisoft recording log"),
+    ],
+)
+def test_a_file_that_is_no_whole_log_is_one_line(content, message, tmp_path):
+    path = tmp_path / "x.jsonl"
+    with recording_log(path, LogHeader("n", "settled", "kPa", 1, 1, ArmInfo())):
+        pass
+    path.write_text(content.replace("{head}", path.read_text().strip()))
+    with pytest.raises(InputError, match=message):
+        read_log(path)
+
+
+def test_a_log_that_is_there_is_not_overwritten(tmp_path):
+    log = tmp_path / "r.log.jsonl"
+    collect(VirtualRig(1), SETTLED, log=log)
+    before = log.read_text()
+    with pytest.raises(InputError, match="the log of an interrupted recording is there"):
+        collect(VirtualRig(2), SETTLED, log=log)
+    assert log.read_text() == before
+    collect(VirtualRig(2), SETTLED, log=log, force=True)
+    assert log.read_text() != before
+
+
+PROGRAM = """
+import sys, time
+sys.path.insert(0, {root!r})
+from surgisoft.rig.virtual import VirtualRig
+from surgisoft.rig.collect import collect
+from surgisoft.measurement.protocols import Protocol
+
+class Slow(VirtualRig):
+    def read(self):
+        time.sleep(0.02)
+        return super().read()
+
+collect(Slow(1), Protocol("w", "continuous", [[0, 0, 0], [8.0, 2, 0]], [0, 0], [0.0, 500.0]),
+        log={log!r})
+"""
+
+
+def test_after_kill_9_every_sample_is_there(tmp_path):
+    log = tmp_path / "r.log.jsonl"
+    child = subprocess.Popen([sys.executable, "-c", PROGRAM.format(root=os.getcwd(), log=str(log))])
+    until = time.monotonic() + 60.0
+    while time.monotonic() < until and not (log.exists() and log.read_text().count("\n") > 8):
+        time.sleep(0.05)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    recording, lacking = read_log(log)
+    assert recording.samples >= 8
+    assert f"interrupted after {recording.samples} of 10000 samples" in lacking
+    np.testing.assert_allclose(np.diff(recording.t_s), 0.05, atol=1e-9)
+
+
+def test_the_disk_is_told_to_write_while_the_recording_runs(tmp_path, monkeypatch):
+    told = []
+    real = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda number: (told.append(time.monotonic()), real(number)))
+    header = LogHeader("n", "continuous", "kPa", 1, 1, ArmInfo())
+    with recording_log(tmp_path / "x.jsonl", header) as log:
+        log.sample(0, 0, 0.0, np.zeros(1), np.zeros((1, 3)))
+        time.sleep(1.3)
+        during = len(told)
+    assert during >= 2
+    assert json.loads((tmp_path / "x.jsonl").read_text().splitlines()[1])["p"] == [0.0]

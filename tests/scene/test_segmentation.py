@@ -1,0 +1,237 @@
+"""Segmented images: surfaces of their labels in the patient's frame, whatever order voxels have."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.errors import InputError
+from surgisoft.scene.author import Request, choose_sites, prepare, ring_diameter
+from surgisoft.scene.folder import open_scene
+from surgisoft.scene.inside import winding_numbers
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.segmentation import parse_label, read_segmentation
+
+nibabel = pytest.importorskip("nibabel", reason="the extra 'segmentation' is not installed")
+nrrd = pytest.importorskip("nrrd", reason="the extra 'segmentation' is not installed")
+
+SPACING = np.array([1.5, 1.5, 2.5])
+"""Distance of the voxels along right, anterior and superior, mm."""
+ORIGIN = np.array([-70.0, -55.0, 240.0])
+"""Middle of the first voxel, RAS, mm."""
+LESION = np.array([8.0, 38.0, 300.0])
+"""Middle of the lesion, a ball with a radius of 8 mm, RAS, mm."""
+LABELS = tuple(map(parse_label, ("1:organ:liver", "2:lesion:tumour", "3:keep-out:portal")))
+
+
+def patient():
+    """(I, J, K) labels along R, A, S: an ellipsoid with a ball near its front and a tube inside."""
+    grid = np.meshgrid(*(np.arange(n) for n in (92, 76, 50)), indexing="ij")
+    x, y, z = (ORIGIN[i] + SPACING[i] * grid[i] for i in range(3))
+    labels = ((x / 60) ** 2 + (y / 50) ** 2 + ((z - 300) / 50) ** 2 < 1).astype(np.uint8)
+    labels[(x - LESION[0]) ** 2 + (y - LESION[1]) ** 2 + (z - LESION[2]) ** 2 < 64.0] = 2
+    labels[(y**2 + (z - 290.0) ** 2 < 25.0) & (np.abs(x) < 65.0)] = 3
+    labels[:1, :1, :1] = 3  # a stray voxel
+    return labels
+
+
+def to_ras():
+    matrix = np.diag([*SPACING, 1.0])
+    matrix[:3, 3] = ORIGIN
+    return matrix
+
+
+def reordered(labels, matrix, order, flips):
+    """Equal labels with the voxel axes in another order and direction."""
+    change = np.zeros((4, 4))
+    change[3, 3] = 1.0
+    for new, old in enumerate(order):
+        change[old, new] = -1.0 if flips[old] else 1.0
+        if flips[old]:
+            change[old, 3] = labels.shape[old] - 1
+    flipped = labels[tuple(slice(None, None, -1) if f else slice(None) for f in flips)]
+    return np.ascontiguousarray(flipped.transpose(order)), matrix @ change
+
+
+def write_nifti(path, labels, matrix, unit="mm"):
+    image = nibabel.Nifti1Image(labels, matrix)
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, path)
+    return path
+
+
+def write_nrrd(path, labels, matrix, **more):
+    """In the frame LPS of DICOM, as 3D Slicer writes it."""
+    to_lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ matrix
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": to_lps[:3, :3].T,
+        "space origin": to_lps[:3, 3],
+    }
+    nrrd.write(str(path), labels, header | more)
+    return path
+
+
+@pytest.fixture(scope="module")
+def nifti(tmp_path_factory):
+    return write_nifti(tmp_path_factory.mktemp("seg") / "ct.nii.gz", patient(), to_ras())
+
+
+@pytest.fixture(scope="module")
+def read(nifti):
+    return read_segmentation(nifti, LABELS)
+
+
+def test_surfaces_have_the_size_and_place_of_the_bodies(read):
+    """Closed forms: an ellipsoid, whole although a ball and a tube were cut out of it, and both."""
+    organ, vessel = (Mesh(part.vertices, part.faces) for part in read.parts)
+    assert read.roles == ("organ", "keep-out")
+    assert [part.name for part in read.parts] == ["liver", "portal"]
+    assert organ.is_watertight
+    assert vessel.is_watertight
+    # the tube leaves the ellipsoid at both ends by up to 5 mm
+    ellipsoid = 4.0 / 3.0 * np.pi * 60.0 * 50.0 * 50.0
+    assert organ.volume_mm3 == pytest.approx(ellipsoid, rel=0.005)
+    voxels = (patient() == 3).sum() * np.prod(SPACING)  # seven voxels across: smoothing shrinks it
+    assert vessel.volume_mm3 == pytest.approx(voxels, rel=0.1)
+    middle = organ.vertices_mm.mean(axis=0)
+    np.testing.assert_allclose(middle, [0.0, 0.0, 300.0], atol=1.0)
+    np.testing.assert_allclose(read.lesion_mm.mean(axis=0), LESION, atol=0.3)
+    radius = np.linalg.norm(read.lesion_mm - LESION, axis=1)
+    assert abs(radius.mean() - 8.0) < 0.3
+    # the voxels of lesion and vessel belong to the solid organ
+    inside = winding_numbers(organ, np.array([LESION, [0.0, 0.0, 290.0], [20.0, 0.0, 290.0]]))
+    np.testing.assert_allclose(inside, 1.0, atol=1e-6)
+    assert any("1 pieces below 0.05 ml left out" in note for note in read.notes)
+
+
+@pytest.mark.parametrize(
+    ("order", "flips"),
+    list(zip(itertools.permutations(range(3)), itertools.product((0, 1), repeat=3), strict=False)),
+)
+def test_the_order_of_voxels_does_not_matter(order, flips, read, tmp_path):
+    labels, matrix = reordered(patient(), to_ras(), order, flips)
+    for path in (
+        write_nifti(tmp_path / "ct.nii", labels, matrix),
+        write_nrrd(tmp_path / "ct.nrrd", labels, matrix),
+    ):
+        again = read_segmentation(path, LABELS)
+        for part, other in zip(again.parts, read.parts, strict=True):
+            np.testing.assert_allclose(
+                [part.vertices.min(0), part.vertices.max(0)],
+                [other.vertices.min(0), other.vertices.max(0)],
+                atol=0.02,
+            )
+            mesh = Mesh(part.vertices, part.faces)
+            assert mesh.volume_mm3 == pytest.approx(
+                Mesh(other.vertices, other.faces).volume_mm3, rel=1e-4
+            )
+
+
+def test_the_headers_unit_counts(read, tmp_path):
+    matrix = to_ras()
+    matrix[:3] /= 1000.0
+    again = read_segmentation(write_nifti(tmp_path / "m.nii", patient(), matrix, "meter"), LABELS)
+    np.testing.assert_allclose(
+        again.parts[0].vertices.max(0), read.parts[0].vertices.max(0), atol=0.02
+    )
+
+
+def test_slicers_segments_have_names_and_may_overlap(tmp_path):
+    """Two layers: the lesion's voxels are the liver's too."""
+    labels = patient()
+    layers = np.stack([(labels > 0).astype(np.uint8), (labels == 2).astype(np.uint8)])
+    to_lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ to_ras()
+    header = {
+        "space": "left-posterior-superior",
+        "kinds": ["list", "domain", "domain", "domain"],
+        "space directions": np.vstack([[np.nan] * 3, to_lps[:3, :3].T]),
+        "space origin": to_lps[:3, 3],
+        "Segment0_Name": "liver",
+        "Segment0_LabelValue": "1",
+        "Segment0_Layer": "0",
+        "Segment1_Name": "tumour",
+        "Segment1_LabelValue": "1",
+        "Segment1_Layer": "1",
+    }
+    path = tmp_path / "ct.seg.nrrd"
+    nrrd.write(str(path), layers, header)
+    read = read_segmentation(path, (parse_label("liver:organ"), parse_label("tumour:lesion")))
+    np.testing.assert_allclose(read.lesion_mm.mean(axis=0), LESION, atol=0.3)
+    assert [part.name for part in read.parts] == ["liver"]
+    with pytest.raises(InputError, match=r"no label 'kidney'; its labels are liver \(.*\), tumour"):
+        read_segmentation(path, (parse_label("kidney:organ"),))
+
+
+def test_the_ring_lies_above_the_lesion_with_its_margin(nifti):
+    """The patient lies on the back: anterior is up, and the ball lies 12 mm below the surface."""
+    request = Request((nifti,), ("organ",), labels=LABELS, margin_mm=4.0)
+    prepared = prepare(request)
+    assert ring_diameter(request, prepared) == pytest.approx(2.0 * (8.0 + 4.0), abs=2.0)
+    (site,) = choose_sites(request, prepared)
+    organ = prepared.meshes[0]
+    middle = prepared.lesion_mm.mean(axis=0)
+    # world x right, z anterior, so y to the feet; the origin is the middle of the organ
+    np.testing.assert_allclose(middle, [8.0, 0.0, 38.0], atol=1.5)
+    assert site.point_mm[2] > middle[2]
+    distances = np.linalg.norm(organ.vertices_mm - middle, axis=1)
+    assert np.linalg.norm(site.point_mm - middle) <= distances.min() + 0.1
+
+
+def test_a_segmented_patient_becomes_a_scene(nifti, tmp_path, capsys):
+    labels = [f"{one.key}:{one.role}:{one.name}" for one in LABELS]
+    options = [word for label in labels for word in ("--label", label)]
+    assert run(["scene", "new", str(nifti), *options, "-o", str(tmp_path / "scene")]) == 0
+    said = capsys.readouterr().out
+    assert "segmented lesion: 1" in said
+    scene = open_scene(tmp_path / "scene")
+    assert [(body.name, body.role) for body in scene.bodies] == [
+        ("liver", "organ"),
+        ("portal", "keep-out"),
+    ]
+    distance = float(said.split("ring to 'portal'")[1].split("mm")[0])
+    # from the ring on the front of the organ to the tube, whose axis lies at y = 0, z = 290
+    world = scene.ring.points_mm
+    vessel = scene.spec.body("portal")
+    points = next(body for body in scene.bodies if body.name == vessel.name).world_mesh.vertices_mm
+    nearest = np.linalg.norm(world[:, None] - points[None], axis=2).min()
+    assert distance == pytest.approx(nearest, abs=0.2)
+
+
+BAD = [
+    ((), r"say what its labels are .* its labels are 1 \([\d.]+ ml\), 2 \(2"),
+    (("2:lesion",), "0 labels with the role organ"),
+    (("1:organ", "2:organ"), "2 labels with the role organ"),
+    (("1:organ", "7:lesion"), r"there is no label '7'; its labels are 1"),
+]
+
+
+@pytest.mark.parametrize(("labels", "says"), BAD, ids=[says for _, says in BAD])
+def test_bad_labels_list_those_of_the_file(labels, says, nifti):
+    with pytest.raises(InputError, match=says):
+        read_segmentation(nifti, tuple(map(parse_label, labels)))
+
+
+def test_images_that_are_no_segmentation_are_one_line(tmp_path):
+    grey = write_nifti(tmp_path / "grey.nii", patient() * np.float32(0.3), to_ras())
+    flat = write_nifti(tmp_path / "flat.nii", patient()[:, :, :1], to_ras())
+    noise = tmp_path / "noise.nrrd"
+    noise.write_bytes(b"NRRD0004\ntype: short\nsizes: x y\n\n")
+    cut = tmp_path / "cut.nii.gz"
+    cut.write_bytes(write_nifti(tmp_path / "w.nii.gz", patient(), to_ras()).read_bytes()[:900])
+    huge = tmp_path / "huge.nrrd"
+    huge.write_text(
+        "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 9000 9000 9000\nencoding: raw\n\nx"
+    )
+    for path, says in (
+        (grey, "holds grey values"),
+        (flat, "expected a volume"),
+        (noise, "cannot be read as a segmented image"),
+        (cut, "cannot be read as a segmented image"),
+        (huge, "9000 x 9000 x 9000 voxels"),
+        (tmp_path / "absent.nii", "there is no such file"),
+    ):
+        with pytest.raises(InputError, match=says) as stopped:
+            read_segmentation(path, LABELS)
+        assert "\n" not in str(stopped.value)

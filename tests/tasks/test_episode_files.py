@@ -1,0 +1,142 @@
+"""Files of episodes whose content is damaged: one line each, and no memory for what is not there.
+
+The cases were found by `python -m benchmarks.fuzz`.
+"""
+
+import io
+import json
+import struct
+import tracemalloc
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene import mesh
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.episodes import parts
+from surgisoft.tasks.episodes.file import load_episode, save_episode
+from surgisoft.tasks.episodes.log import EpisodeRecorder
+from surgisoft.tasks.registry import make_task
+
+
+@pytest.fixture(scope="module")
+def members(tmp_path_factory):
+    """The members of the file of a short cut, by name."""
+    task = make_task("circle_ablation")
+    with torch.inference_mode():
+        episodes = Episodes(task, donate=True)
+        state = episodes.seeded(4, 1)
+        recorder = EpisodeRecorder(task, state, driver="scripted", seed=4)
+        for _ in range(3):
+            actions = task.script(state)
+            state, outcome = episodes.step(state, actions)
+            recorder.step(state, outcome, actions)
+    file = tmp_path_factory.mktemp("episode") / "a.npz"
+    log = recorder.log()
+    changes = {"rows": np.array([2]), "starts": np.array([0, 2]), "sample": np.array([0, 5])}
+    dose = replace(log.dose, **changes, dose_j_per_mm2=np.array([0.1, 0.2]))
+    save_episode(replace(log, dose=dose), file)
+    with zipfile.ZipFile(file) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def written(folder, members):
+    with zipfile.ZipFile(folder / "a.npz", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return folder / "a.npz"
+
+
+def array(content):
+    return np.load(io.BytesIO(content))
+
+
+def packed(values):
+    out = io.BytesIO()
+    np.save(out, values)
+    return out.getvalue()
+
+
+def changed(values, index, value):
+    values = np.array(values)
+    values[index] = value
+    return values
+
+
+DAMAGE = {
+    "/time_s": (lambda a: a[:-1], r"'targets_mm' of the log has shape \(4, 1, 3\), expected \(3"),
+    "/targets_mm": (lambda a: a[..., :2], "'targets_mm' of the log has shape"),
+    "/actuals_mm": (lambda a: a.astype("U4"), "'actuals_mm' of the log holds <U4"),
+    "/arms/laser/line_mm": (lambda a: a.reshape(-1), "'line_mm' of arm 'laser' has shape"),
+    "/arms/laser/mount": (lambda a: a * np.nan, "'mount' of arm 'laser' holds NaN"),
+    "/arms/laser/points_mm": (lambda a: a * 1e9, "lengths of an impossible size"),
+    "/dose/faces": (lambda a: a + 10**6, "faces that its organ does not have"),
+    "/dose/sample": (lambda a: a - 1, "triangles that it does not have"),
+    "/dose/starts": (lambda a: a + 1, "changes of the dose do not add up"),
+    "/dose/rows": (lambda a: a + 100, "rows that the log does not have"),
+    "/dose/station": (lambda a: a + 10**6, "stations that are not on its ring"),
+    "/bodies/0/faces": (lambda a: changed(a, 0, 10**6), "faces without their vertices"),
+    "/beam/hits_organ": (lambda a: a.astype(float), "'hits_organ' of the beam holds float64"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_arrays_that_disagree_are_refused(members, tmp_path, name):
+    change, said = DAMAGE[name]
+    assert load_episode(written(tmp_path, members)).rows == 4
+    damaged = members | {f"{name}.npy": packed(change(array(members[f"{name}.npy"])))}
+    with pytest.raises(InputError, match=said):
+        load_episode(written(tmp_path, damaged))
+
+
+def test_a_header_that_claims_more_than_the_file_takes_no_memory(members, tmp_path):
+    head = "{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 1000), }".ljust(117) + "\n"
+    claim = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + head.encode()
+    file = written(tmp_path, members | {"/time_s.npy": claim})
+    tracemalloc.start()
+    with pytest.raises(InputError, match="claims an array that is not in it"):
+        load_episode(file)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
+    file = written(tmp_path, members)
+    content = bytearray(file.read_bytes())
+    at = content.rindex(b"PK\x01\x02")  # the last entry of the directory: its size unpacked
+    content[at + 24 : at + 28] = struct.pack("<I", 2**31)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=f"expected at most {2**29}"):
+        load_episode(file)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        (("log", "table", "rewards"), "x", "its rewards are no table"),
+        (("log", "table", "agents"), ["nobody"], "its agents are none of its arms"),
+        (("log", "table", "dose", "table", "body"), "spleen", "a body that is not in it"),
+        (("log", "table", "limits", "table"), {}, "a view without its limit"),
+        (("log", "table", "camera", "table", "range_mm"), [5.0, 1.0], "range is impossible"),
+        (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is no number"),
+        (("format",), "\x1b[2J", r"format text '\\x1b\[2J', expected"),
+    ],
+)
+def test_a_table_with_another_value_is_refused(members, tmp_path, path, value, said):
+    table = json.loads(array(members["table.npy"]).tobytes())
+    node = table
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = value
+    text = np.frombuffer(json.dumps(table).encode(), np.uint8)
+    with pytest.raises(InputError, match=said):
+        load_episode(written(tmp_path, members | {"table.npy": packed(text)}))
+
+
+def test_roles_are_those_of_scenes():
+    assert parts.ROLES == mesh.ROLES

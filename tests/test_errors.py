@@ -1,0 +1,20 @@
+"""The message of an InputError is one printable line of bounded length."""
+
+import io
+
+from surgisoft.errors import LONGEST, InputError
+
+
+def test_what_a_file_holds_cannot_steer_the_terminal_or_fail_to_be_printed():
+    message = str(InputError("a.toml: field '\x1b[2J\u202e\ud800\0'\nnext\r line"))
+    assert message == r"a.toml: field '\x1b[2J\u202e\ud800\x00' next line"
+    io.TextIOWrapper(io.BytesIO(), encoding="utf-8").write(message)
+
+
+def test_a_long_message_keeps_its_beginning_and_its_end():
+    message = str(InputError("a.csv: " + "x" * 10**6 + "; expected less"))
+    assert len(message) < LONGEST
+    assert message.startswith("a.csv: xxx")
+    short = str(InputError("a.csv: " + "y" * 2000 + "; expected less"))
+    assert len(short) < LONGEST
+    assert short.endswith("; expected less")

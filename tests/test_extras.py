@@ -1,0 +1,117 @@
+"""The core without its extras: what it can do, and what it says where an extra is missing."""
+
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+from surgisoft.extras import EXTRA_OF, EXTRA_OF_USE
+
+ROOT = Path(__file__).resolve().parents[1]
+WITHOUT = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names!r}:
+            raise ModuleNotFoundError(f"No module named '{{name}}'", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+"""A program's first lines: the libraries of the extras cannot be imported."""
+
+
+def core(code, *arguments):
+    """What a program prints in an environment without the extras."""
+    program = WITHOUT.format(names=sorted(EXTRA_OF)) + code
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def extras():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def plain(requirement):
+    return requirement.partition(">")[0].strip().lower()
+
+
+def test_every_library_of_an_extra_has_its_advice():
+    """The table of modules against the package's own metadata."""
+    tools = {"dev", "docs", "all"}
+    listed = {
+        plain(requirement): extra
+        for extra, requirements in extras().items()
+        if extra not in tools
+        for requirement in requirements
+        if not requirement.startswith("surgisoft")
+    }
+    distribution_of = {
+        module: {name.lower().replace("_", "-") for name in names}
+        for module, names in packages_distributions().items()
+    }
+    covered = set()
+    for module, extra in EXTRA_OF.items():
+        owners = distribution_of.get(module)
+        if owners is None:
+            continue  # an extra that is not installed here
+        (owner,) = owners & set(listed)
+        assert listed[owner] == extra
+        covered.add(owner)
+    installed = {name for names in distribution_of.values() for name in names}
+    assert covered == set(listed) & installed
+    assert set(EXTRA_OF_USE.values()) <= set(extras())
+
+
+def test_the_core_identifies_without_scenes_training_and_replays(tmp_path):
+    """Record, compare and diagnose, as the lines of the README do."""
+    done = core(
+        """
+from pathlib import Path
+import surgisoft
+folder = Path(sys.argv[1])
+recording = surgisoft.collect("mixed", seed=0, points=300)
+surgisoft.save_recording(recording, folder / "bench.parquet")
+comparison, _ = surgisoft.compare("default", [folder / "bench.parquet"])
+print(comparison.rmse_mm > 0)
+print(surgisoft.diagnose("default", [folder / "bench.parquet"]).verdict.kind)
+""",
+        tmp_path,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith("True\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        ("train --task track_circle", "train"),
+        ("scene check phantom_liver", "scene"),
+        ("replay x.rrd", "replay"),
+        ("collect mixed --rig elastica -o x.parquet", "elastica"),
+    ],
+)
+def test_a_missing_library_names_its_extra(arguments, extra):
+    done = core("from surgisoft.cli import run; sys.exit(run(sys.argv[1:]))", *arguments.split())
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert f"pip install 'surgisoft[{extra}]'" in done.stderr
+
+
+def test_python_names_the_extra_too():
+    done = core(
+        """
+import surgisoft
+try:
+    surgisoft.parallel_env
+except ImportError as error:
+    print(error)
+"""
+    )
+    assert "surgisoft.parallel_env: the package" in done.stdout
+    assert "pip install 'surgisoft[train]'" in done.stdout

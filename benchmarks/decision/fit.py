@@ -2,7 +2,7 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases, and so do the kinds of cases in every source (PRIORS). The penalty of each model is chosen by leaving out one group of robots after another within
+cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by leaving out one group of robots after another within
 the cases that it is fitted to, so nothing of a source that is judged enters.
 """
 
@@ -34,10 +34,10 @@ WEAK = 0.5
 cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
-PRIORS = {"missing": 0.75, "known": 0.75, "two": 0.3, "network": 0.2}
-"""Shares of cases of which each statement is true, for which the probabilities are calibrated. They
-are stated: how often cases of each kind were drawn for a source says nothing of real arms, and it
-differs between sources."""
+PRIORS = {"two": 0.3}
+"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated: how
+many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in one
+source and a quarter in another. The other models take the sources' shares, which are alike."""
 WHOLE_TRUTH = ("missing", "known", "network")
 """Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
@@ -86,9 +86,9 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
 def case_weights(name: str, some: Sequence) -> np.ndarray:
     """(N,) weights of a model's sample, of mean 1.
 
-    Every source has the same sum, unless it has few cases, and in every source the statement is
-    true for the share PRIORS of it; where a source has cases of one kind only, they have the share
-    of that kind.
+    Every source has the same sum, unless it has few cases. Where PRIORS has the model, the
+    statement is true for that share of every source; cases of a source that has one kind only have
+    the share of that kind.
     """
     prior = PRIORS.get(name)
     kinds = [(case.source, prior is None or bool(right)) for _, right, case in some]
@@ -113,6 +113,17 @@ def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
     return np.array(answer, float)
 
 
+def _padded(some: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((N, E, F) features, (N, E) right, (N, E) whether there is such an effect) of E at most."""
+    most = max(len(rows) for rows, _, _ in some)
+    x = np.zeros((len(some), most, some[0][0].shape[1]))
+    y, there = np.zeros((len(some), most)), np.zeros((len(some), most), bool)
+    for number, (rows, right, _) in enumerate(some):
+        x[number, : len(rows)], y[number, : len(rows)] = rows, right
+        there[number, : len(rows)] = True
+    return x, y, there
+
+
 def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     """One logistic model of given penalty."""
     features = FEATURES[name]
@@ -122,8 +133,7 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     weights = case_weights(name, some)
     joint = name == "first"
     if joint:
-        x = [rows for rows, _, _ in some]
-        y = [right for _, right, _ in some]
+        x, y, there = _padded(some)
     else:
         x, y = np.array([row for row, _, _ in some]), np.array([right for _, right, _ in some])
 
@@ -133,13 +143,13 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
         slope = np.append(penalty * w, CONSTANT_PENALTY * constant)
         total = prior
         if joint:
-            for weight, rows, right in zip(weights, x, y, strict=True):
-                odds = rows @ w
-                share = np.exp(odds - odds.max())
-                share /= share.sum()
-                hit = share @ right
-                total -= weight * np.log(max(hit, 1e-300))
-                slope[:-1] += weight * (share @ rows - (share * right / hit) @ rows)
+            odds = np.where(there, x @ w, -np.inf)
+            share = np.exp(odds - odds.max(axis=1, keepdims=True))
+            share /= share.sum(axis=1, keepdims=True)
+            hit = np.maximum((share * y).sum(axis=1), 1e-300)
+            total -= weights @ np.log(hit)
+            off = weights[:, None] * share * (1.0 - y / hit[:, None])
+            slope[:-1] += np.einsum("ne,nef->f", off, x)
             return float(total), slope
         odds = x @ w + constant
         total += float(weights @ (np.logaddexp(0.0, odds) - y * odds))

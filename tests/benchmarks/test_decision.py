@@ -140,12 +140,11 @@ def test_every_source_counts_alike():
     assert few[-1] < 0.25 * few[:30].sum()
 
 
-def test_how_often_a_kind_was_drawn_does_not_count():
-    """Of a source that is half unknown effects and of one that hardly has any, the statement is
-    true for the same share of the weight."""
-    weights = case_weights("known", drawn("a", 10, 10) + drawn("b", 30, 10))
-    assert weights[:10].sum() / weights[:20].sum() == pytest.approx(PRIORS["known"])
-    assert weights[20:50].sum() / weights[20:].sum() == pytest.approx(PRIORS["known"])
+def test_how_often_pairs_were_drawn_does_not_count():
+    """Of a source that is half pairs and of one that has few, pairs have the same weight."""
+    weights = case_weights("two", drawn("a", 10, 10) + drawn("b", 10, 30))
+    assert weights[:10].sum() / weights[:20].sum() == pytest.approx(PRIORS["two"])
+    assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
 
 
 def test_a_source_is_judged_without_its_own_cases(monkeypatch):

@@ -265,7 +265,7 @@ def test_what_was_wrong_before_is_no_change_without_pairs(model, changed):
     left = np.sqrt(np.mean(np.square(gain[rows])) / 3 + 3 * NOISE_MM**2)
     assert plain > 3.0 * NOISE_MM * np.sqrt(3)
     assert problem.rmse_mm == pytest.approx(left, rel=0.3)
-    assert np.all(problem.discrepancy_mm < 0.5 * model.validation.rmse_mm)
+    assert np.all(problem.discrepancy_mm < 0.5 * np.array(model.validation.per_key_point_mm))
 
 
 def test_a_nearly_idle_chamber_is_no_common_range(model):

@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test fast lint docs fuzz clean
+.PHONY: demo test fast lint docs fuzz mutants kills sbom clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -21,8 +21,9 @@ $(DOCS_STAMP): $(STAMP)
 
 demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that a model is missing
 	rm -rf demo/ring
-	$(BIN)/surgisoft train --task circle_ablation --minutes 4 -o demo/ring
+	$(BIN)/surgisoft train --task circle_ablation --preset randomised --minutes 4 -o demo/ring
 	$(BIN)/surgisoft evaluate demo/ring scripted random --task circle_ablation --episodes 4 --replay demo/ring.rrd
+	$(BIN)/surgisoft evaluate demo/ring scripted --on rig --episodes 2
 	$(BIN)/surgisoft collect mixed --seed 0 --hidden creep -o demo/bench.parquet --force
 	$(BIN)/surgisoft compare default demo/bench.parquet --report demo/compare
 	$(BIN)/surgisoft diagnose default demo/bench.parquet --report demo/diagnosis
@@ -44,6 +45,17 @@ lint: $(STAMP)  ## style, format, types
 SECONDS ?= 300
 fuzz: $(STAMP)  ## mutated files into every reader for SECONDS
 	$(BIN)/python -m benchmarks.fuzz --seconds $(SECONDS) --workers 2
+
+mutants: $(STAMP)  ## wrong versions of the source that the tests should notice
+	$(BIN)/python -m benchmarks.mutants
+
+kills: $(STAMP)  ## commands ended by SIGKILL at any moment
+	$(BIN)/python -m benchmarks.kills
+
+sbom: $(STAMP)  ## what is installed, as sbom.json (CycloneDX)
+	$(PYTHON) -m venv $(VENV)/sbom
+	$(VENV)/sbom/bin/pip install --quiet "cyclonedx-bom>=7.5,<8"
+	$(VENV)/sbom/bin/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml --of JSON -o sbom.json
 
 docs: $(DOCS_STAMP)  ## the documentation site, in site/
 	$(BIN)/python docs/draw_architecture.py --check

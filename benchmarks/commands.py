@@ -108,6 +108,35 @@ def diagnosis(
 
 
 @app.command()
+def intervals(
+    robots: Annotated[
+        str,
+        typer.Option(help="Seeds of the robots, with commas; 201 to 204 served for calibration."),
+    ] = "205,206,207,208",
+    count: Annotated[
+        int, typer.Option(min=1, help="Number of recordings of each setting with an effect.")
+    ] = 30,
+    clean: Annotated[
+        int, typer.Option(min=0, help="Number of recordings of each setting without an effect.")
+    ] = 32,
+    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    work: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
+    ] = Path("runs/benchmark-intervals"),
+    output: Output = None,
+) -> None:
+    """Coverage of the intervals of `amend`, and falls that it claims on clean arms."""
+    from benchmarks.intervals import cases, markdown, run
+
+    some = cases(count, clean, tuple(_numbers("--robots", robots)))
+    with progress("intervals") as report:
+        outcomes = run(some, work, processes, report)
+    command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
+    _show("Intervals of amend", command, markdown(outcomes), output)
+
+
+@app.command()
 def decision(
     cases: Annotated[
         list[str] | None,
@@ -261,6 +290,38 @@ def control(
     command += f" --tasks {tasks}" if tasks else ""
     command += f" --episodes {episodes} --rig-episodes {rig_episodes}"
     _show("Control results", command, markdown(results, config), output)
+
+
+@app.command()
+def live(
+    robots: Annotated[
+        str, typer.Option(help="Seeds of the robots, with commas.")
+    ] = "204,205,206,207",
+    hours: Annotated[
+        float, typer.Option(min=0.2, help="Hours of clean rig for each robot and motion.")
+    ] = 5.0,
+    models: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
+    ] = Path("runs/benchmark-live"),
+    processes: Annotated[int, typer.Option(min=1, help="Number of recordings in parallel.")] = 2,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """False alarms of the change detector on a clean rig, and its delay after a change."""
+    from dataclasses import asdict
+
+    from benchmarks.live import markdown, run
+
+    check_free(json_file, "clean")
+    check_folder(models)
+    numbers = _numbers("--robots", robots)
+    with progress("live") as report:
+        clean, changes = run(numbers, hours, models, processes, report)
+    if json_file:
+        both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
+        write_json(json_file, both)
+    command = f"surgisoft benchmark live --robots {robots} --hours {hours:g}"
+    _show("Live: false alarms and delays", command, markdown(clean, changes), output)
 
 
 @app.command()

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.surrogate.arm import ArmSpec
@@ -117,6 +118,8 @@ class Kernel:
         return np.exp(-(square - 2 * x @ self.landmarks.T).clip(min=0) / (2 * self.width**2))
 
 
+MOST_KNOWN = 0.02
+"""Largest share of left-out rows that also occur in the fit; stalled sensors repeat a few."""
 BLACK_BOXES = {
     "ridge with memory": (Ridge, RIDGES),
     "kernel with memory": (Kernel, [(w, r) for w in WIDTHS for r in KERNEL_RIDGES]),
@@ -153,6 +156,12 @@ def judge(history: History, spec: ArmSpec, left_out: torch.Tensor, config: FitCo
     result = fit(train, None, spec, config)
     for line in result.lines():
         print("    " + line)
+    known = result.model.fitted_rows.share_of(history, history.rows(left_out).numpy())
+    if known > MOST_KNOWN:
+        raise InputError(
+            f"{known:.0%} of the left-out rows are among those of the fit: the recordings repeat "
+            "rows; leave the copies out"
+        )
     found = result.model.predict_interval(history)
     error = (found.key_points_mm[left_out] - measured).norm(dim=-1)
     radius = found.radius_mm[left_out]

@@ -24,6 +24,7 @@ TITLES = {
     "cli": "cli: commands",
     "diagnosis": "diagnosis: system identification",
     "experiments": "experiments",
+    "live": "live: closed loop on a rig with a model beside it",
     "measurement": "measurement: recordings, importing, protocols",
     "replay": "replay: Rerun views",
     "report": "report: HTML pages",

@@ -18,8 +18,11 @@ System identification of an arm:
 Surgical tasks:
 
     make, parallel_env           Gymnasium and PettingZoo environments
+    batched_env                  thousands of episodes, tensors in and out
     train, evaluate              policies (PPO, centralised training, decentralised execution)
+    run                          a policy or a schedule on a rig, with a model beside it
     open_scene, open_replay      scenes and episodes
+    demo                         the demonstration in five steps
 """
 
 from importlib import import_module
@@ -33,11 +36,13 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from surgisoft.agents.session import evaluate
     from surgisoft.agents.training_request import train
+    from surgisoft.demo.story import demo
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
     from surgisoft.diagnosis.design.next_experiment import next_experiment
     from surgisoft.diagnosis.diagnose import diagnose
     from surgisoft.diagnosis.improve import improve
+    from surgisoft.live.session import run
     from surgisoft.measurement.fitting import fit
     from surgisoft.measurement.recordings import (
         load_recording,
@@ -50,13 +55,16 @@ if TYPE_CHECKING:
     from surgisoft.surrogate.checkpoint import load_model, save_model
     from surgisoft.surrogate.checkpoint import load_model as load
     from surgisoft.surrogate.effects import register_effect_file
+    from surgisoft.tasks.batched import batched_env
     from surgisoft.tasks.make import make
     from surgisoft.tasks.parallel import parallel_env
 
 _PLACES = {
     "amend": "diagnosis.amend",
+    "batched_env": "tasks.batched",
     "collect": "rig.trial",
     "compare": "diagnosis.compare",
+    "demo": "demo.story",
     "diagnose": "diagnosis.diagnose",
     "evaluate": "agents.session",
     "fit": "measurement.fitting",
@@ -70,6 +78,7 @@ _PLACES = {
     "open_scene": "scene.folder",
     "parallel_env": "tasks.parallel",
     "register_effect_file": "surrogate.effects",
+    "run": "live.session",
     "save_model": "surrogate.checkpoint",
     "save_recording": "measurement.recordings",
     "train": "agents.training_request",
@@ -81,8 +90,10 @@ _OTHER_NAMES = {"load": "load_model"}
 __all__ = [
     "__version__",
     "amend",
+    "batched_env",
     "collect",
     "compare",
+    "demo",
     "diagnose",
     "evaluate",
     "fit",
@@ -97,6 +108,7 @@ __all__ = [
     "open_scene",
     "parallel_env",
     "register_effect_file",
+    "run",
     "save_model",
     "save_recording",
     "train",

@@ -19,6 +19,9 @@ EXTRA_OF = {
     "rerun": "replay",
     "rerun_cli": "replay",
     "elastica": "elastica",
+    "serial": "serial",
+    "mcap": "mcap",
+    "mcap_ros2": "mcap",
     "nibabel": "segmentation",
     "nrrd": "segmentation",
     "skimage": "segmentation",
@@ -31,8 +34,10 @@ EXTRA_OF_USE = {
     "evaluate": "train",
     "export": "train",
     "make": "train",
+    "batched_env": "scene",
     "parallel_env": "train",
     "experiment": "all",
+    "demo": "all",
 }
 """The extra that a command or function needs in whole, by its name."""
 

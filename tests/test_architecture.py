@@ -27,11 +27,15 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
+    "demo": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
     "cli": {
         "agents",
+        "demo",
         "experiments",
+        "live",
         "tasks",
         "scene",
         "surrogate",
@@ -51,6 +55,7 @@ FLOORS = {
     "diagnosis": (
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
+        ("other_models",),
         ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
@@ -85,6 +90,7 @@ FLOORS = {
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
+        ("live_view",),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),
@@ -114,6 +120,9 @@ ONLY_IN = {
     "rsl_rl": "agents",
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
+    "serial": "rig/drivers/serial_controller",
+    "mcap": "measurement/importing/readers/mcap",
+    "mcap_ros2": "measurement/importing/readers/mcap",
 }
 
 

@@ -21,10 +21,15 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, Stages
 from surgisoft.tasks.registry import config_of
 
-LEARNED = ("track_circle", "track_square", "laser_plane", "circle_ablation")
-"""Tasks that policies are trained for."""
-TASKS = (*LEARNED, "track_body", "keyhole")
-"""All evaluated tasks; the last ones have no learned policy."""
+TASKS = (
+    "track_circle",
+    "track_square",
+    "laser_plane",
+    "circle_ablation",
+    "track_body",
+    "keyhole",
+)
+"""Tasks that policies are trained for and evaluated on."""
 PLACES = ("simulation", "rig")
 """Plants of the evaluation."""
 RATE_TASK = "track_circle"
@@ -104,7 +109,7 @@ class Results:
 
 def run(config: ControlConfig, folder: Path, report: Progress) -> Results:
     """Train what is missing, then evaluate everything that is not in the cache."""
-    learned = [(task, seed) for task in LEARNED if task in config.tasks for seed in config.seeds]
+    learned = [(task, seed) for task in TASKS if task in config.tasks for seed in config.seeds]
     plays = 2 * (len(learned) + 2 * len(config.tasks))
     whole = config.whole_steps if RATE_TASK in config.tasks else 0
     alone = 25 * bool(config.rate_steps) + 100 * bool(whole)

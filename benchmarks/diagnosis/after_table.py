@@ -23,8 +23,12 @@ def rate(hits: list[bool]) -> str:
 
 
 def open_cases(some: list[Outcome]) -> list[Outcome]:
-    """Cases with the verdict ambiguous, the hidden effect competing, and a recorded experiment."""
-    return [o for o in some if o.settled is not None and o.case.truth[0] in o.effects]
+    """All cases with the verdict ambiguous and a recorded experiment, whatever is hidden.
+
+    An experiment that leaves a case open, or whose competing effects did not hold the hidden one,
+    has not named the right one.
+    """
+    return [o for o in some if o.settled is not None]
 
 
 def right_after(outcome: Outcome) -> bool:
@@ -48,12 +52,15 @@ def judged_amendments(some: list[Outcome]) -> list[Outcome]:
     ]
 
 
-def after_rows(some: list[Outcome], static: list[Outcome]) -> list[tuple[str, str, str]]:
-    """Rows (measure, goal, measured) for cases with one effect of the list.
+def after_rows(
+    every: list[Outcome], some: list[Outcome], static: list[Outcome]
+) -> list[tuple[str, str, str]]:
+    """Rows (measure, goal, measured) about what follows a diagnosis.
 
-    static: those of a static effect at least as large as the surrogate's error.
+    every: all cases; some: those with one effect of the list; static: those of a static effect at
+    least as large as the surrogate's error.
     """
-    asked = open_cases(some)
+    asked = open_cases(every)
     rows = [
         (
             "ambiguous: the recommended experiment names the right one",
@@ -67,7 +74,7 @@ def after_rows(some: list[Outcome], static: list[Outcome]) -> list[tuple[str, st
         ),
     ]
     if asked:
-        wrong = [o.settled.effect not in (None, o.case.truth[0]) for o in asked]
+        wrong = [o.settled.effect is not None and not _right(o, o.settled) for o in asked]
         minutes = [o.settled.minutes for o in asked]
         rows += [
             ("ambiguous: the experiment names a wrong one", "", rate(wrong)),
@@ -91,7 +98,7 @@ def after_rows(some: list[Outcome], static: list[Outcome]) -> list[tuple[str, st
 
 
 def _right(outcome: Outcome, settled: Settled) -> bool:
-    return settled.effect == outcome.case.truth[0]
+    return settled.effect is not None and settled.effect in outcome.case.truth
 
 
 def pooled_share(judged: list[Outcome]) -> float:

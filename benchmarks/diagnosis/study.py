@@ -1,6 +1,7 @@
 """Benchmark `diagnosis`: many virtual robots with known hidden effects.
 
-The formulas of their hidden effects differ from those of the model.
+Most of their hidden effects have other equations than the model's effects; `cases.SAME_LAW` lists
+those that do not.
 Every case draws the hidden effect (or none, one outside the list, or two), its amplitude, noise,
 excitation and the model discrepancy. An ambiguous case continues with the recommended experiment;
 in some cases the model is amended by the named effects.

@@ -51,8 +51,24 @@ def first_right(outcome: Outcome, among: int = 1) -> bool:
 
 
 def statement_right(outcome: Outcome) -> bool:
-    """Whether the first effect named is a hidden one."""
-    return bool(outcome.effects) and outcome.effects[0] in outcome.case.truth
+    """Whether what is stated is right: the effect is hidden, all of several, or one of a set."""
+    hits = [name in outcome.case.truth for name in outcome.effects]
+    return bool(hits) and (any(hits) if outcome.kind == "ambiguous" else all(hits))
+
+
+def named_alone(outcome: Outcome) -> bool:
+    """Whether the verdict names the hidden effect and no other."""
+    return outcome.kind == "identified" and outcome.effects == outcome.case.truth
+
+
+def named(outcome: Outcome) -> bool:
+    """Whether the verdict names the hidden effect, alone or in a set."""
+    return outcome.kind in NAMING and bool(set(outcome.effects) & set(outcome.case.truth))
+
+
+def both_named(outcome: Outcome) -> bool:
+    """Whether the verdict states that two effects are missing, and names exactly those hidden."""
+    return outcome.kind == "several" and sorted(outcome.effects) == sorted(outcome.case.truth)
 
 
 def _goals(outcomes: list[Outcome]) -> str:
@@ -66,8 +82,8 @@ def _goals(outcomes: list[Outcome]) -> str:
     known = [o for o in outcomes if "unknown" not in o.case.truth and not o.case.undertrained]
     under = [o for o in outcomes if o.case.undertrained]
     pairs = [o for o in outcomes if len(o.case.hidden) == 2]
-    named = [o for o in outcomes if o.kind in NAMING]
-    sure = [o for o in named if o.confidence >= SURE]
+    naming = [o for o in outcomes if o.kind in NAMING]
+    sure = [o for o in naming if o.confidence >= SURE]
     extra = [len(set(o.effects) - set(o.case.truth)) for o in pairs if o.kind == "several"]
 
     lines = ["| measure | goal | measured |", "|---|---|---|"]
@@ -80,6 +96,9 @@ def _goals(outcomes: list[Outcome]) -> str:
 
     row("right effect first, memory effects", "97 %", split(at_least, True), first_right)
     row("right effect first, static effects", "85 %", split(at_least, False), first_right)
+    row("the verdict names it alone, memory effects", "", split(at_least, True), named_alone)
+    row("the verdict names it alone, static effects", "", split(at_least, False), named_alone)
+    row("the verdict names it, alone or in a set", "90 %", at_least, named)
     row("the same, ten rich minutes, memory", "", split(rich, True), first_right)
     row("the same, ten rich minutes, static", "", split(rich, False), first_right)
     row("right first, at least twice the surrogate's error", "95 %", twice, first_right)
@@ -89,10 +108,13 @@ def _goals(outcomes: list[Outcome]) -> str:
     row("outside the list: `unknown_effect`", "80 %", unknown, lambda o: o.kind == OTHER)
     row("the same, at least the surrogate's error", "", seen, lambda o: o.kind == OTHER)
     row("called so though in the list, or clean", "5 %", known, lambda o: o.kind == OTHER)
-    row("two at once, both named", "85 %", pairs, lambda o: set(o.case.truth) <= set(o.effects))
+    row("two at once, both named", "85 %", pairs, both_named)
     row("undertrained surrogate called so", "", under, lambda o: o.kind == UNDERTRAINED)
-    error = calibration_error(named)
+    error = calibration_error(naming)
     lines.append(f"| calibration error of the confidence | 0.05 | {error:.3f} |")
+    need = clean_needed(0.02)
+    enough = f"{len(clean)} of {need}" + ("" if len(clean) >= need else ": too few for the goal")
+    lines.append(f"| clean robots; none named of so many shows less than 2 % | {need} | {enough} |")
     mean = float(np.mean(extra)) if extra else 0.0
     lines.append(f"| effects too many, a pair called `several` | 0.1 | {mean:.2f} |")
     seconds = [o.seconds for o in outcomes if o.case.excitation == "rich"]
@@ -103,8 +125,19 @@ def _goals(outcomes: list[Outcome]) -> str:
             f"longest {most:.1f} s |"
         )
     static = split(at_least, False)
-    lines += [f"| {what} | {goal} | {said} |" for what, goal, said in after_rows(some, static)]
+    lines += [
+        f"| {what} | {goal} | {said} |" for what, goal, said in after_rows(outcomes, some, static)
+    ]
     return "## Goals\n\n" + "\n".join(lines)
+
+
+def clean_needed(most: float) -> int:
+    """Cases without a hit from which the upper end of Wilson's 95 % interval is below `most`.
+
+    With no hit of n that end is z^2 / (n + z^2).
+    """
+    z2 = float(stats.norm.ppf(0.975)) ** 2
+    return int(np.ceil(z2 * (1.0 / most - 1.0)))
 
 
 def calibration_error(named: list[Outcome]) -> float:

@@ -156,6 +156,14 @@ def change_json(random: Random, content: bytes) -> bytes:
     return json.dumps(change_tree(random, json.loads(content))).encode()
 
 
+def change_json_lines(random: Random, content: bytes) -> bytes:
+    """A change of one node in one line of a file of JSON objects."""
+    lines = content.splitlines()
+    row = random.choice((0, random.randrange(len(lines))))
+    lines[row] = change_json(random, lines[row])
+    return b"\n".join(lines) + b"\n"
+
+
 def change_toml(random: Random, content: bytes) -> bytes:
     """A change of one node of a TOML file."""
     import tomli_w
@@ -345,6 +353,7 @@ Mutation = Callable[[Random, bytes], bytes]
 
 KINDS: dict[str, tuple[Mutation, ...]] = {
     "json": (change_text, change_json, change_json, change_json),
+    "jsonl": (change_text, change_json_lines, change_json_lines, change_json_lines),
     "toml": (change_text, change_text, change_toml, change_toml),
     "npz": (change_npz, change_npz, change_npz),
     "safetensors": (change_safetensors, change_safetensors),

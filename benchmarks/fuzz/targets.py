@@ -67,6 +67,25 @@ def read_recordings(sample: Path) -> None:
     load_recordings([sample])
 
 
+def make_logs(folder: Path) -> None:
+    """The log of a short recording."""
+    from surgisoft.measurement.recordings.log import LogHeader, recording_log
+
+    one = recording(12)
+    header = LogHeader("a", "continuous", "kPa", 3, 3, one.arm, (0.0, 0.0, 1.0), rows=12)
+    with recording_log(folder / "one" / "a.jsonl", header) as log:
+        for row in range(one.samples):
+            parts = one.measured[row], one.key_points_mm[row], one.commanded[row]
+            log.sample(row, int(one.run[row]), float(one.t_s[row]), *parts, temp_C=21.0)
+
+
+def read_logged(sample: Path) -> None:
+    """The recording in the log."""
+    from surgisoft.measurement.recordings.log import read_log
+
+    read_log(sample / "a.jsonl")
+
+
 def make_schedule(folder: Path) -> None:
     """A user's schedule of pressures."""
     (folder / "one").mkdir(parents=True)
@@ -440,6 +459,7 @@ def read_decision(sample: Path) -> None:
 
 TARGETS: dict[str, Target] = {
     "recording": Target(make_recordings, read_recordings, weight=3),
+    "log": Target(make_logs, read_logged, weight=2),
     "schedule": Target(make_schedule, read_schedule, weight=2),
     "import": Target(make_raw, read_raw, weight=3),
     "model": Target(make_models, read_model, ("config.json", "*.safetensors"), weight=2),

@@ -1,94 +1,291 @@
-"""Policies for other programs: ONNX and TorchScript, one file of each for an agent.
+"""Policies for other programs: networks and whole controllers as ONNX and TorchScript.
 
-Input `observation` (B, D) float32 as the task gives it, output `action` (B, m) float32, change of
-pressure in kPa, within the pumps' largest step; any batch.
+`AGENT.onnx` and `AGENT.pt` are an agent's network alone: `observation` (B, D) float32 as the task
+gives it in, `action` (B, m) float32 out, change of pressure in kPa within the pumps' largest step.
+
+`controller.onnx` and `controller.pt` are all of it, from measurements to commands, for one robot:
+see `ControllerGraph`. `controller.py` runs either without this package, and `policy.json` states
+every name, order, unit, scale and range.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
-import logging
-import warnings
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, cast
 
 import torch
+from torch import Tensor
 
+from surgisoft.agents import controller_runner
+from surgisoft.agents.controller import ControllerGraph, goal_docs
+from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.learned import LearnedPolicy
+from surgisoft.agents.observer import ObserverGains
 from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.errors import InputError
+from surgisoft.files import json_safe, new_folder, write_json
+from surgisoft.graphs import DoesNotTrace, largest_difference, write_onnx, write_torch_script
+from surgisoft.tasks.base import DocumentedTask, Task
+from surgisoft.tasks.describe import describe_agents
 
+FORMAT = 2
+"""Version of `policy.json`; version 1 had the networks alone."""
 TOLERANCE = 1e-5
 """Largest accepted difference between actions of exported and original policy, kPa."""
+CONTROLLER_TOLERANCE = 1e-4
+"""Largest accepted difference of any command (kPa), estimate (mm) or observation of an exported
+controller over CHECKED samples."""
+CHECKED = 40
+"""Samples of a random sequence on which an exported controller is compared."""
+SETTABLE = {
+    "mount": "pose of the arm's base in the task's frame, 4 x 4, mm",
+    "plant.lowest_kPa": "lowest pressure that is commanded, kPa",
+    "plant.highest_kPa": "highest pressure that is commanded, kPa",
+}
+"""Parts of an arm's state that a user may set before an episode, with their meaning."""
+NOTE = (
+    "A block's value is `scale` of the quantity x in `unit`. Values are clipped to -20..20; noise "
+    "may carry measured ones past low and high."
+)
 
 
-def export(policy: LearnedPolicy, folder: Path) -> list[Path]:
-    """Write `AGENT.onnx`, `AGENT.pt` and `policy.json`, each checked against the policy."""
+def export(
+    policy: LearnedPolicy,
+    folder: Path,
+    task: Task | None = None,
+    gains: ObserverGains | None = None,
+) -> list[Path]:
+    """Write a policy for other programs, each file checked against the policy; returns the files.
+
+    task: where the policy acts, None: the task of its run. gains: of the observer.
+    """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already there; choose another name")
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for agent, actor in policy.actors.items():
-        width = policy.run.agents[agent]["observation"]
-        actor = actor.to("cpu")
-        written.append(_torch_script(actor, width, folder / f"{agent}.pt"))
-        written.append(_onnx(actor, width, folder / f"{agent}.onnx"))
-    about = {
-        "task": policy.run.config["task"],
-        "checkpoint": policy.which,
-        "iteration": policy.iteration,
-        "input": "observation (B, D) float32",
-        "output": "action (B, m) float32, change of pressure, kPa",
-        "agents": policy.run.agents,
-        "trained_with": policy.run.config["versions"],
+    task = task or policy.run.task()
+    with new_folder(folder) as fresh:
+        written = []
+        for agent, actor in policy.actors.items():
+            width = policy.run.agents[agent]["observation"]
+            written += _network(actor.to("cpu"), width, fresh / agent)
+        content = {
+            "format": FORMAT,
+            "task": policy.run.config["task"],
+            "checkpoint": policy.which,
+            "iteration": policy.iteration,
+            "input": "observation (B, D) float32",
+            "output": "action (B, m) float32, change of pressure, kPa",
+            "agents": policy.run.agents,
+            "trained_with": policy.run.config["versions"],
+        }
+        try:
+            graph = ControllerGraph(task, policy.actors, gains).eval().requires_grad_(False)
+            _controller(graph, fresh)
+            written += [fresh / "controller.onnx", fresh / "controller.pt"]
+            content |= describe_controller(graph)
+            runner = Path(controller_runner.__file__).read_text(encoding="utf-8")
+            (fresh / "controller.py").write_text(runner, encoding="utf-8")
+            written.append(fresh / "controller.py")
+        except (DoesNotTrace, InputError) as error:
+            content |= {"controller": None, "note": str(error)}
+        write_json(fresh / "policy.json", content)
+        names = [*(file.name for file in written), "policy.json"]
+    return [folder / name for name in names]
+
+
+def controller_of(
+    policy: LearnedPolicy, task: Task | None = None, gains: ObserverGains | None = None
+) -> Controller:
+    """The controller of a policy in this process, without any file; arguments as for `export`."""
+    graph = ControllerGraph(task or policy.run.task(), policy.actors, gains)
+    return running(graph.eval().requires_grad_(False))
+
+
+def running(graph: ControllerGraph) -> Controller:
+    """A controller that computes with a graph of this process."""
+    names = graph.inputs
+
+    def function(given: Mapping[str, Any]) -> list:
+        with torch.no_grad():
+            found = graph(*(torch.from_numpy(given[name]) for name in names))
+        return [value.numpy() for value in found]
+
+    return Controller.of(json_safe(describe_controller(graph)), function)
+
+
+def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
+    """What `policy.json` says of a controller: names, order, units, scales and ranges."""
+    task, meanings = graph.task, goal_docs(graph.start.goal)
+    leaves: list[dict[str, Any]] = [
+        {"name": leaf.name, "first": leaf.first, "last": leaf.last, "shape": list(leaf.shape)}
+        for leaf in graph.leaves
+    ]
+    initial = graph.initial[0].tolist()
+    arms = [
+        {
+            "name": name,
+            "chambers": arm.chambers,
+            "key_points": arm.key_points,
+            "lowest_kPa": arm.low.tolist(),
+            "highest_kPa": arm.high.tolist(),
+            "start_kPa": arm.first.tolist(),
+            "largest_change_kPa": arm.pneumatics.step_kPa,
+            "model": arm.model.summary(),
+        }
+        for name, arm in graph.arms.items()
+    ]
+    goals = [
+        {**leaf, "meaning": meanings[leaf["name"]], "default": _shaped(initial, leaf)}
+        for leaf in leaves
+        if leaf["name"] in meanings
+    ]
+    if graph.signals:
+        lesion = next(leaf for leaf in leaves if leaf["name"] == "lesion")
+        goals.append({**lesion, "meaning": "number of the lesion", "default": 0})
+    settable = [
+        {**leaf, "meaning": meaning, "default": _shaped(initial, leaf)}
+        for leaf in leaves
+        for suffix, meaning in SETTABLE.items()
+        if leaf["name"].startswith("arms.") and leaf["name"].split(".", 2)[2] == suffix
+    ]
+    described = describe_agents(cast(DocumentedTask, graph.simulated))
+    signals = [
+        asdict(signal) | {"optional": signal.default is not None} for signal in graph.signals
+    ]
+    return {
+        "episode_steps": task.steps,
+        "episode_s": task.steps * graph.control_s,
+        "observations": {
+            agent: [
+                {
+                    "name": block.name,
+                    "first": block.first,
+                    "last": block.last,
+                    "unit": block.unit,
+                    "scale": block.scale,
+                    "low": block.low,
+                    "high": block.high,
+                    "meaning": block.meaning,
+                }
+                for block in facts.observation
+            ]
+            for agent, facts in described.items()
+        },
+        "observations_note": NOTE,
+        "controller": {
+            "onnx": "controller.onnx",
+            "torchscript": "controller.pt",
+            "runner": "controller.py",
+            "control_period_s": graph.control_s,
+            "arms": arms,
+            "signals": signals,
+            "inputs": graph.inputs,
+            "outputs": graph.outputs,
+            "tensors": _tensors(graph),
+            "goal": goals,
+            "settable": settable,
+            "state": {"size": len(initial), "leaves": leaves, "initial": initial},
+        },
     }
-    (folder / "policy.json").write_text(json.dumps(about, indent=2) + "\n")
-    return [*written, folder / "policy.json"]
 
 
-def _torch_script(actor: ScaledActor, width: int, file: Path) -> Path:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        script = torch.jit.trace(actor, torch.zeros(2, width))
-        script.save(str(file))
-        again = torch.jit.load(str(file))
-    _check(actor, width, lambda seen: again(seen), file)
-    return file
+def _tensors(graph: ControllerGraph) -> dict[str, dict]:
+    """Input or output -> its shape, unit, range and meaning."""
+    size = graph.initial.shape[1]
+    found: dict[str, dict] = {
+        "state": {"shape": [1, size], "meaning": "all memories, see `state`"},
+        "begin": {"shape": [1], "meaning": "1 if the episode begins with this sample, else 0"},
+        "dt_s": {"shape": [1], "unit": "s", "meaning": "time since the sample before"},
+        "next_state": {"shape": [1, size], "meaning": "the state for the next sample"},
+    }
+    for name, arm in graph.arms.items():
+        row, points = [1, arm.chambers], [1, arm.key_points, 3]
+        low, high = float(arm.low.min()), float(arm.high.max())
+        kPa = {"shape": row, "unit": "kPa", "low": low, "high": high}
+        mm = {"shape": points, "unit": "mm"}
+        base = "frame of the arm's base, from the base to the tip"
+        found |= {
+            f"{name}_pressure_kPa": {**kPa, "meaning": "measured pressures"},
+            f"{name}_key_points_mm": {
+                **mm,
+                "meaning": f"measured key points, {base}; NaN where one is lost",
+            },
+            f"{name}_commanded_kPa": {**kPa, "meaning": "set points that are in force"},
+            f"{name}_command_kPa": {**kPa, "meaning": "set points to command now"},
+            f"{name}_estimate_mm": {**mm, "meaning": "estimated key points, task's frame"},
+            f"{name}_model_mm": {**mm, "meaning": "the arm model's key points, task's frame"},
+            f"{name}_observation": {
+                "shape": [1, graph.widths[name]],
+                "meaning": "observation of the last decision, see `observations`",
+            },
+        }
+    for signal in graph.signals:
+        about = {"unit": signal.unit, "low": signal.low, "high": signal.high}
+        found[signal.name] = {"shape": [1], **about, "meaning": signal.meaning}
+    return {name: {"dtype": "float32", **about} for name, about in found.items()}
 
 
-def _onnx(actor: ScaledActor, width: int, file: Path) -> Path:
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            actor,
-            (torch.zeros(2, width),),
-            str(file),
-            input_names=["observation"],
-            output_names=["action"],
-            dynamic_shapes=({0: torch.export.Dim("batch")},),
-            external_data=False,
-            dynamo=True,
-            verbose=False,
-        )
-    from onnx.reference import ReferenceEvaluator
-
-    session = ReferenceEvaluator(str(file))
-    _check(
-        actor,
-        width,
-        lambda seen: torch.from_numpy(next(iter(session.run(None, {"observation": seen.numpy()})))),
-        file,
-    )
-    return file
+def _shaped(values: list[float], leaf: dict) -> Any:
+    """A part of a state vector as nested lists."""
+    flat = torch.tensor(values[leaf["first"] : leaf["last"]])
+    return flat.reshape(leaf["shape"]).tolist()
 
 
-def _check(actor: ScaledActor, width: int, other, file: Path) -> None:
-    """Compare on 64 observations far beyond what tasks give; delete the file if they differ."""
+def _controller(graph: ControllerGraph, folder: Path) -> None:
+    """Write `controller.pt` and `controller.onnx`, each checked on a sequence of samples."""
+    example = graph.example()
+    files = {
+        "controller.pt": lambda file: write_torch_script(graph, example, file),
+        "controller.onnx": lambda file: write_onnx(
+            graph, example, file, graph.inputs, graph.outputs, batched=False
+        ),
+    }
+    for name, write in files.items():
+        worst = largest_difference(graph, write(folder / name), _samples(graph), states=1)
+        if not worst <= CONTROLLER_TOLERANCE:
+            (folder / name).unlink()
+            raise DoesNotTrace(
+                f"controller: {name} differs by {worst:.2g} from the policy; an effect or a task "
+                "that branches on values cannot be exported"
+            )
+
+
+def _samples(graph: ControllerGraph) -> Iterator[list[Tensor]]:
+    """A random sequence of measurements, in which the episode begins after a few samples."""
+    random = torch.Generator().manual_seed(0)
+    pressure = {name: arm.first.clone() for name, arm in graph.arms.items()}
+    for sample in range(CHECKED):
+        given = [graph.initial, torch.tensor([float(sample == 5)]), torch.tensor([0.05])]
+        for name, arm in graph.arms.items():
+            step = arm.pneumatics.step_kPa * torch.randn(arm.chambers, generator=random)
+            pressure[name] = (pressure[name] + step).clamp(arm.low, arm.high)
+            noise = torch.randn(1, arm.key_points, 3, generator=random)
+            points = cast(Tensor, arm.model.rest_mm) + noise
+            commanded = pressure[name] + 0.1 * torch.rand(arm.chambers, generator=random)
+            given += [pressure[name][None].clone(), points, commanded[None]]
+        for signal in graph.signals:
+            share = torch.rand(1, generator=random)
+            value = signal.low + (signal.high - signal.low) * share
+            optional = signal.default is not None and math.isnan(signal.default)
+            given.append(torch.full((1,), torch.nan) if optional and sample % 2 else value)
+        yield given
+
+
+def _network(actor: ScaledActor, width: int, stem: Path) -> list[Path]:
+    """Write an actor as `STEM.pt` and `STEM.onnx`, checked far beyond what tasks give."""
+    example = [torch.zeros(2, width)]
     seen = 3.0 * torch.randn(64, width, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        worst = (actor(seen) - other(seen)).abs().max().item()
-    if not worst <= TOLERANCE:
-        file.unlink()
-        raise RuntimeError(f"{file}: actions differ by {worst:.2g} kPa from the policy's")
+    written = []
+    for suffix in (".pt", ".onnx"):
+        file = stem.with_name(stem.name + suffix)
+        if suffix == ".pt":
+            other = write_torch_script(actor, example, file)
+        else:
+            other = write_onnx(actor, example, file, ["observation"], ["action"])
+        worst = largest_difference(actor, other, [[seen]])
+        if not worst <= TOLERANCE:
+            raise RuntimeError(f"{file}: actions differ by {worst:.2g} kPa from the policy's")
+        written.append(file)
+    return written

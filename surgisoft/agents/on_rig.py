@@ -9,10 +9,8 @@ errors are the true ones of the plant, without the cameras' noise. A real rig ha
 is the measured one, errors contain the noise of the cameras, and where a key point is lost the
 estimate stands in. There is one bench, so that episodes run one after the other.
 
-An observer makes an estimate of them: the arm's model runs beside the rig, driven by the measured
-pressures, and its output is corrected by a filtered output disturbance, as in offset-free model
-predictive control (Pannocchia & Rawlings 2003). With `observer_gain` = 1 the estimate is the raw
-measurement.
+An observer (`surgisoft.agents.observer`) makes an estimate of them; with `observer_gain` = 1 the
+estimate is the raw measurement.
 """
 
 from __future__ import annotations
@@ -28,10 +26,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surgisoft.agents.observer import Observer, ObserverGains
 from surgisoft.errors import InputError
 from surgisoft.rig import Rig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.rig.registry import open_rig, parse_rig
+from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
 from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.tasks.base import Task
@@ -46,20 +45,18 @@ class RigConfig:
 
     seed: int = 0
     """Seed of the robot of a simulated rig; the default arm model was fitted to robot 0."""
-    hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects of a simulated rig: (name, amplitude)."""
+    hidden: tuple[HiddenEffect, ...] = ()
+    """Hidden effects of a simulated rig: (name, amplitude) or (name, amplitude, seconds)."""
     noise: float = 1.0
     """Factor on all sensor and camera noise of a simulated rig."""
     cameras: bool = True
     """Whether cameras measure the key points; else the model alone estimates them."""
-    observer_gain: float = 0.3
-    """Share of the innovation (cameras minus estimate) that the estimate adopts in a step, 0..1:
-    the alpha of an alpha-beta filter."""
-    drift_gain: float = 0.01
-    """Share of the innovation that is added to the disturbance's rate, 0..1: the filter's beta."""
-    pump_gain: float = 0.3
-    """Share of the difference between measured and expected pressure that the estimated offset of
-    the pumps adopts in a step, 0..1."""
+    observer_gain: float = ObserverGains.observer_gain
+    """The field of `ObserverGains`."""
+    drift_gain: float = ObserverGains.drift_gain
+    """The field of `ObserverGains`."""
+    pump_gain: float = ObserverGains.pump_gain
+    """The field of `ObserverGains`."""
     settle_s: float = 4.0
     """Time at each pressure of the random history before an episode, s."""
     rigs: tuple[str, ...] = ("virtual",)
@@ -67,12 +64,21 @@ class RigConfig:
     `ARM=NAME[:...]` for single arms, the others then being virtual."""
 
     def __post_init__(self):
-        for name in ("observer_gain", "drift_gain", "pump_gain"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"rig: {name} is {getattr(self, name)}, expected 0 to 1")
+        _ = self.gains  # which checks them
         if not self.settle_s > 0.0:
             raise InputError(f"rig: settle_s is {self.settle_s}, expected more than 0 s")
 
+    @property
+    def gains(self) -> ObserverGains:
+        """The gains of the observer."""
+        return ObserverGains(self.cameras, self.observer_gain, self.drift_gain, self.pump_gain)
+
+
+FOREIGN_RATIO = 5.0
+"""Ratio of a model's error on a rig to its validated error from which the model is reported: far
+above what noise and the history of the same arm explain."""
+FOREIGN_LEAST_mm = 0.5
+"""Error below which no model is reported [mm]."""
 
 BuildRig = Callable[[RigConfig, int], Rig]
 """Makes the rig of one arm of one episode from the configuration and the number of its trial.
@@ -161,9 +167,20 @@ class RigArm:
     is there once; simulated rigs are in `ArmPart.plant`.
     """
 
-    def __init__(self, arm: ModelArm, config: RigConfig, dt_s: float, build: BuildRig = named_rig):
-        """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s."""
+    def __init__(
+        self,
+        arm: ModelArm,
+        config: RigConfig,
+        dt_s: float,
+        build: BuildRig = named_rig,
+        on_warning: Callable[[str], None] | None = None,
+    ):
+        """arm: the simulated arm that the rigs replace; dt_s: time of a step of the world, s.
+
+        on_warning: is called once where the arm model does not predict the first measured poses.
+        """
         self.config, self.build = config, build
+        self.on_warning = on_warning
         rig = build(config, 0)
         self.real: SafeRig | None = None
         if not is_simulated(rig):
@@ -178,6 +195,7 @@ class RigArm:
         low, high = (torch.tensor(end).to(arm.low) for end in rig.limits.T)
         self.lowest = torch.maximum(arm.low, low)
         self.highest = torch.minimum(arm.high, high)
+        self.observer = Observer(arm, config.gains, dt_s, self.lowest, self.highest)
         self.simulated = arm
         self.name, self.device, self.vary = arm.name, arm.device, arm.vary
         self.chambers, self.key_points = arm.chambers, arm.key_points
@@ -225,35 +243,35 @@ class RigArm:
             part,
             gain=torch.ones_like(part.gain),
             arm=self.model.initial_state(len(rigs.items)),
+            belief=None,
             plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
         )
+        off_mm = []
         for target in (*passed, first):
-            for _ in range(round(self.config.settle_s / self.period_s)):
+            for _ in range(max(1, round(self.config.settle_s / self.period_s))):
                 part, reading = self._read(part, target)
-        part = replace(part, command=reading.pressure)
-        return stream, self._observed(part, reading, begins=True)
+            off_mm.append(frames.apply(part.mount, reading.points_mm) - part.points_mm)
+        self._compare(torch.stack(off_mm))
+        part = self.observer.begun(part, reading.pressure, reading.points_mm)
+        return stream, self._true(part, reading)
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
-        """Advance one step with changes of pressure (B, m), kPa.
-
-        `part.command` is the command after which a pump of the simulated arm would give what the
-        rig's pump gives: the two differ by an offset, which is estimated here.
-        """
-        target = part.plant.target_kPa.to(action)
-        shift = part.command - target
-        target = self.pneumatics.command(target, action, self.lowest, self.highest)
-        expected = self.pneumatics.follow(part.pressure, target + shift, dt_s)
+        """Advance one step with changes of pressure (B, m), kPa; dt_s is that of the world."""
+        order = self.observer.order(part, action)
         for _ in range(self.reads):
-            part, reading = self._read(part, target)
-        surprise = (reading.pressure - expected) / self.pneumatics.share(dt_s)
-        shift = shift + self.config.pump_gain * surprise
-        return stream, self._observed(replace(part, command=target + shift), reading)
+            part, reading = self._read(part, order.target_kPa)
+        part = self.observer.stepped(part, order, reading.pressure, reading.points_mm)
+        return stream, self._true(part, reading)
 
     def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
         """One-step prediction of the key points, see `Arm.predict`, with the estimated offset."""
         return self.simulated.predict(part, pressure, dt_s)
+
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The state with its body moved to key points, see `Arm.posed`."""
+        return self.simulated.posed(part, points_mm)
 
     def settled(self, pressure: Tensor) -> Tensor:
         """Steady-state key points of the arm model, see `Arm.settled`."""
@@ -273,6 +291,26 @@ class RigArm:
         rig.reset()
         return rig
 
+    def _compare(self, off_mm: Tensor) -> None:
+        """Report a model that does not predict the first poses: (P, B, n, 3) mm, measured minus it.
+
+        The error is the root mean square of the distance of a key point, as the validated one.
+        """
+        if self.on_warning is None:
+            return
+        report, self.on_warning = self.on_warning, None
+        error_mm = float(off_mm.norm(dim=-1).square().nanmean().sqrt())
+        validated_mm = self.model.validation.rmse_mm
+        if validated_mm is None or not validated_mm > 0.0:
+            return
+        if error_mm > max(FOREIGN_RATIO * validated_mm, FOREIGN_LEAST_mm):
+            report(
+                f"arm '{self.name}': its model is {error_mm:.1f} mm off the first "
+                f"{len(off_mm) * off_mm.shape[1]} poses measured on the rig, and was validated at "
+                f"{validated_mm:.2g} mm: it is a model of another robot, or the robot has changed "
+                "('surgisoft diagnose' finds out what; --arm names another model)"
+            )
+
     def _read(self, part: ArmPart, target: Tensor) -> tuple[ArmPart, Reading]:
         """One period of the rigs towards pressures (B, m) kPa; the model goes along."""
         rows = []
@@ -289,41 +327,28 @@ class RigArm:
         reading = Reading(
             *(torch.tensor(each, dtype=torch.float32, device=self.device) for each in columns)
         )
-        model, points = self.simulated.bent(part, reading.pressure, self.period_s)
-        plant = replace(part.plant, target_kPa=target)
-        part = replace(part, arm=model, points_mm=points, pressure=reading.pressure, plant=plant)
-        return part, reading
+        part = replace(part, plant=replace(part.plant, target_kPa=target))
+        return self.observer.followed(part, reading.pressure, self.period_s), reading
 
-    def _observed(self, part: ArmPart, reading: Reading, begins: bool = False) -> ArmPart:
-        """The part as estimated and as it truly is; its key points so far are the model's.
-
-        An alpha-beta filter (Kalata 1984) estimates by how much the body lies off the model: it
-        follows a steady drift without lag. At the beginning of an episode the whole first
-        innovation is taken over.
-        """
-        seen, offset, plant = part.points_mm, part.offset_mm, part.plant
-        if self.config.cameras:
-            measured = frames.apply(part.mount, reading.points_mm)
-            surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
-            if begins:
-                drift, now = plant.drift_mm, offset + surprise
-            else:
-                drift = plant.drift_mm + self.config.drift_gain * surprise
-                now = offset + self.config.observer_gain * surprise
-            seen, offset = seen + now, now + drift
-            plant = replace(plant, drift_mm=drift)
+    def _true(self, part: ArmPart, reading: Reading) -> ArmPart:
+        """The part with the body of the plant in place of the model's."""
         body = frames.apply(part.mount, reading.true_mm)
         if self.real is not None:
-            body = body.where(body.isfinite(), seen)
-        part = self.simulated.posed(part, body)
-        return replace(part, seen_mm=seen, seen_kPa=reading.pressure, offset_mm=offset, plant=plant)
+            body = body.where(body.isfinite(), part.seen_mm)
+        return self.simulated.posed(part, body)
 
 
-def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_rig) -> Task:
+def on_rig(
+    task: Task,
+    config: RigConfig | None = None,
+    build: BuildRig = named_rig,
+    on_warning: Callable[[str], None] | None = None,
+) -> Task:
     """The task with every arm on a rig; the given task stays as it is.
 
     Tasks ask their world for its arms, so that this exchanges the world only. Real benches are open
-    from here on: run the task inside `at_benches`.
+    from here on: run the task inside `at_benches`. on_warning: is called once for each arm whose
+    model does not predict the first poses that are measured on its rig.
     """
     config = config or RigConfig()
     world, moved = copy.copy(task.world), copy.copy(task)
@@ -334,7 +359,7 @@ def on_rig(task: Task, config: RigConfig | None = None, build: BuildRig = named_
         for name, arm in world.arms.items():
             if not isinstance(arm, ModelArm):
                 raise InputError(f"arm '{name}' is on a rig already, expected a simulated arm")
-            placed = RigArm(arm, replace(config, rigs=(texts[name],)), dt_s, build)
+            placed = RigArm(arm, replace(config, rigs=(texts[name],)), dt_s, build, on_warning)
             opened.callback(placed.close)
             arms[name] = placed
             if placed.real is not None and list(texts.values()).count(texts[name]) > 1:

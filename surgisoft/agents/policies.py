@@ -77,7 +77,9 @@ def open_policy(name: str, task: Task) -> Policy:
 
 def check_policy(name: str) -> None:
     """Raise InputError unless the name is that of a policy or a path that exists."""
-    if name in POLICIES or Path(name).exists():
+    from surgisoft.agents.run_folder import run_path
+
+    if name in POLICIES or run_path(name).exists():
         return
     if Path(name).name == name:
         raise unknown_name("policy", name, [*POLICIES, "the folder of a training run"])

@@ -77,6 +77,20 @@ class RunConfig:
     """See `Plan`."""
 
 
+PACKAGED = Path(surgisoft.__file__).parent / "assets" / "policies"
+"""Folder of the runs that the package brings along."""
+
+
+def run_path(path: str | Path) -> Path:
+    """The folder of a run; the name of a packaged one, such as `ring`, gives its folder.
+
+    A file or folder of that name in the working directory has precedence.
+    """
+    path = Path(path)
+    named = len(path.parts) == 1 and not path.exists()
+    return PACKAGED / path if named and (PACKAGED / path / "config.json").is_file() else path
+
+
 def default_folder(task: str) -> Path:
     """A free `runs/TASK-DATE-TIME`."""
     base = Path("runs") / f"{task}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -163,7 +177,7 @@ class RunFolder:
     """A run that is there."""
 
     def __init__(self, path: str | Path):
-        self.path = Path(path)
+        self.path = run_path(path)
         file = self.path / "config.json"
         if not file.is_file():
             raise InputError(

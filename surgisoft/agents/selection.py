@@ -18,8 +18,8 @@ def evaluate_checkpoint(
 ) -> tuple[dict[str, float], EpisodeLog]:
     """Means over validation episodes without exploration noise, and the first episode's log.
 
-    error_mm: mean over steps and episodes; success: share of episodes, absent where a task has
-    none; the other measures by their names.
+    error_mm: mean over steps and episodes of the task's first error; success: share of episodes,
+    absent where a task has none; the other measures by their names.
     """
     watch = EpisodeRecorders(task, "learned", SEED, only=0)
     result = rollout(task, policy, episodes, SEED, watch=watch)
@@ -27,7 +27,7 @@ def evaluate_checkpoint(
     for name, trace in result.measures.items():
         if name == "success":
             means[name] = result.end(name).mean().item()
-        elif name.endswith("error_mm"):
+        elif name.endswith("error_mm") and "error_mm" not in means:
             means["error_mm"] = trace.nanmean().item()
         elif name in ("completion", "largest_gap_mm", "healthy_mm2"):
             means[name] = result.end(name).nanmean().item()

@@ -8,16 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from surgisoft.agents.evaluate import CONFIDENCE, Evaluation
 from surgisoft.agents.evaluate import evaluate as evaluate_policy
 from surgisoft.agents.on_rig import RigConfig, at_benches, on_rig, real_benches
-from surgisoft.agents.policies import POLICIES, check_policy, open_policy
+from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
 from surgisoft.agents.rollout import BATCH, EpisodeRecorders
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
-from surgisoft.tasks.base import Task
+from surgisoft.tasks.base import Episodes, Task
+from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
     TASKS,
@@ -116,6 +119,8 @@ class Evaluations:
     measured_arms: tuple[str, ...] = ()
     """Arms on a real bench: their errors are those of the measured key points, camera noise
     included."""
+    success_rule: str = ""
+    """What an episode needs to be a success, in words; empty for a task without success."""
 
     def to_json(self) -> dict:
         """Plain values, as `evaluate --json` writes them."""
@@ -126,6 +131,7 @@ class Evaluations:
             "on": asked.place,
             "rig": asked.rig and to_table(asked.rig),
             "measured_arms": list(self.measured_arms),
+            "success_rule": self.success_rule or None,
             "seed": asked.seed,
             "episodes": asked.episodes,
             "dt_s": self.dt_s,
@@ -156,9 +162,21 @@ def evaluate(
     names = tuple(dict.fromkeys(str(name) for name in given))
     request = EvaluationRequest(names, task, **fields)
     plain, config = request.resolved(on_warning)
-    place = plain if request.rig is None else on_rig(plain, request.rig)
+    place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
     with at_benches(place):
         return _evaluated(request, plain, place, config, progress)
+
+
+def _warm_up(task: Task, policy: Policy) -> None:
+    """Let a policy act once in simulation.
+
+    The first action takes seconds where code is compiled or read from the disk, for which no real
+    bench should wait under pressure.
+    """
+    with torch.inference_mode():
+        runner = Episodes(task)
+        state = runner.seeded(0, 1)
+        runner.step(state, policy.act(task, state, runner.observe(state)))
 
 
 def _evaluated(
@@ -167,6 +185,9 @@ def _evaluated(
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
     measured = tuple(real_benches(place))
     opened = {name: open_policy(name, place) for name in request.policies}
+    if measured:
+        for policy in opened.values():
+            _warm_up(plain, policy)
     logs = {
         name: EpisodeRecorders(place, name, request.seed, request.place, only=0)
         for name in request.log
@@ -199,4 +220,5 @@ def _evaluated(
         tuple(results),
         {name: each.log(0) for name, each in logs.items()},
         measured,
+        success_rule(config) if isinstance(config, CircleAblationConfig) else "",
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from surgisoft.agents.distributed import processes
-from surgisoft.agents.presets import Plan, preset_for, steps_for
+from surgisoft.agents.presets import Plan, config_for, preset_for, steps_for
 from surgisoft.agents.run_folder import check_free, default_folder
 from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
@@ -25,7 +25,8 @@ class TrainingRequest:
     task: str
     """Name of the task."""
     preset: str = "fast"
-    """`fast`, or `paper`: the hyper-parameters of Chen et al. 2025."""
+    """`fast`; `randomised`: the same under domain randomization; or `paper`: the hyper-parameters
+    of Chen et al. 2025."""
     steps: int | None = None
     """Steps over all episodes; None: the number that the task names, unless minutes are given."""
     minutes: float | None = None
@@ -52,6 +53,7 @@ class TrainingRequest:
             )
         config = task_config(self.task, self.config, self.arm, self.scene)
         numbers = preset_for(self.preset, self.task, envs=self.envs)
+        config = config_for(self.preset, config)
         steps = self.steps
         if steps is None and self.minutes is None:
             steps = steps_for(self.preset, self.task)

@@ -18,6 +18,7 @@ app = typer.Typer(
 )
 
 COMMANDS = (
+    "demo",
     "collect",
     "import_",
     "fit",
@@ -27,7 +28,9 @@ COMMANDS = (
     "amend",
     "improve",
     "train",
+    "export",
     "evaluate",
+    "run",
     "scene",
     "experiment",
     "rig",
@@ -46,8 +49,9 @@ MANY = {
         "--effects",
         "--hidden",
         "--label",
+        "--model-code",
     ),
-    *("--policy", "--strength", "--valid", "--without"),
+    *("--policy", "--predictions", "--strength", "--valid", "--without"),
 }
 """Options with one or more values: `--valid A B` reads as `--valid A --valid B`."""
 

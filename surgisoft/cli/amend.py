@@ -16,6 +16,7 @@ from surgisoft.cli.options import (
     Force,
     JsonFile,
     Model,
+    ModelError,
     NewModel,
     Paired,
     Refit,
@@ -63,6 +64,7 @@ def amend(
         ),
     ] = False,
     refit: Refit = "auto",
+    model_error: ModelError = None,
 ) -> None:
     """Amend a model: add a physical effect and validate it on held-out data.
 
@@ -77,16 +79,14 @@ def amend(
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.amend import amend as amend_model
-    from surgisoft.surrogate.checkpoint import load_model
     from surgisoft.surrogate.effects import named_effect
 
     # Files of effects first: the model may hold one of them.
     names = [named_effect(given) for given in effects]
-    arm = load_model(model)
     with progress("amend") as tell:
         stages = iter(range(100))
         result = amend_model(
-            arm,
+            model,
             measured,
             names,
             not keep_network,
@@ -96,6 +96,7 @@ def amend(
             refit=refit,
             refit_progress=tell,
             processes=REFIT_PROCESSES,
+            error_mm=model_error,
         )
     warn_all(result.notes)
     saved = result.claimed or anyway

@@ -189,8 +189,12 @@ def record_on(
     log = log_of(output)
     there = log.exists()
     check = checked_by(preflight) if preflight else None
-    if not simulated:
+
+    def before(rig: Rig) -> None:
         warn(STOP_NOTE)
+        if check:
+            check(rig)
+
     try:
         with progress(f"collect {protocol}") as report:
             return collect_recording(
@@ -199,7 +203,7 @@ def record_on(
                 progress=report,
                 log=None if simulated else log,
                 force=force,
-                before=check,
+                before=None if simulated else before,
                 **fields,
             )
     except BaseException:
@@ -223,11 +227,14 @@ def checked_by(model: Path) -> Callable[[Rig], None]:
     return check
 
 
-def written_line(path: Path, recording: Recording, hidden: Sequence[tuple[str, float]] = ()) -> str:
+def written_line(path: Path, recording: Recording, hidden: Sequence[Sequence] = ()) -> str:
     """One line about a recording that was written."""
     minutes = recording.t_s[-1] / 60
     noise = "" if recording.noise_mm is None else f", noise {recording.noise_mm:.3f} mm"
-    secret = "".join(f", hidden {name} {size:g}" for name, size in hidden)
+    secret = "".join(
+        f", hidden {name} {size:g}" + "".join(f" from {begins_s:g} s on" for begins_s in late)
+        for name, size, *late in hidden
+    )
     return (
         f"wrote {path}: {recording.samples} {recording.kind} samples of {recording.chambers} "
         f"chambers and {recording.key_points} key points in {len(recording.runs)} runs, "
@@ -235,8 +242,8 @@ def written_line(path: Path, recording: Recording, hidden: Sequence[tuple[str, f
     )
 
 
-def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
-    """Hidden effects with their amplitudes; 1 where none is given."""
+def _pairs(given: list[str], strengths: list[float]) -> list:
+    """Hidden effects with their amplitudes, 1 where none is given, and times of beginning."""
     if len(strengths) not in (0, len(given)):
         raise InputError(
             f"{len(given)} --hidden and {len(strengths)} --strength, expected one for each"
@@ -246,9 +253,9 @@ def _pairs(given: list[str], strengths: list[float]) -> list[tuple[str, float]]:
     from surgisoft.rig.registry import hidden_effects
 
     pairs = hidden_effects(given)
-    return (
-        [(name, x) for (name, _), x in zip(pairs, strengths, strict=True)] if strengths else pairs
-    )
+    if not strengths:
+        return pairs
+    return [(name, x, *late) for (name, _, *late), x in zip(pairs, strengths, strict=True)]
 
 
 def check_new_recording(path: Path, force: bool) -> None:

@@ -6,14 +6,17 @@ from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
+    AnyModel,
     Before,
     EffectFiles,
     JsonFile,
-    Model,
+    ModelError,
     Paired,
+    Predictions,
     Recordings,
     Replay,
     Report,
+    model_options,
     with_effect_files,
 )
 from surgisoft.files import write_json
@@ -26,10 +29,12 @@ LEAST_SHOWN = 0.02
 
 @app.command()
 def compare(
-    model: Model,
+    model: AnyModel,
     recordings: Recordings,
     before: Before = None,
     paired: Paired = "auto",
+    predictions: Predictions = None,
+    model_error: ModelError = None,
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
@@ -40,15 +45,21 @@ def compare(
     check_folder(report)
     check_replay(replay)
 
-    check_model(model)
+    check_model(model, predictions)
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.compare import compare as compare_model
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
-    result, rest = compare_model(arm, measured, before=earlier, paired=paired)
+    result, rest = compare_model(
+        model,
+        measured,
+        before=earlier,
+        paired=paired,
+        predictions=predictions,
+        error_mm=model_error,
+    )
+    arm = rest.model
     warn_all(result.notes)
     title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
     written = []
@@ -80,6 +91,7 @@ def compare(
     if result.explainable:
         names = " ".join(map(str, recordings))
         since = f" --before {' '.join(map(str, before))}" if before else ""
+        since += model_options(predictions, model_error)
         following = with_effect_files(f"surgisoft diagnose {model} {names}{since}")
         print(f"next, which effect is missing: {following}")
 

@@ -11,11 +11,13 @@ from surgisoft.cli.files import check_folder, check_free, check_new_folder, chec
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
+    AnyModel,
     Before,
     EffectFiles,
     JsonFile,
-    Model,
+    ModelError,
     Paired,
+    Predictions,
     Recordings,
     Refit,
     Report,
@@ -37,13 +39,15 @@ ReplayOfChange = Annotated[
 
 @app.command()
 def diagnose(
-    model: Model,
+    model: AnyModel,
     recordings: Recordings,
     json_file: JsonFile = None,
     report: Report = None,
     replay: ReplayOfChange = None,
     before: Before = None,
     paired: Paired = "auto",
+    predictions: Predictions = None,
+    model_error: ModelError = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,19 +86,17 @@ def diagnose(
     if replay and not before:
         raise InputError("--replay shows a change; add --before REC, or use 'surgisoft compare'")
     check_new_folder(apply)
-    check_model(model)
+    check_model(model, predictions)
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.measurement.recordings import save_recordings
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(
-            arm,
+            model,
             measured,
             lambda text: tell(next(stages), 6, text),
             without=without or (),
@@ -104,6 +106,8 @@ def diagnose(
             refit=refit,
             refit_progress=tell,
             processes=REFIT_PROCESSES,
+            predictions=predictions,
+            error_mm=model_error,
         )
     warn_all(found.notes)
     written = []

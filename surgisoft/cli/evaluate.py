@@ -85,6 +85,16 @@ def evaluate(
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,
+    rules: Annotated[
+        Path | None,
+        typer.Option(
+            "--rules",
+            metavar="EXPERIMENT",
+            help="Rules of an experiment (FILE.toml, or a packaged name such as liver): its scene "
+            "and its fields of the task, such as fire_mm. Without it those of the training run, or "
+            "of --config.",
+        ),
+    ] = None,
     effect_files: EffectFiles = None,
     json_file: JsonFile = None,
     replay: Replay = None,
@@ -99,6 +109,10 @@ def evaluate(
 
     from surgisoft.agents.session import evaluate as evaluate_policies
 
+    of_task: object = config
+    if rules:
+        task, of_task = _rules(rules, task, config)
+
     with progress("evaluate") as report_progress:
         found = evaluate_policies(
             policies,
@@ -111,7 +125,7 @@ def evaluate(
             referee=referee,
             arm=arm,
             scene=scene,
-            config=config,
+            config=of_task,
             log=policies if report else policies[:1] if replay else (),
         )
     about = f"{counted(episodes, 'episode')} of seed {seed}"
@@ -132,6 +146,8 @@ def evaluate(
         written.append(write_page(page, report / "report.html"))
     print(f"{found.task}, {on}: {about}; mean [95 % interval]")
     _show(found.results)
+    if found.success_rule:
+        print(f"success: {found.success_rule}")
     if found.measured_arms:
         print(
             f"{', '.join(found.measured_arms)}: on a real bench, whose true body is not known; "
@@ -139,6 +155,19 @@ def evaluate(
         )
     for path in written:
         print(f"wrote {path}")
+
+
+def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str, object]:
+    """The task of an experiment and the task's configuration in it."""
+    if config:
+        raise InputError("--config and --rules both set the task's fields; give one of the two")
+    from surgisoft.experiments.session import open_experiment
+    from surgisoft.experiments.spec import TASK
+
+    if task not in (None, TASK):
+        raise InputError(f"--rules {experiment}: is an experiment of {TASK}, not of {task}")
+    spec = open_experiment(experiment)
+    return TASK, replace(spec.task, scene=spec.scene)
 
 
 def _rig_config(

@@ -15,6 +15,7 @@ from surgisoft.cli.options import (
     Force,
     JsonFile,
     Model,
+    ModelError,
     NewModel,
     Recordings,
     Refit,
@@ -35,6 +36,7 @@ def improve(
     json_file: JsonFile = None,
     report: Report = None,
     refit: Refit = "auto",
+    model_error: ModelError = None,
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
@@ -50,9 +52,7 @@ def improve(
     claim_other_folder(output, model, force)
 
     from surgisoft.diagnosis.improve import improve as improve_model
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
     with progress("improve") as tell:
         done = []
 
@@ -61,13 +61,14 @@ def improve(
             tell(len(done), most + 2, each.step or each.verdict)
 
         result = improve_model(
-            arm,
+            model,
             measured,
             most,
             after,
             refit=refit,
             refit_progress=tell,
             processes=REFIT_PROCESSES,
+            error_mm=model_error,
         )
     warn_all(result.notes)
     written = []

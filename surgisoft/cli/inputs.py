@@ -13,13 +13,35 @@ def warn(text: str) -> None:
     typer.echo(f"surgisoft: warning: {text}", err=True)
 
 
-def check_model(folder: Path) -> None:
-    """Raise InputError where there is no model, before anything is loaded that takes seconds."""
-    if str(folder) != "default" and not (folder / "config.json").is_file():
-        raise InputError(
-            f"{folder}: no arm model there (config.json is missing); expected 'default' or a "
-            "folder that 'surgisoft fit' made"
-        )
+def check_model(folder: Path, predictions: list[Path] | None = None) -> None:
+    """Raise InputError where there is no model, before anything is loaded that takes seconds.
+
+    predictions: files of predictions, for which the model is but a name.
+    """
+    text = str(folder)
+    if predictions:
+        if text == "default" or (folder / "config.json").is_file():
+            raise InputError(
+                f"{folder}: is a model, and --predictions takes the place of one; expected a name "
+                "for the model that made them, or no --predictions"
+            )
+        return
+    if text == "default" or (folder / "config.json").is_file():
+        return
+    if folder.suffix in (".csv", ".parquet") and folder.is_file():
+        return
+    if ":" in text and not folder.exists():
+        return
+    if not folder.exists():
+        from surgisoft.surrogate.callables.named import offered
+
+        if text in offered():
+            return
+    raise InputError(
+        f"{folder}: no arm model there (config.json is missing); expected 'default', a folder "
+        "that 'surgisoft fit' made, package.module:object or FILE.py:object of a callable, or a "
+        "file of predictions (docs/your_model.md)"
+    )
 
 
 def read_recordings(paths: Iterable[Path]) -> list:

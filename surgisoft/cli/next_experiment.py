@@ -9,7 +9,15 @@ from surgisoft.cli import app
 from surgisoft.cli.collect import check_new_recording, log_of, record_on, written_line
 from surgisoft.cli.files import check_folder, check_free
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
-from surgisoft.cli.options import EffectFiles, Force, JsonFile, Model
+from surgisoft.cli.options import (
+    AnyModel,
+    EffectFiles,
+    Force,
+    JsonFile,
+    ModelError,
+    Predictions,
+    model_options,
+)
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
@@ -22,7 +30,7 @@ SHOWN_PAIRS = 10
 
 @app.command("next-experiment")
 def next_experiment(
-    model: Model,
+    model: AnyModel,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(metavar="REC", help="Recordings so far; may be left out."),
@@ -44,6 +52,8 @@ def next_experiment(
     as_it_stands: Annotated[
         bool, typer.Option("--as-it-stands", help="Propose no change of the experimental setup.")
     ] = False,
+    predictions: Predictions = None,
+    model_error: ModelError = None,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -68,34 +78,41 @@ def next_experiment(
     check_free(json_file, "separates")
     if record:
         check_new_recording(record, force)
-    check_model(model)
+    check_model(model, predictions)
     measured = read_recordings(recordings) if recordings else []
 
     from surgisoft.diagnosis.design.next_experiment import next_experiment as find_experiment
     from surgisoft.diagnosis.design.schedules import AS_IT_STANDS, SETUPS, schedule_text
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
     competing = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
-    result = find_experiment(arm, measured, competing, minutes, settings)
+    result = find_experiment(
+        model,
+        measured,
+        competing,
+        minutes,
+        settings,
+        predictions=predictions,
+        error_mm=model_error,
+    )
     warn_all(result.notes)
     write_atomically(output, schedule_text(result.protocol))
     if json_file:
         write_json(json_file, result.to_json())
-    _show(result, arm.spec, model, recordings or [], output)
+    later = [*(predictions or []), Path("PREDICTIONS_OF_NEW.csv")] if predictions else None
+    _show(result, model, recordings or [], output, model_options(later, model_error))
     if record:
         _record(result, rig, output, record, force)
 
 
-def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> None:
+def _show(result, model: Path, recordings: list[Path], output: Path, of_model: str) -> None:
     from surgisoft.diagnosis.design.isolability import SURE
 
     print(f"next experiment: {result.name}, {result.minutes:g} min on the bench")
     print(f"why: {result.why}")
     for number, step in enumerate(result.steps, 1):
         print(f"  {number}. {step}")
-    on_rig = (spec.chambers, spec.unit) == ON_RIG
+    on_rig = (result.protocol.commands.shape[1], result.protocol.unit) == ON_RIG
     if result.by_hand and on_rig:
         print("  the virtual rig has no option for that change: --as-it-stands asks for none")
     elif on_rig:
@@ -104,7 +121,7 @@ def _show(result, spec, model: Path, recordings: list[Path], output: Path) -> No
     # After a change that removes an effect, only the new recording counts.
     old = "" if result.by_hand else "".join(f" {path}" for path in recordings)
     taken = f" --without {' '.join(result.removes)}" if result.by_hand else ""
-    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}")
+    print(f"  then: surgisoft diagnose {model}{old} NEW.parquet{taken}{of_model}")
     pairs = sorted(result.pairs, key=lambda pair: pair.after)
     open_ = [pair for pair in pairs if pair.effects not in result.separates]
     shown = max(SHOWN_PAIRS, len(open_))

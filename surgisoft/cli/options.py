@@ -13,7 +13,40 @@ SEED_MAX = 2**31
 
 Model = Annotated[
     Path,
-    Argument(metavar="MODEL", help="Folder of an arm model, or default: the arm of the package."),
+    Argument(
+        metavar="MODEL",
+        help="Folder of an arm model, or default: the arm of the package. A model of your own "
+        "(docs/your_model.md): package.module:object or FILE.py:object, a Python callable, which "
+        "is imported and run, so name only what you trust.",
+    ),
+]
+AnyModel = Annotated[
+    Path,
+    Argument(
+        metavar="MODEL",
+        help="Folder of an arm model, or default: the arm of the package. A model of your own "
+        "(docs/your_model.md): package.module:object or FILE.py:object, a Python callable, which "
+        "is imported and run, so name only what you trust; or its predictions in a file beside "
+        "the recording (.csv, .parquet); with --predictions any name.",
+    ),
+]
+Predictions = Annotated[
+    list[Path] | None,
+    Option(
+        "--predictions",
+        metavar="FILE...",
+        help="What a model in any language predicts: files with the columns k0_x_mm ... of the "
+        "rows of each REC, in order, then of each --before. MODEL is then a name for it.",
+    ),
+]
+ModelError = Annotated[
+    float | None,
+    Option(
+        "--model-error",
+        metavar="MM",
+        help="RMS error of a key point that a callable model, or one given by predictions, was "
+        "validated with, mm; default: what it states itself, else its error on --before.",
+    ),
 ]
 Recordings = Annotated[
     list[Path], Argument(metavar="REC", help="Recordings (.csv, .parquet) or folders of them.")
@@ -42,40 +75,52 @@ NewRecording = Annotated[
 ]
 
 
-def _register(paths: list[Path] | None) -> list[Path] | None:
-    """Register the user-defined effects of files, before anything opens a model that holds them."""
-    for path in paths or []:
-        if not path.is_file():
+def _register(given: list[Path] | None) -> list[Path] | None:
+    """Run the code that models may hold, before anything opens a model that holds it."""
+    for path in given or []:
+        if ":" not in str(path) and path.suffix == ".py" and not path.is_file():
             raise InputError(f"{path}: no such file; name a .py file that defines one Effect")
-    if paths:
-        from surgisoft.surrogate.effects import register_effect_files
+    if given:
+        from surgisoft.surrogate.code import name_code
 
-        register_effect_files(paths)
-    return paths
+        name_code(given)
+    return given
 
 
 EffectFiles = Annotated[
     list[Path] | None,
     Option(
         "--effect-file",
-        metavar="FILE.py...",
+        "--model-code",
+        metavar="FILE.py|PACKAGE.MODULE:OBJECT...",
         callback=_register,
         help="Files of user-defined effects (docs/effects.md): those in the model, and further "
-        "candidates. The files are run, so name only those that you trust.",
+        "candidates. Also the callable that the model was made from (docs/your_model.md). All are "
+        "run, so name only those that you trust.",
     ),
 ]
-"""Option of every command that opens a model. Reading the command line registers the effects."""
+"""Option of every command that opens a model. Reading the command line runs the code."""
 
 
 def with_effect_files(command: str) -> str:
-    """A command to run next, with `--effect-file` and the files that this call was given.
+    """A command to run next, with the options that name the code that this call was given.
 
-    Without them the command would refuse to open the model.
+    Without them the command would refuse to open the model. A callable that the command names as
+    its model is not named twice.
     """
+    from surgisoft.surrogate.callables.named import named_callables
     from surgisoft.surrogate.effects import registered_files
 
     files = registered_files()
-    return f"{command} --effect-file {' '.join(files)}" if files else command
+    named = [name for name in named_callables() if name not in command.split()]
+    effects = f" --effect-file {' '.join(files)}" if files else ""
+    return command + effects + (f" --model-code {' '.join(named)}" if named else "")
+
+
+def model_options(predictions: list[Path] | None, error_mm: float | None) -> str:
+    """The options of a command to run next that say what MODEL is, as this call was given them."""
+    text = f" --predictions {' '.join(map(str, predictions))}" if predictions else ""
+    return text if error_mm is None else f"{text} --model-error {error_mm:g}"
 
 
 Run = Annotated[Path, Argument(metavar="RUN", help="Folder of a training run.")]
@@ -121,8 +166,9 @@ Hidden = Annotated[
     list[str] | None,
     Option(
         "--hidden",
-        metavar="NAME[:X]...",
-        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1.",
+        metavar="NAME[:X][@S]...",
+        help="Hidden effects of the rig, which the model lacks, with their amplitudes; default 1. "
+        "On the virtual rig @S lets one begin S seconds after the first reset.",
     ),
 ]
 Arm = Annotated[
@@ -161,6 +207,17 @@ REFIT_PROCESSES = min(2, os.cpu_count() or 1)
 """Processes that a refit trains in; the result does not depend on them."""
 
 Web = Annotated[bool, Option("--web", help="Show it in a browser; served to this machine only.")]
+Port = Annotated[
+    int | None,
+    Option(
+        "--port",
+        metavar="N",
+        min=1,
+        max=65534,
+        help="With --web: port of the page; the data take the next one. To look from another "
+        "machine: ssh -L N:localhost:N -L N+1:localhost:N+1.",
+    ),
+]
 Screenshot = Annotated[
     Path | None,
     Option(

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import SaveReplay, Screenshot, Web
+from surgisoft.cli.options import Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 
 
@@ -20,6 +20,7 @@ def replay(
         ),
     ],
     web: Web = False,
+    port: Port = None,
     screenshot: Screenshot = None,
     size: Annotated[
         str, typer.Option(metavar="WxH", help="Size of the picture's window, in points.")
@@ -45,6 +46,7 @@ def replay(
             save=save,
             screenshot=screenshot,
             web=web,
+            port=port,
             size=size,
             time_s=time,
             view=view,

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.options import EffectFiles, Force, SaveReplay, Screenshot, Web
+from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 
@@ -180,6 +180,7 @@ def check(
 def show(
     folder: Folder,
     web: Web = False,
+    port: Port = None,
     screenshot: Screenshot = None,
     save: SaveReplay = None,
     effect_files: EffectFiles = None,
@@ -195,6 +196,8 @@ def show(
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
 
+    if port is not None and not web:
+        raise InputError("--port applies to a browser only: give --web too")
     scene = open_scene(folder)
     reaches = reaches_of(scene)
     if save is not None:
@@ -207,7 +210,11 @@ def show(
             take_screenshot(recording, screenshot, "Scene", ("ring_point", 0))
             print(f"wrote {screenshot}")
         elif web:
-            serve_viewer(recording, lambda url: print(f"open {url} (stop with Ctrl-C)", flush=True))
+            serve_viewer(
+                recording,
+                lambda url: print(f"open {url} (stop with Ctrl-C)", flush=True),
+                port,
+            )
         else:
             open_viewer(recording)
 

@@ -1,4 +1,4 @@
-"""`surgisoft train` and `surgisoft export`: train policies, and write them for other programs."""
+"""`surgisoft train`: train the agents of a task."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +10,6 @@ from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
     EffectFiles,
-    Run,
     SceneFolder,
     TaskConfig,
     Threads,
@@ -27,7 +26,9 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            metavar="fast|paper", help="Hyper-parameters: fast (default), or those of the paper."
+            metavar="fast|randomised|paper",
+            help="fast (default); randomised: with camera noise, mounts and gains that differ "
+            "between episodes, and a state observer; or the hyper-parameters of the paper.",
         ),
     ] = None,
     steps: Annotated[
@@ -123,17 +124,3 @@ def _summary(folder: Path, result) -> str:
         f"wrote {folder}: {result.steps:,} steps in {result.wall_s:.0f} s "
         f"({result.cpu_s:.0f} s of processor), best {_measures(result.best)}"
     )
-
-
-@app.command()
-def export(
-    run: Run,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
-    which: Annotated[str, typer.Option(metavar="best|last", help="Checkpoint.")] = "best",
-) -> None:
-    """Write a run's policies as ONNX and TorchScript, one file of each for every agent."""
-    from surgisoft.agents.export import export as export_policy
-    from surgisoft.agents.learned import LearnedPolicy
-
-    for file in export_policy(LearnedPolicy(run, which=which), output):
-        print(f"wrote {file}")

@@ -1,34 +1,41 @@
 """`amend`: put a named effect into a model and evaluate it on held-out data.
 
 The parameters are fitted to the training rows, three quarters of each recording; together with the
-whole network where that may have imitated the effect. The held-out quarter is evaluated once, for
-the error before and after. A fall of the error is claimed only where its 95 % interval, from a
-bootstrap of blocks of time, is above zero and where the fall is large enough to matter.
+whole network where that may have imitated the effect. The held-out quarter is opened once, for the
+error before and after, and chooses nothing: the new model is the same whatever is in it. A fall of
+the error is claimed only where its 95 % interval, from a bootstrap of blocks of time, is above
+zero, where the fall is large enough to matter, and where the network's own error would hardly have
+been fitted by so much of the effects.
 """
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from surgisoft.diagnosis.estimation.effects import fit_effects
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.network import retune
-from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
-from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
+from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
+from surgisoft.diagnosis.other_models import open_model, refuse_predictions
+from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
 from surgisoft.surrogate.effects import named_effect
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import torch_threads
 
+LEVEL = 0.05
+"""Largest p-value of an effect's amplitudes with which a fall is claimed for it: on an arm that
+lacks nothing a fall is claimed at most so often."""
 LEAST_FALL = 0.05
 """Least fall of the error that is claimed, as a share of what stands above the noise floor."""
 
@@ -54,24 +61,49 @@ class Fall:
     """Held-out rows."""
     blocks: int
     """Blocks of time that they make."""
+    p_value: float | None = None
+    """Probability that noise and the network's own error alone would have been fitted by so much of
+    the effects; None where that was not tested."""
+
+    in_fit: float = 0.0
+    """Share of the rows that the old model had been fitted to: there its error is no test."""
 
     @property
     def claimed(self) -> bool:
-        """Whether the fall is significant and large enough to matter."""
+        """Whether the fall is significant, large enough to matter, and due to the effects.
+
+        An effect also lowers the error of an arm that lacks nothing, where it happens to resemble
+        the error of the network.
+        """
+        return self.ci95[0] > 0 and self._matters and not self._by_chance
+
+    @property
+    def _matters(self) -> bool:
         room = max(self.before - self.floor, 0.1 * self.before)
-        return self.ci95[0] > 0 and self.fall >= LEAST_FALL * room
+        return self.fall >= LEAST_FALL * room
+
+    @property
+    def _by_chance(self) -> bool:
+        return self.p_value is not None and self.p_value >= LEVEL
 
     @property
     def sentence(self) -> str:
         """The fall in words."""
         low, high = self.ci95
+        part = f", {self.in_fit:.0%} of which the model had been fitted to," if self.in_fit else ""
         numbers = (
-            f"{self.before:.3f} to {self.after:.3f} mm on held-out data "
+            f"{self.before:.3f} to {self.after:.3f} mm on held-out data{part} "
             f"(fall {self.fall:.3f} mm, 95 % {low:.3f} to {high:.3f}; floor {self.floor:.3f} mm)"
         )
         if self.claimed:
             return f"error {numbers}"
-        why = "is too small" if low > 0 else "is not significant"
+        why = "is too small"
+        if low <= 0:
+            why = "is not significant"
+        elif self._matters:
+            why = (
+                f"may be the network's own error, which the effect resembles (p {self.p_value:.2g})"
+            )
         return f"no fall of the error is claimed: {numbers} {why}"
 
 
@@ -190,16 +222,19 @@ def amend(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    error_mm: float | None = None,
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths; a callable, or its name, is a model too, with
+    error_mm as its validated error, mm (docs/your_model.md).
 
     effects: names, or files of user-defined effects (`my_effect.py`), which are run.
-    retune_network: also re-tune the network's last layer, where held-out motion rewards it and the
-    effects alone make the error fall. before: recordings from before a change. Where they were made
-    with the same actuation, effects are fitted to the paired difference (`pairs`), so that the
-    network's error does not enter; paired: as for `diagnose`.
+    retune_network: also re-tune the network's last layer, where the effects alone make the error of
+    the training rows fall and motion that is left out among them rewards it. before: recordings
+    from before a change. Where they were made with the same actuation, effects are fitted to the
+    paired difference (`pairs`), so that the network's error does not enter; paired: as for
+    `diagnose`.
     refit: `always` fits the whole network together with the
     effects, `auto` does where a network may have imitated them (`surgisoft.diagnosis.refit`) and
     held-out runs reward it, `never` does not; refit_progress and processes as for `diagnose`.
@@ -207,12 +242,19 @@ def amend(
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
     names = [named_effect(given) for given in ([effects] if isinstance(effects, str) else effects)]
+    refuse_predictions(model)
+    model, recordings, before = open_model(model, recordings, before, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
     tell("predicting")
-    plain = table = residual_table(model, recordings)
-    both = None
+    sealed = Sealed(recordings)
+    plain = table = residual_table(model, sealed.training)
+    both, earlier = None, []
     if before is not None:
-        both = before_and_after(plain, load_recordings(before), paired).with_held_out_pairs()
+        earlier = load_recordings(before)
+        both = before_and_after(plain, earlier, paired)
+        if both.used and both.pairs.paired[plain.held_out].mean() < LEAST_SHARE:
+            # Too few held-out rows have a partner for a final check of the paired difference.
+            both = replace(both, table=plain, used=False)
         notes, table = (*notes, *both.notes), both.table
     problem = table.training()
     names = list(dict.fromkeys(names))
@@ -231,7 +273,7 @@ def amend(
         joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
         better, retuned, parameters = joint.model, False, joint.parameters
         refitted = tuple(name for name in names if name in model.effects)
-        held_out = whole = table.final_check()
+        held_out = whole = sealed.opened(plain).final_check()
         alone = fall_of(held_out.with_model(joint.alone), held_out.with_model(better))
     else:
         judged = None
@@ -239,28 +281,34 @@ def amend(
         fitted = fit_effects(problem, names)
         parameters, refitted = fitted.parameters, fitted.refitted
         better, retuned = fitted.model, False
-        if retune_network:
+        shown_by_training = fall_of(problem, problem.with_model(better), fitted.p_value).claimed
+        if retune_network and shown_by_training:
             tell("re-tuning the network")
             # Tuned to what was measured: the network's own error is not in a paired difference.
-            tried = retune(better, plain.training())
-            better, retuned = tried.model, tried.kept
+            rows = plain.training()
+            tried = retune(better, rows)
+            pair = rows.with_model(better), rows.with_model(tried.model)
+            if tried.kept and fall_of(*pair).claimed:
+                better, retuned = tried.model, True
         tell("evaluating on the held-out part")
-        held_out, whole = table.final_check(), plain.final_check()
-        alone = fall_of(held_out, held_out.with_model(fitted.model))
-        if retuned and not (alone.claimed and fall_of(whole, whole.with_model(better)).claimed):
-            better, retuned = fitted.model, False
+        held_out = whole = (opened := sealed.opened(plain)).final_check()
+        if both is not None and both.used:
+            held_out = before_and_after(opened, earlier, "always").table.final_check()
+        alone = fall_of(held_out, held_out.with_model(fitted.model), fitted.p_value)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         better.training_residuals = None if retuned else model.training_residuals
+    better.fitted_rows = FittedRows.of([plain.history]).joined(model.fitted_rows)
     is_paired = both is not None and both.used
     # The paired difference holds for the network that predicted BEFORE.
     shown = fitted.model if is_paired else better
     falls = [(part, part.with_model(shown)) for part in (problem, held_out)]
+    tested = alone.p_value if judged is None and not retuned else None
     return Amendment(
         model=better,
         effects=tuple(names),
         refitted=refitted,
         parameters=parameters,
-        held_out=fall_of(*falls[1]),
+        held_out=fall_of(*falls[1], tested),
         alone=alone,
         training=fall_of(*falls[0]),
         retuned=retuned,
@@ -273,9 +321,14 @@ def amend(
     )
 
 
-def fall_of(before: Problem, after: Problem) -> Fall:
-    """The fall of the error between two models on the same rows, with its interval."""
+def fall_of(before: Problem, after: Problem, p_value: float | None = None) -> Fall:
+    """The fall of the error between two models on the same rows, with its interval.
+
+    p_value: of the effects' amplitudes, see `Fall.p_value`.
+    """
     seen = np.isfinite(before.residual).all(2).sum(1)
+    known = before.model.fitted_rows
+    share = 0.0 if known is None else known.share_of(before.history)
     sums = [
         block_sums(np.nansum(np.square(problem.residual), axis=(1, 2)), before.block)
         for problem in (before, after)
@@ -291,6 +344,8 @@ def fall_of(before: Problem, after: Problem) -> Fall:
         ci95=(float(low), float(high)),
         rows=len(before.index),
         blocks=len(count),
+        p_value=p_value,
+        in_fit=0.0 if share < LEAST_KNOWN else share,
     )
 
 

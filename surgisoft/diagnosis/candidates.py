@@ -87,8 +87,7 @@ def signals(problem: Problem) -> Signals:
     first = problem.model.first_pressure(history)
     taps = chain.scan(history, first)
     context = replace(context_of(history), pressure=taps.pressure)
-    at, direction = problem.rows(taps.behind["material"]), problem.rows(taps.direction)
-    slope = chain.network_slope(at, direction)
+    slope = chain.slope(history, first, taps, problem.rows)
     return Signals(context, taps, slope, chain.standing(first)[1], first)
 
 

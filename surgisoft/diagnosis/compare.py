@@ -1,7 +1,8 @@
 """`compare`: a model's error on recordings, what it depends on, and the best achievable error."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
+from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import Change, Paired, before_and_after
 from surgisoft.diagnosis.residuals import (
     LEAST_BLOCKS,
@@ -188,14 +190,20 @@ def compare(
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     before: Recordings | None = None,
     paired: Paired = "auto",
+    predictions: Iterable[str | Path] | None = None,
+    error_mm: float | None = None,
 ) -> tuple[Comparison, ResidualTable]:
     """Evaluate a model on recordings; both may be given by their paths.
+
+    A model of other origin is a callable, its name, or a name with its predictions in files, one
+    for each recording and of `before`; error_mm: its validated error, mm (docs/your_model.md).
 
     part: which rows of them are looked at; `diagnose` looks at the training rows. reference: as
     for `diagnose`, which takes it into account for the best achievable error. before: recordings
     from before a change; the comparison then also says how far the two sets differ (`pairs`), by
     the paired difference where both have the same actuation; paired: as for `diagnose`.
     """
+    model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
     model, recordings, notes = open_inputs(model, recordings, sized=False)
     wrong = find_setup_faults(model, recordings) if part == "all" else None
     if wrong is None:
@@ -257,7 +265,7 @@ def achievable(problem: Problem) -> BestAchievable | None:
     if len(problem.motion) < LEAST_BLOCKS:
         return None
     selected = None
-    if not problem.model.remembers:
+    if problem.model.takes_effects:
         some, _ = testable(problem, candidates(problem), list(known_effects()))
         selected = select(problem, some, lambda text: None)
     return best_achievable(problem, black_box(problem), selected)

@@ -16,8 +16,9 @@ the diagnosis ends there. Else it is a system identification of a grey-box model
 """
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import CLAIM, SEARCH
@@ -40,10 +41,11 @@ from surgisoft.diagnosis.inputs import (
     open_inputs,
     with_known_residuals,
 )
+from surgisoft.diagnosis.other_models import open_model
 from surgisoft.diagnosis.pairs import BeforeAfter, Change, ChangeTrack, Paired, before_and_after
 from surgisoft.diagnosis.refit import Refit, refit_reason
 from surgisoft.diagnosis.refit import refit as fit_candidates_together
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.selection import (
     Findings,
     Score,
@@ -207,17 +209,26 @@ def diagnose(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    predictions: Iterable[str | Path] | None = None,
+    error_mm: float | None = None,
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
-    Model and recordings may be given by their paths. Where `setup_tests` prove a fault of the
-    set-up, the verdict is `setup`, and no effect is looked for: `Diagnosis.setup` mends the
-    recordings.
+    Model and recordings may be given by their paths; a model of other origin as for `compare`.
+    Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is
+    looked for: `Diagnosis.setup` mends the recordings.
 
+<<<<<<< HEAD
     Only the training rows are looked at: the view of the residual table that is worked on holds no
     other key points. before: recordings from before a change in question. Where they were made with
     the same actuation, the paired difference is explained (`pairs`), else the residuals of the
     model less what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few common
+=======
+    Only the training rows are looked at: the key points of all others are removed first (`Sealed`).
+    before: recordings from before a change in question. Where they were made with the same
+    actuation, the paired difference is explained (`pairs`), else the residuals of the model, with
+    those of `before` as what was known; paired: `auto`, `always` (too few common
+>>>>>>> main
     motions are an error) or `never`. reference: recordings, as before; or residuals of the model
     from before, default those that it keeps of its fit. without: effects that cannot act, such as a
     contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
@@ -228,7 +239,9 @@ def diagnose(
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
+    model, recordings, before = open_model(model, recordings, before, predictions, error_mm)
     model, recordings, notes = open_inputs(model, recordings, sized=not setup_tests)
+    recordings = Sealed(recordings).training
     if setup_tests:
         report("set-up")
         wrong = find_setup_faults(model, recordings)

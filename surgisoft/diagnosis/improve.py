@@ -16,12 +16,14 @@ from surgisoft.diagnosis.estimation.effects import Fitted, fit_effects, fit_plau
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
+from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.refit import JointFit, fit_together
-from surgisoft.diagnosis.residuals import model_discrepancy, residual_table
+from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
 from surgisoft.progress import Progress as RefitProgress
 from surgisoft.progress import silent
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
@@ -124,10 +126,12 @@ def improve(
     refit: str = "auto",
     refit_progress: RefitProgress = silent,
     processes: int = 1,
+    error_mm: float | None = None,
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 
-    Model and recordings may be given by their paths.
+    Model and recordings may be given by their paths; a callable, or its name, is a model too, with
+    error_mm as its validated error, mm (docs/your_model.md).
 
     reference, refit, refit_progress, processes: as for `diagnose`. An effect that a refit names is
     fitted together with the whole network.
@@ -136,8 +140,11 @@ def improve(
         raise InputError(f"at most {most_effects} effects: expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
+    refuse_predictions(model)
+    model, recordings, _ = open_model(model, recordings, None, None, error_mm)
     model, recordings, notes = open_inputs(model, recordings)
-    known = model.training_residuals
+    known, sealed = model.training_residuals, Sealed(recordings)
+    recordings = sealed.training
     table = residual_table(model, recordings)
     problem = table.training()
     models, rounds, parameters = [model], [], ()
@@ -207,7 +214,8 @@ def improve(
         kept = not (added and tuned.kept)
         # The residuals of the fit say nothing of a network that was re-tuned since.
         models[-1].training_residuals = known if kept else None
-    held_out = table.final_check()
+        models[-1].fitted_rows = FittedRows.of([table.history]).joined(model.fitted_rows)
+    held_out = sealed.opened(table).final_check()
     after_round = iter([held_out.with_model(one) for one in models[1:]])
     final, shown = held_out, []
     for done in rounds:
@@ -248,7 +256,7 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
     """Why an effect is not added, whatever the diagnosis says; empty where it may be."""
     if not fall.claimed:
         return f"{name}, fitted through the whole model, does not lower the error"
-    wrong = [p for p in parameters if p.effect == name and not p.plausible]
+    wrong = [p for p in parameters if p.effect == name and not p.may_be_plausible]
     if not wrong:
         return ""
     low, high = wrong[0].plausible_range

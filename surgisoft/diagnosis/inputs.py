@@ -1,18 +1,22 @@
 """The inputs of every command: a model, recordings, and the identification problem they pose."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from surgisoft.diagnosis.residuals import Problem, residual_table
+from surgisoft.diagnosis.other_models import notes_of
+from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.weight import under_weight
-from surgisoft.measurement.histories import check_fits, outside_range
+from surgisoft.measurement.histories import check_fits, history_of, outside_range
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 
-Model = ArmModel | str | Path
-"""A model, or its folder."""
+LEAST_KNOWN = 0.02
+"""Least share of a recording's rows in the fit of a model that is reported."""
+
+Model = ArmModel | str | Path | Callable
+"""A model, its folder, a callable, the name of one, or a file of predictions (`open_model`)."""
 Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 """Recordings, their files, or folders of them."""
 
@@ -30,7 +34,28 @@ def open_inputs(
     measured = load_recordings(recordings)
     check_fits(arm.spec, measured, sized)
     turned, notes = under_weight(arm, measured)
-    return turned, measured, (*notes, *outside_range(arm.spec, measured))
+    taken_part = part_in_fit(arm, measured)
+    notes = (*notes_of(arm), *notes, *outside_range(arm.spec, measured), *taken_part)
+    return turned, measured, notes
+
+
+def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]:
+    """A note for each recording that the model was fitted to, in whole or in part.
+
+    Errors there are errors of the fit and no test of the model.
+    """
+    known = model.fitted_rows
+    if known is None:
+        return ()
+    notes = []
+    for recording in recordings:
+        share = known.share_of(history_of([recording], model.spec.actuation))
+        if share >= LEAST_KNOWN:
+            notes.append(
+                f"{recording.name}: the model was fitted to {100 * share:.0f} % of its rows: the "
+                "error there is no test; use recordings that took no part in the fit"
+            )
+    return tuple(notes)
 
 
 def identification_problem(
@@ -43,7 +68,8 @@ def identification_problem(
     reference: recordings from before something changed. Without them the residuals that the model
     keeps of its own fit (`ArmModel.training_residuals`), where it has them.
     """
-    return with_known_residuals(residual_table(model, recordings).training(), reference)
+    table = residual_table(model, Sealed(recordings).training)
+    return with_known_residuals(table.training(), reference)
 
 
 def with_known_residuals(

@@ -41,7 +41,6 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import Memoryless, known_effects
 from surgisoft.surrogate.model import ArmModel, Validation
-from surgisoft.surrogate.networks import RecurrentArm
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from surgisoft.workers import torch_threads, workers
 
@@ -253,17 +252,13 @@ def reason_to_refit(problem: Problem) -> str:
     excess = float(np.sqrt(max(error**2 - floor**2, 0.0)))
     if error < ASKED.over_floor * floor:
         return ""
-    if excess > ASKED.within * validated or not _trainable(problem.model):
+    if excess > ASKED.within * validated or not problem.model.trainable:
         return ""
     return (
         f"the error ({error:.3g} mm) is far above the noise floor ({floor:.3g} mm) and no larger "
         f"than the model's validated error ({validated:.3g} mm), so the network may imitate what "
         "is missing"
     )
-
-
-def _trainable(model: ArmModel) -> bool:
-    return not isinstance(model.network, RecurrentArm)
 
 
 LINE = "line_lag"
@@ -589,10 +584,16 @@ JOIN = " + "
 
 def check_trainable(model: ArmModel, effects: Iterable[str] = ()) -> None:
     """Raise InputError unless a model's network can be trained together with the effects."""
-    if not _trainable(model):
+    if not model.takes_effects:
         raise InputError(
             "the recurrent baseline takes no effects, so nothing can be fitted together with it: "
             "pass --refit never, or fit a model with --network haw_nn"
+        )
+    if not model.trainable:
+        kind = model.summary().partition(" (")[0]
+        raise InputError(
+            f"{kind} has no network that could be trained together with effects: expected a model "
+            "that 'surgisoft fit' made; pass --refit never"
         )
     for name in effects:
         stage = known_effects()[name].stage

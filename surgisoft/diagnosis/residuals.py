@@ -368,6 +368,40 @@ def held_out_rows(recordings: list[Recording]) -> np.ndarray:
     return np.concatenate(answer)
 
 
+class Sealed:
+    """Recordings whose held-out rows nothing but the final check can see.
+
+    `training` are the recordings with the key points of their held-out rows missing: all that a
+    diagnosis or a fit is given. `opened` gives the held-out rows, once.
+    """
+
+    def __init__(self, recordings: list[Recording]):
+        held_out = held_out_rows(recordings)
+        ends = np.cumsum([recording.samples for recording in recordings])[:-1]
+        self.training = [
+            replace(r, key_points_mm=np.where(held[:, None, None], np.nan, r.key_points_mm))
+            for r, held in zip(recordings, np.split(held_out, ends), strict=True)
+        ]
+        self._key_points_mm: list[np.ndarray] | None = [r.key_points_mm for r in recordings]
+
+    def opened(self, table: ResidualTable) -> ResidualTable:
+        """The table of the training rows with the held-out rows in it, for `final_check`.
+
+        Noise and all that a table of the training rows says of errors stay. A second call raises
+        ValueError: what was looked at twice was chosen by.
+        """
+        if self._key_points_mm is None:
+            raise ValueError("the held-out rows were opened before; one check is all they are for")
+        whole = np.concatenate(self._key_points_mm)
+        measured = np.where(table.held_out[:, None, None], whole, table.measured_mm)
+        self._key_points_mm = None
+        points = table.history.key_points.clone()
+        points[table.history.valid] = torch.from_numpy(measured).to(points)
+        return replace(
+            table, measured_mm=measured, history=replace(table.history, key_points=points)
+        )
+
+
 # The rows of one part ------------------------------------------------------------------------
 
 

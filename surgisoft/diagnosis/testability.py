@@ -12,12 +12,14 @@ import numpy as np
 
 from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.criteria import SEARCH
+from surgisoft.diagnosis.other_models import has_slope
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-Cause = Literal["no_motion", "no_reversals", "no_change", "below_noise"]
+Cause = Literal["no_motion", "no_reversals", "no_change", "below_noise", "no_slope"]
 """Steady-state samples only; no inner reversals of the actuation; no change of the prediction at
-all; at the plausible end of its amplitudes less than what stands out from the noise."""
+all; at the plausible end of its amplitudes less than what stands out from the noise; not known how
+the model's predictions change with the actuation."""
 
 REASONS = {
     "no_motion": "steady-state samples cannot show what is over when the arm has stopped; record "
@@ -26,6 +28,8 @@ REASONS = {
     "actuation; record ramps that turn back at different levels",
     "no_change": "it changes nothing along this actuation, or needs a quantity that was not "
     "recorded",
+    "no_slope": "it acts on the actuation, and the model's predictions are no function of the "
+    "actuation and its past that could be fitted to them; give the model as a callable",
     "below_noise": "even at the end of its plausible range it changes less than the noise shows",
 }
 """The causes in words, with what to do."""
@@ -65,6 +69,8 @@ def testable(
 def _cause(problem: Problem, name: str, own: list[Candidate]) -> Cause | None:
     """Why an effect cannot show; None where it can."""
     hypothesis = hypothesis_of(known_effects()[name])
+    if known_effects()[name].stage in ("line", "material") and not has_slope(problem.model):
+        return "no_slope"
     if hypothesis.needs_motion and not problem.table.timed[problem.index.numpy()].any():
         return "no_motion"
     if not own:

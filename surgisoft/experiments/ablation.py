@@ -48,7 +48,7 @@ class AblationSupervision:
         return _clearance(state).collides
 
     def fires(self, state: TaskState) -> Tensor:
-        """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
+        """(B,) bool: the task would switch its beam on, see `CircleAblation.fires`."""
         return self.task.fires(state)
 
     def fired(self, state: TaskState) -> Tensor:
@@ -70,7 +70,7 @@ def _centred(task: CircleAblation, state: TaskState, within: float) -> Tensor:
 
 
 def _aimed(task: CircleAblation, state: TaskState, within: float) -> Tensor:
-    return task.beam_error_mm(state) <= within
+    return task.measured_error_mm(state) <= within
 
 
 def _cut(task: CircleAblation, state: TaskState, within: float) -> Tensor:
@@ -82,7 +82,7 @@ def _cut(task: CircleAblation, state: TaskState, within: float) -> Tensor:
 
 def _retracted(task: CircleAblation, state: TaskState, within: float) -> Tensor:
     first = task.world.arms["laser"].first
-    return (state.world.arms["laser"].pressure - first).abs().amax(1) <= within
+    return (state.world.arms["laser"].seen_kPa - first).abs().amax(1) <= within
 
 
 def _never(task: CircleAblation, state: TaskState, within: float) -> Tensor:

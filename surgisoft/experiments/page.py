@@ -11,6 +11,7 @@ from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.experiments.results import Results, SettingResult
 from surgisoft.experiments.spec import EXPERIMENT_TASK
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
+from surgisoft.tasks.circle_ablation import success_rule
 
 NUMBERS, CONDITIONS = EXPERIMENT_TASK.numbers, EXPERIMENT_TASK.conditions
 SHOWN = 4
@@ -49,7 +50,7 @@ def experiment_page(results: Results, films: dict[tuple[str, int], Picture], abo
             Facts(_facts(results)),
             *sections,
             _design(results),
-            Section("How to read this", [Text(HOW)]),
+            Section("How to read this", [Text(f"{rules(results)}\n\n{HOW}")]),
         ],
     )
 
@@ -151,7 +152,12 @@ def markdown(results: Results) -> str:
     header, rows = turned_table(results)
     lines = [header, ["---"] * len(header), *rows]
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{verdict(results)}\n\n{table}\n"
+    return f"{verdict(results)}\n\n{table}\n\n{rules(results)}\n"
+
+
+def rules(results: Results) -> str:
+    """What counts as a success, in one sentence; the rule of the task beneath, and no abort."""
+    return f"Success: {success_rule(results.experiment.task)}; nothing is aborted."
 
 
 def _outcomes(results: Results) -> Section:

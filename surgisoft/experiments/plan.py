@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import warnings
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -196,4 +197,9 @@ def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     }
     faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
     spec = dataclasses.replace(spec, faults=faults)
-    return PhasedTask(EXPERIMENT_TASK.supervise(base if rig is None else on_rig(base, rig)), spec)
+    return PhasedTask(
+        EXPERIMENT_TASK.supervise(
+            base if rig is None else on_rig(base, rig, on_warning=warnings.warn)
+        ),
+        spec,
+    )

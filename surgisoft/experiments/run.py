@@ -37,7 +37,7 @@ from surgisoft.experiments.spec import (
 from surgisoft.experiments.task import Row
 from surgisoft.files import json_safe, read_json, write_json
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import register_effect_files, registered_files
+from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.workers import torch_threads, workers
@@ -199,7 +199,7 @@ def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = si
 def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
     """Run the blocks in worker processes; yields each block as it is done."""
     try:
-        prepare = partial(register_effect_files, registered_files())
+        prepare = partial(name_code, named_code())
         with workers(processes, prepare) as pool:
             waiting = {pool.submit(_run_block, spec, folder, job): job for job in left}
             for future in as_completed(waiting):

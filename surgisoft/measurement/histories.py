@@ -49,7 +49,7 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
     A continuous run begins where its first measured actuation says; one of steady-state points
     begins at rest, from where its first point was approached.
     """
-    times, pressures, points, warmth, stood = [], [], [], [], []
+    times, pressures, points, warmth, stood, predicted = [], [], [], [], [], []
     for recording in recordings:
         signal = actuation_of(recording, actuation)
         for run in recording.runs:
@@ -59,6 +59,8 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
             first = torch.from_numpy(recording.measured[run.start].copy())
             settled = recording.kind == "settled"
             stood.append(torch.full_like(first, torch.nan) if settled else first)
+            if recording.predicted_mm is not None:
+                predicted.append(torch.from_numpy(recording.predicted_mm[run].copy()))
             room = recording.temp_C
             warmth.append(
                 torch.full((len(times[-1]),), torch.nan)
@@ -68,7 +70,8 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
     if all(room.isnan().all() for room in warmth):
         warmth = None
-    packed = pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood)
+    known = predicted if len(predicted) == len(times) else None
+    packed = pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood, known)
     return replace(packed, noise_mm=known_noise(recordings))
 
 

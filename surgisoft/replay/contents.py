@@ -6,7 +6,6 @@ child process with limits reads the file, and its end is an error of one line he
 """
 
 import json
-import resource
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -44,11 +43,11 @@ def contents(recording: str | Path) -> Contents:
 
 @lru_cache(maxsize=4)
 def _contents(path: Path, changed_ns: int, size: int) -> Contents:
+    """The contents of a file as it is at a time of change and with a size."""
     child = subprocess.run(
         [sys.executable, "-m", "surgisoft.replay.contents", str(path)],
         stdin=subprocess.DEVNULL,
         capture_output=True,
-        preexec_fn=lambda: _limit(size),
     )
     lines = child.stdout.decode("utf-8", "replace").splitlines()
     if child.returncode != 0 or not lines:
@@ -62,7 +61,11 @@ def _contents(path: Path, changed_ns: int, size: int) -> Contents:
 
 
 def _limit(size: int) -> None:
-    """Limits of the child: address space, processor time, no core file."""
+    """Limit this process: address space, processor time, no core file; Windows has no limits."""
+    try:
+        import resource
+    except ImportError:
+        return
     most = MEMORY_BYTES + MEMORY_PER_BYTE * size
     wanted = ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, PATIENCE_S))
     for kind, limit in (*wanted, (resource.RLIMIT_CORE, 0)):
@@ -90,5 +93,7 @@ def read(recording: Path) -> Contents:
 
 
 if __name__ == "__main__":
-    found = read(Path(sys.argv[1]))
+    file = Path(sys.argv[1])
+    _limit(file.stat().st_size)
+    found = read(file)
     sys.stdout.write(json.dumps({"duration_s": found.duration_s, "views": found.views}) + "\n")

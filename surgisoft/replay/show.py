@@ -76,6 +76,7 @@ def open_replay(
     save: str | Path | None = None,
     screenshot: str | Path | None = None,
     web: bool = False,
+    port: int | None = None,
     size: str = WINDOW,
     time_s: float | None = None,
     view: str | None = None,
@@ -88,11 +89,13 @@ def open_replay(
     save: write the replay of a log to this .rrd file instead. screenshot: write a picture to this
     .png file instead, at `time_s` (default: two thirds of the episode), of one `view` or of all,
     from a window of `size`. web: serve the replay to a browser on this machine; `on_address` is
-    called with the address.
+    called with the address, and `port` fixes that of its page and, one above, that of its data.
     """
     window, found = parse_size(size), find_replay(what)
     if sum((web, screenshot is not None, save is not None)) > 1:
         raise InputError("expected at most one of --web, --screenshot and --save")
+    if port is not None and not web:
+        raise InputError("--port applies to a browser only: give --web too")
     if screenshot is None and (time_s is not None or view is not None):
         raise InputError("--time and --view apply to a picture only: give --screenshot too")
     if view is not None and found.suffix != SUFFIX:
@@ -106,7 +109,7 @@ def open_replay(
             at = moment(recording, time_s)
             take_screenshot(recording, Path(screenshot), view, at, window)
         elif web:
-            serve_viewer(recording, on_address)
+            serve_viewer(recording, on_address, port)
         else:
             open_viewer(recording)
     return None

@@ -55,8 +55,19 @@ def temporary_recording() -> Iterator[Path]:
 
 def _die_with_parent() -> None:
     """Ask Linux to end this process with the one that started it (prctl(2), PR_SET_PDEATHSIG)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
+def _end(process: subprocess.Popen, patience_s: float = 3.0) -> None:
+    """End a process with all that it started: by request, then by force."""
+    for force in (False, True):
+        with contextlib.suppress(ProcessLookupError):
+            if sys.platform == "win32":
+                process.kill() if force else process.terminate()
+            else:
+                os.killpg(process.pid, signal.SIGKILL if force else signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(patience_s)
 
 
 @contextlib.contextmanager
@@ -68,16 +79,12 @@ def running(*arguments: str, quiet: bool = True) -> Iterator[subprocess.Popen]:
         stdout=sink,
         stderr=sink,
         start_new_session=True,
-        preexec_fn=_die_with_parent,
+        preexec_fn=_die_with_parent if sys.platform == "linux" else None,
     )
     try:
         yield process
     finally:
-        for way, patience in ((signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0)):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, way)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(patience)
+        _end(process)
 
 
 def wait_for_port(process: subprocess.Popen, port: int, patience_s: float = 30.0) -> None:
@@ -106,13 +113,18 @@ def open_viewer(recording: Path) -> None:
             )
 
 
-def serve_viewer(recording: Path, on_address: Callable[[str], None]) -> None:
+def serve_viewer(
+    recording: Path, on_address: Callable[[str], None], port: int | None = None
+) -> None:
     """Serve viewer and recording to browsers on this machine until interrupted.
 
-    The recording is sent to the running server. As an argument of the server it would keep one core
-    busy for ever (rerun-sdk 0.41).
+    port: that of the page, and the next one is that of the data; None: two free ones. An InputError
+    where one of them is in use. The recording is sent to the running server: as an argument of the
+    server it would keep one core busy for ever (rerun-sdk 0.41).
     """
-    page, data = free_port(), free_port()
+    page, data = (free_port(), free_port()) if port is None else (port, port + 1)
+    for number in (page, data):
+        _check_free(number)
     ports = ("--web-viewer-port", str(page), "--port", str(data))
     with running("--serve-web", "--bind", LOCAL, *ports) as viewer:
         wait_for_port(viewer, page)
@@ -125,6 +137,18 @@ def serve_viewer(recording: Path, on_address: Callable[[str], None]) -> None:
         on_address(web_address(page, data))
         with contextlib.suppress(KeyboardInterrupt):
             viewer.wait()
+
+
+def _check_free(port: int) -> None:
+    """Raise an InputError unless a TCP port of this machine is free."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOCAL, port))
+        except (OSError, OverflowError):
+            raise InputError(
+                f"--port {port}: cannot be used; expected a free port above 1023, and the next one"
+            ) from None
 
 
 def web_address(page: int, data: int) -> str:

@@ -7,9 +7,20 @@ No network, no script; pictures lie inside the file. Charts follow the reader's 
 """
 
 from surgisoft.report.page import Page, render, write_page
-from surgisoft.report.parts import Facts, Gallery, Part, Picture, Section, Share, Table, Text
+from surgisoft.report.parts import (
+    Command,
+    Facts,
+    Gallery,
+    Part,
+    Picture,
+    Section,
+    Share,
+    Table,
+    Text,
+)
 
 __all__ = [
+    "Command",
     "Facts",
     "Gallery",
     "Page",

@@ -35,6 +35,17 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Command:
+    """Lines to type or to paste, set as code."""
+
+    lines: str
+    """The lines as they are typed."""
+
+    def to_html(self) -> str:
+        return f"<pre><code>{html.escape(self.lines)}</code></pre>"
+
+
+@dataclass(frozen=True)
 class Facts:
     """A few values in large type side by side."""
 

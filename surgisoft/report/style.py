@@ -28,6 +28,8 @@ gap:12px;margin:16px 0}}
 .facts div{{background:var(--card);border-radius:4px;padding:10px 14px}}
 dd{{margin:0;font-size:1.25rem;font-variant-numeric:tabular-nums;overflow-wrap:anywhere}}
 .wide{{overflow-x:auto;margin:0 0 16px}}
+pre{{margin:0 0 12px;padding:10px 14px;overflow-x:auto;background:var(--card);border-radius:4px;
+font-size:.875rem}}
 figure .wide{{margin:0 0 4px}}
 .long{{min-width:18em}}
 table{{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}}

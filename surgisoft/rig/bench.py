@@ -237,7 +237,7 @@ def take_shape(plant: Plant, state: State) -> bool:
     add_twist(effects, state.effective, active)
     chamber_thrusts(robot.rod, state.effective, state.thrusts)
     time = state.steps[0] * plant.pumps.step
-    softness = 1.0 - effects.warmth * (room_temperature(effects, time) - 22.0)
+    softness = 1.0 - effects.warmth * (room_temperature(time) - 22.0)
     drifted_base(effects, time, robot.rod.base, state.base)
     return balance(robot.rod, plant.loads, softness, state.thrusts, state.base, state.shape)
 
@@ -264,7 +264,7 @@ def look_at(
     frames.centres[index] = shape.centres
     carry_mount(effects, time, frames.centres[index : index + 1])
     frames.chamber[index] = state.chamber
-    frames.temperature[index] = math.floor(10.0 * room_temperature(effects, time) + 0.5) / 10.0
+    frames.temperature[index] = math.floor(10.0 * room_temperature(time) + 0.5) / 10.0
     return at
 
 

@@ -250,10 +250,8 @@ def add_twist(effects: Effects, effective: np.ndarray, active: np.ndarray) -> No
 
 
 @compiled
-def room_temperature(effects: Effects, time: float) -> float:
+def room_temperature(time: float) -> float:
     """Temperature [degrees Celsius] at a time [s]: the bench warms up, the heating cycles."""
-    if effects.warmth == 0.0:
-        return 22.0
     warm = 5.0 * (1.0 - math.exp(-time / 500.0))
     return 22.0 + warm + 1.0 * math.sin(2.0 * math.pi * time / 1300.0)
 

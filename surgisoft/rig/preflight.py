@@ -150,8 +150,7 @@ def _directions(
     )
     straight = np.einsum("ab,knb->kna", turn, predicted)
     fits = np.diag(_cosines(measured.reshape(count, -1), straight.reshape(count, -1)))
-    upright = _cosines(axes[0][None], (turn @ axes[1])[None])[0, 0] >= plan.aligned
-    if angle_deg >= plan.turned_deg and upright and (fits >= plan.aligned).all():
+    if angle_deg >= plan.turned_deg and (fits >= plan.aligned).all():
         faults.append(
             f"{'or ' if faults else ''}the cameras' frame is turned by {angle_deg:.0f} degrees "
             "against the arm's base frame"

@@ -22,8 +22,10 @@ from types import ModuleType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.rig.drivers.serial_rig import SerialRig
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.rig.interface import Rig, is_simulated
+from surgisoft.rig.motion_capture import CameraDesign
 from surgisoft.rig.safety import SafeRig, Safety
 from surgisoft.rig.virtual import MOUNT, VirtualRig
 
@@ -35,7 +37,9 @@ LIST_SEPARATOR = "/"
 Gravity = Annotated[
     tuple[float, float, float], "direction of weight, arm base frame before the roll"
 ]
-HiddenEffects = Annotated[tuple[str, ...], "hidden effects, NAME or NAME:AMPLITUDE"]
+HiddenEffects = Annotated[
+    tuple[str, ...], "hidden effects, NAME or NAME:AMPLITUDE; @SECONDS behind it: begins later"
+]
 RobotSeed = Annotated[int, "seed of the robot"]
 NoiseSeed = Annotated[int, "seed of the noise of sensors and cameras"]
 RollDeg = Annotated[float, "rotation of the base about its axis [deg]"]
@@ -51,6 +55,7 @@ def virtual(
     roll_deg: RollDeg = 0.0,
     payload_g: PayloadG = 0.0,
     noise: NoiseFactor = 1.0,
+    rate_Hz: Annotated[float, "samples a second"] = CameraDesign().rate_Hz,
 ) -> Rig:
     """The project's own simulated bench: a quasi-static rod, syringe pumps, motion capture."""
     return VirtualRig(
@@ -61,6 +66,7 @@ def virtual(
         roll_deg=roll_deg,
         payload_g=payload_g,
         noise=noise,
+        cameras=CameraDesign(rate_Hz=rate_Hz),
     )
 
 
@@ -78,7 +84,7 @@ def elastica(
     return _elastica().ElasticaRig(
         seed,
         take=noise_seed,
-        hidden=tuple(hidden_effects(hidden)),
+        hidden=_from_the_start(hidden),
         gravity=gravity,
         roll_deg=roll_deg,
         payload_g=payload_g,
@@ -87,7 +93,11 @@ def elastica(
     )
 
 
-RIGS: dict[str, Callable[..., Rig]] = {"virtual": virtual, "elastica": elastica}
+RIGS: dict[str, Callable[..., Rig]] = {
+    "virtual": virtual,
+    "elastica": elastica,
+    "serial": SerialRig,
+}
 """The rigs of this package by name."""
 SIMULATED = ("virtual", "elastica")
 """Those of them that are simulated, with hidden effects."""
@@ -115,23 +125,44 @@ def _elastica() -> ModuleType:
     return importlib.import_module("surgisoft.rig.elastica")
 
 
-def hidden_effects(
-    given: Iterable[str | tuple[str, float]] | None,
-) -> list[tuple[str, float]]:
-    """Hidden effects as (name, amplitude), from text such as `creep:0.5`; default amplitude 1.
+HiddenEffect = tuple[str, float] | tuple[str, float, float]
+"""Name and amplitude of a hidden effect and, where it is not there from the start, the time after
+the first reset at which it begins [s]."""
 
-    Raises InputError for an amplitude that is no number.
+
+def hidden_effects(given: Iterable[str | HiddenEffect] | None) -> list[HiddenEffect]:
+    """Hidden effects from text such as `creep`, `creep:0.5` or `payload:1@360`; amplitude 1.
+
+    `@360` lets the effect begin 360 s after the first reset. Raises InputError for an amplitude or
+    a time that is no number.
     """
-    found = []
+    found: list[HiddenEffect] = []
     for item in given or ():
         if not isinstance(item, str):
-            found.append((item[0], float(item[1])))
+            size, *late = (float(value) for value in item[1:])
+            found.append((item[0], size, late[0]) if late else (item[0], size))
             continue
-        name, colon, strength = item.partition(":")
+        effect, at, begins_s = item.partition("@")
+        name, colon, amplitude = effect.partition(":")
         try:
-            found.append((name, float(strength) if colon else 1.0))
+            size = float(amplitude) if colon else 1.0
+            found.append((name, size, float(begins_s)) if at else (name, size))
         except ValueError:
-            raise InputError(f"hidden effect '{item}': expected NAME or NAME:AMPLITUDE") from None
+            raise InputError(
+                f"hidden effect '{item}': expected NAME or NAME:AMPLITUDE, either with @SECONDS"
+            ) from None
+    return found
+
+
+def _from_the_start(given: Iterable[str | HiddenEffect]) -> tuple[HiddenEffect, ...]:
+    """Hidden effects of a rig that cannot let one begin later."""
+    found = tuple(hidden_effects(given))
+    late = [effect[0] for effect in found if len(effect) == 3]
+    if late:
+        raise InputError(
+            f"hidden effect '{late[0]}' with a time (@SECONDS): the rig 'elastica' has all its "
+            "effects from the start; use the rig 'virtual'"
+        )
     return found
 
 

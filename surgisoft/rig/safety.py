@@ -315,7 +315,7 @@ class SafeRig:
 
     def _unlisten(self) -> None:
         if self._terminal is not None:
-            termios.tcsetattr(0, termios.TCSADRAIN, self._terminal)
+            termios.tcsetattr(0, termios.TCSANOW, self._terminal)
             self._terminal = None
 
     def _hear(self) -> None:

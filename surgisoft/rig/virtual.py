@@ -5,6 +5,7 @@ code, no formulas.
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -64,7 +65,11 @@ class VirtualRigConfig:
     take: int = 0
     """Number of the trial: another one has other noise on the same robot."""
     hidden: tuple[tuple[str, float], ...] = ()
-    """Hidden effects: (name, amplitude), see hidden.py."""
+    """Hidden effects: (name, amplitude), see hidden.py. An entry (name, amplitude, seconds) counts
+    to `later`."""
+    later: tuple[tuple[str, float, float], ...] = ()
+    """Hidden effects that begin during a recording: (name, amplitude, time [s] after the end of the
+    first reset), such as a payload that somebody hangs on."""
     event_window_s: tuple[float, float] = EVENT_WINDOW_S
     """Window of time since switching on in which hidden events that occur once fall [s]."""
     design: ArmDesign = field(default_factory=ArmDesign)
@@ -75,8 +80,10 @@ class VirtualRigConfig:
     """Design of the motion capture."""
 
     def __post_init__(self):
-        hidden = tuple((name, strength) for name, strength in self.hidden)
-        object.__setattr__(self, "hidden", hidden)
+        given = [tuple(effect) for effect in self.hidden]
+        late = [tuple(effect) for effect in self.later] + [e for e in given if len(e) == 3]
+        object.__setattr__(self, "hidden", tuple(e for e in given if len(e) == 2))
+        object.__setattr__(self, "later", tuple(sorted(late, key=lambda effect: effect[2])))
         direction = np.asarray(self.gravity, np.float64)
         if self.seed < 0:
             raise InputError(f"seed is {self.seed}, expected a whole number >= 0")
@@ -88,6 +95,18 @@ class VirtualRigConfig:
             raise InputError(f"payload is {self.payload_g} g, expected 0 to {HEAVIEST_G:g} g")
         if not (np.isfinite(self.noise) and self.noise >= 0.0):
             raise InputError(f"noise scale is {self.noise}, expected a number >= 0")
+        for name, _, begins_s in self.later:
+            if not 0.0 <= begins_s < math.inf:
+                raise InputError(
+                    f"hidden effect '{name}' begins at {begins_s} s, expected a time of 0 s or "
+                    "more after the first reset"
+                )
+        periods = 1.0 / (self.cameras.rate_Hz * self.pumps.step_s) if self.cameras.rate_Hz else 0.0
+        if not (round(periods) >= 1 and abs(periods - round(periods)) < 1e-6):
+            raise InputError(
+                f"cameras take {self.cameras.rate_Hz:g} frames a second, expected a period that is "
+                f"a multiple of the pumps' {self.pumps.step_s:g} s, such as 10, 20, 25 or 50"
+            )
         first, last = self.event_window_s
         if not 0.0 <= first <= last < math.inf:
             raise InputError(
@@ -127,9 +146,13 @@ class VirtualRig:
         loads = plain_loads(self.gravity)._replace(payload=weight_N)
         rod = robot.rod
         stiffness = rod.wall.modulus * rod.wall.area / design.friction_lines
-        effects = no_effects(design.chambers, stiffness)
-        setup = Setup(effects, loads, rod, config.event_window_s)
-        setup = switch_on(setup, config.hidden, seed)
+
+        def hiding(hidden: Sequence[tuple[str, float]]) -> Setup:
+            """The setup with hidden effects (name, amplitude)."""
+            effects = no_effects(design.chambers, stiffness)
+            return switch_on(Setup(effects, loads, rod, config.event_window_s), hidden, seed)
+
+        setup = hiding(config.hidden)
         volumes = rod.wall.areas * design.soft_mm
         self._plant = bench.Plant(
             robot=robot,
@@ -146,7 +169,14 @@ class VirtualRig:
             ),
             effects=setup.effects,
         )
-        self._thermometer = setup.effects.warmth != 0.0
+        self._changes: list[tuple[int, bench.Plant]] = []
+        present = list(config.hidden)
+        for name, amplitude, begins_s in config.later:
+            present.append((name, amplitude))
+            setup = hiding(present)
+            plant = self._plant._replace(loads=setup.loads, effects=setup.effects)
+            self._changes.append((bench.steps_in(self._plant, begins_s), plant))
+        self._begun: int | None = None
         self.period_s = self._plant.cameras.period
         self._rng = np.random.default_rng([seed, config.take, 0x5EED])
         self._state = bench.new_state(self._plant)
@@ -166,6 +196,8 @@ class VirtualRig:
         """Vent the arm and let it rest until it has no memory of before: the start of a run."""
         bench.rest(self._plant, self._state)
         self._state.steps[0] += bench.steps_in(self._plant, REST_S)
+        if self._begun is None:
+            self._begun = int(self._state.steps[0])
 
     def command(self, pressures: np.ndarray) -> None:
         """Set the pressures (m,) [kPa gauge] that the controllers reach for from now on."""
@@ -187,7 +219,7 @@ class VirtualRig:
             measured=frame.measured[0],
             commanded=self._state.target.copy(),
             key_points_mm=frame.points[0],
-            temp_C=float(frame.temperature[0]) if self._thermometer else None,
+            temp_C=float(frame.temperature[0]),
         )
         return sample, Truth(frame.centres, frame.clean, frame.chamber)
 
@@ -221,22 +253,54 @@ class VirtualRig:
             frames.points,
             commanded,
             noise_mm,
-            frames.temperature if self._thermometer else None,
+            frames.temperature,
         )
         return recording, truth
 
     def _run(self, commands: np.ndarray, pause: int, count: int) -> bench.Frames:
         """Frames (P * count): `count` samples after each command (P, m) and a pause."""
-        plant = self._plant
-        need = bench.tape_of_pause(plant, pause) + count * bench.tape_of_sample(plant)
-        tape = self._rng.standard_normal(len(commands) * need)
-        frames = bench.new_frames(plant, len(commands) * count)
-        found = bench.run_commands(
-            plant, self._state, commands, pause, self._steps, count, tape, frames
-        )
-        if not found:
-            raise no_equilibrium()
+        frames = bench.new_frames(self._plant, len(commands) * count)
+        filled = 0
+        for some, rest, samples in self._stretches(commands, pause, count):
+            plant = self._plant
+            need = bench.tape_of_pause(plant, rest) + samples * bench.tape_of_sample(plant)
+            tape = self._rng.standard_normal(len(some) * need)
+            room = bench.Frames(*(a[filled : filled + len(some) * samples] for a in frames))
+            filled += len(some) * samples
+            if not bench.run_commands(
+                plant, self._state, some, rest, self._steps, samples, tape, room
+            ):
+                raise no_equilibrium()
         return frames
+
+    def _stretches(
+        self, commands: np.ndarray, pause: int, count: int
+    ) -> Iterator[tuple[np.ndarray, int, int]]:
+        """Commands (P, m), pause and count of `_run` in parts during which no effect begins.
+
+        A later hidden effect begins with the first pause or sample that starts at or after its
+        time, however the samples are asked for; then this changes the plant.
+        """
+        each = pause + count * self._steps
+        while len(commands):
+            now = int(self._state.steps[0]) - (self._begun or 0)
+            while self._changes and self._changes[0][0] <= now:
+                self._plant = self._changes.pop(0)[1]
+            if not self._changes:
+                yield commands, pause, count
+                return
+            whole = (self._changes[0][0] - now) // each
+            if whole:
+                yield commands[:whole], pause, count
+            elif pause and count:
+                yield from self._stretches(commands[:1], pause, 0)
+                yield from self._stretches(commands[:1], 0, count)
+            elif count > 1:
+                for _ in range(count):
+                    yield from self._stretches(commands[:1], 0, 1)
+            else:
+                yield commands[:1], pause, count
+            commands = commands[max(whole, 1) :]
 
     def _part(self, protocol: Protocol, commands: np.ndarray) -> Part:
         """One recorded sample for each of the commands (P, m) [kPa]."""

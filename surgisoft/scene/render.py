@@ -41,7 +41,17 @@ LAMP_HALF_MM = 70.0
 class Renderer:
     """Renders pictures of a fixed set of bodies; built once, one picture per call."""
 
-    def __init__(self, bodies: Sequence[Body], camera: Camera, width: int = 160, height: int = 120):
+    def __init__(
+        self,
+        bodies: Sequence[Body],
+        camera: Camera,
+        width: int = 160,
+        height: int = 120,
+        lamp_half_mm: float = LAMP_HALF_MM,
+        round_view: bool = True,
+    ):
+        """lamp_half_mm: distance at which the light has fallen to a half; round_view: whether the
+        corners are black, as in an endoscope's picture."""
         meshes = [body.world_mesh for body in bodies]
         starts = np.cumsum([0, *(len(m.vertices_mm) for m in meshes)])
         vertices = np.concatenate([m.vertices_mm for m in meshes])
@@ -57,7 +67,9 @@ class Renderer:
         self._names = [body.name for body in bodies]
         self._surface = EmbreeSurface(self._mesh)
         self._camera, self.width, self.height = camera, width, height
-        self._rays, self._inside = pixel_rays(camera, width, height)
+        self._rays, inside = pixel_rays(camera, width, height)
+        self._inside = inside if round_view else np.ones_like(inside)
+        self._lamp_half_mm = lamp_half_mm
 
     def image(
         self,
@@ -66,10 +78,12 @@ class Renderer:
         own: str | None = None,
         beam_mm: np.ndarray | None = None,
         paint: Mapping[str, Callable] | None = None,
+        beam_radius_mm: float = BEAM_RADIUS_MM,
     ) -> np.ndarray:
         """(height, width, 3) uint8 picture from pose (4, 4).
 
-        `own` carries the camera; beam_mm (2, 3) mm is the visible beam's ends; `paint` maps a
+        `own` carries the camera; beam_mm (2, 3) mm is the visible beam's ends, beam_radius_mm the
+        half-width of its glow; `paint` maps a
         body's name to a function of (faces (N,), points (N, 3) mm world, colours (N, 3)) that
         returns new linear colours.
         """
@@ -94,7 +108,7 @@ class Renderer:
             np.zeros(len(rays))
             if beam_mm is None
             else _glow(
-                origin, rays, distance, np.asarray(beam_mm, dtype=np.float64), BEAM_RADIUS_MM
+                origin, rays, distance, np.asarray(beam_mm, dtype=np.float64), beam_radius_mm
             )
         )
         return self._developed(rays, distance, normal, colour, beam)
@@ -127,7 +141,7 @@ class Renderer:
     def _developed(self, rays, distance, normal, colour, beam) -> np.ndarray:
         """Apply light, gloss and gamma: linear colours to (H, W, 3) uint8."""
         facing = np.abs(frames.dot(normal, rays))
-        lamp = 1.0 / (1.0 + (distance / LAMP_HALF_MM) ** 2)
+        lamp = 1.0 / (1.0 + (distance / self._lamp_half_mm) ** 2)
         gloss = 0.35 * facing**40
         light = (colour * (0.06 + 0.94 * facing[:, None]) + gloss[:, None]) * lamp[:, None]
         met = np.any(normal != 0.0, axis=1)[:, None]

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.callables.network import CallableNetwork
 from surgisoft.surrogate.effects import Context, Effect, Memoryless, Stage
 from surgisoft.surrogate.history import History
-from surgisoft.surrogate.networks import RecurrentArm
 from surgisoft.surrogate.scan import direction_scan, direction_step
 
 STOOD_S = 10.0
@@ -95,7 +96,7 @@ class Resting:
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(B, n, 3) key points in mm."""
         network = link.part
-        if not isinstance(network, RecurrentArm):
+        if not network.remembers:
             return network(signal.value, signal.direction)
         self.memory[NETWORK] = network.rest(signal.value)
         return network(signal.value, signal.direction, self.memory[NETWORK])
@@ -124,9 +125,11 @@ class Stepping:
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(B, n, 3) key points in mm."""
         network = link.part
-        if not isinstance(network, RecurrentArm):
+        if not network.remembers:
             return network(signal.value, signal.direction)
-        hidden = network.advance(self.memory[NETWORK], signal.value, signal.direction)
+        hidden = network.advance(
+            self.memory[NETWORK], signal.value, signal.direction, self.context.dt_s
+        )
         self.memory[NETWORK] = hidden
         return network(signal.value, signal.direction, hidden)
 
@@ -139,8 +142,12 @@ class Standing(Stepping):
     """
 
     def __init__(self, state: ArmState):
-        """state: arms at rest, before they are held at another actuation."""
-        super().__init__(state, Context(state.pressure.new_full((len(state.pressure),), STOOD_S)))
+        """state: arms at rest, before they are held at another actuation.
+
+        The recording begins afterwards, so that no time has elapsed in it yet.
+        """
+        held = torch.full_like(state.pressure[:, 0], STOOD_S)
+        super().__init__(state, Context(held, torch.zeros_like(held)))
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
         """Signal behind an effect: a material effect has followed, any other has reached steady
@@ -151,11 +158,20 @@ class Standing(Stepping):
         return link.part.apply(signal.value, self.memory[link.name])
 
     def network(self, link: Link, signal: Signal) -> Tensor:
-        """(B, n, 3) key points in mm; the state of a recurrent network stays that of rest."""
-        if not isinstance(link.part, RecurrentArm):
-            return link.part(signal.value, signal.direction)
-        hidden = link.part.advance(self.memory[NETWORK], signal.value, signal.direction)
-        return link.part(signal.value, signal.direction, hidden)
+        """(B, n, 3) key points in mm.
+
+        The state of a recurrent network stays that of rest; a callable begins as it says itself.
+        """
+        network = link.part
+        if not network.remembers:
+            return network(signal.value, signal.direction)
+        if isinstance(network, CallableNetwork):
+            hidden = self.memory[NETWORK] = network.rest(signal.value)
+        else:
+            hidden = network.advance(
+                self.memory[NETWORK], signal.value, signal.direction, self.context.dt_s
+            )
+        return network(signal.value, signal.direction, hidden)
 
 
 class Scanning:
@@ -167,14 +183,17 @@ class Scanning:
         context: Context,
         rows: Callable[[Tensor], Tensor] | None = None,
         direction: Tensor | None = None,
+        history: History | None = None,
     ):
         """Set where the scan starts and which rows it computes.
 
         start: (R, ...) memory of each effect before the first row; context: (R, T) times and
         temperatures; rows: picks the rows (S, ...) of a (R, T, ...) tensor that the network and all
         effects behind it compute, which must then have no memory (None: every row); direction: (R,
-        T, m) direction of change where it is known, as in a window of a longer scan.
+        T, m) direction of change where it is known, as in a window of a longer scan; history: the
+        runs that are scanned, which networks of whole runs need.
         """
+        self.history = history
         self.start, self.context, self.rows, self.given = start, context, rows, direction
         self.memory: dict[str, Tensor] = {}
 
@@ -201,11 +220,13 @@ class Scanning:
 
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(R, T, n, 3), or (S, n, 3), key points in mm."""
-        actuation, direction = signal.value, signal.direction
+        actuation, direction, network = signal.value, signal.direction, link.part
+        if network.whole_runs:
+            points = network.along(actuation, self.history, self.start.get(NETWORK))
+            return points if self.rows is None else self.rows(points)
         if self.rows is not None:
             actuation, direction = self.rows(actuation), self.rows(direction)
-        network = link.part
-        if isinstance(network, RecurrentArm):
+        if network.remembers:
             return network(actuation, direction, network.scan(actuation, direction))
         return network(actuation, direction)
 
@@ -290,7 +311,7 @@ class Chain:
         mode, behind = Resting(), {}
         links = self.links if taps or self.outer else self.inner
         signal = self.walk(Signal(pressure), mode, links, behind if taps else None)
-        if NETWORK not in mode.memory and isinstance(self.net, RecurrentArm):
+        if NETWORK not in mode.memory and self.net.remembers:
             mode.memory[NETWORK] = self.net.rest(pressure)
         state = ArmState(pressure, pressure, torch.zeros_like(pressure), mode.memory)
         if not taps:
@@ -337,6 +358,12 @@ class Chain:
 
     def step(self, state: ArmState, pressure: Tensor, context: Context) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) in mm after `pressure` (B, m) was held for one step."""
+        if self.net.runs_only:
+            raise InputError(
+                f"{self.net.name} is a function of whole runs and cannot be stepped; give it "
+                "'initial_state' and 'step', or 'static = True' if each row depends on its own "
+                "actuation alone (docs/your_model.md)"
+            )
         mode = Stepping(state, context)
         signal = self.walk(Signal(pressure), mode)
         return ArmState(pressure, mode.anchor, signal.direction, mode.memory), signal.value
@@ -346,7 +373,7 @@ class Chain:
 
         links: the links to pass; default all.
         """
-        mode = Scanning(self.standing(first)[0].memory, context_of(history))
+        mode = Scanning(self.standing(first)[0].memory, context_of(history), history=history)
         behind = {}
         signal = self.walk(Signal(history.pressure), mode, links, behind)
         return Taps(signal.pressure, signal.direction, mode.memory, behind)
@@ -381,6 +408,22 @@ class Chain:
         return torch.stack(slopes, 1).unflatten(1, points.shape[1:])
 
     @torch.no_grad()
+    def slope(
+        self, history: History, first: Tensor, taps: Taps, rows: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        """(S, n, 3, m) derivative of the key points by the effective actuation, mm a unit.
+
+        first: (R, m) actuation at which each run begins; taps: those of a scan of the history;
+        rows: picks the rows (S, ...) of a (R, T, ...) tensor. Of a callable with memory: by an
+        actuation that is offset during the whole run.
+        """
+        actuation = taps.behind["material"]
+        if isinstance(self.net, CallableNetwork) and self.net.whole_runs:
+            memory = self.standing(first)[0].memory.get(NETWORK)
+            return self.net.slope_along(actuation, history, memory, rows)
+        return self.network_slope(rows(actuation), rows(taps.direction))
+
+    @torch.no_grad()
     def sensitivities(
         self,
         effect: Effect,
@@ -391,7 +434,7 @@ class Chain:
         """(K, S, n, 3) derivative of the key points by each amplitude of an effect at zero, mm.
 
         at: (S, m) actuation or (S, n, 3) key points, mm, that the effect sees; memory: (S, ...)
-        its memory; slope: (S, n, 3, m) `network_slope` on those rows, which line and material
+        its memory; slope: (S, n, 3, m) `slope` on those rows, which line and material
         effects act through. Effects behind the effect are assumed to pass the change on unchanged.
         """
         changes = effect.sensitivities(at, memory)
@@ -443,7 +486,8 @@ class RepeatedScan:
         runs = self.history.runs
         start = self.chain.standing(self.first)[0].memory
         start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
-        return Scanning(start, context_of(self.history), self.rows if self.thin else None)
+        rows = self.rows if self.thin else None
+        return Scanning(start, context_of(self.history), rows, history=self.history)
 
     def _walk(self, signal: Signal, links: tuple[Link, ...]) -> Signal:
         return self.chain.walk(signal, self.mode(), links)

@@ -17,8 +17,18 @@ from surgisoft.config import Where, describe, from_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import new_folder, read_json
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.callables.arm import arm_by_itself
+from surgisoft.surrogate.callables.named import (
+    is_callable_name,
+    name_callables,
+    named_callable,
+    stored_callable,
+)
+from surgisoft.surrogate.callables.network import CallableNetwork
+from surgisoft.surrogate.callables.predicted import PredictedNetwork
 from surgisoft.surrogate.effects import ArmFacts, Effect, effect_class, register_effect_files
 from surgisoft.surrogate.effects.user_defined import check_files, files_of
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.model import ArmModel, Validation, arm_facts
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
 from surgisoft.surrogate.training_residuals import FILE as RESIDUALS_FILE
@@ -42,11 +52,27 @@ NETWORKS = {
     "haw_ensemble": (HawEnsemble, ("key_points", "hidden", "directions", "members", "arcs")),
     "constant_curvature": (ConstantCurvature, ("key_points", "sections")),
     "recurrent": (RecurrentArm, ("key_points", "width")),
+    "callable": (CallableNetwork, ("key_points", "name", "sha256")),
 }
 """Every network by name: its class and the arguments that build it again."""
 
 
+SAME_MM = 0.01
+"""Largest distance of a key point at rest, mm, between a saved callable model and the callable as
+it is now: effects that were fitted around another callable do not belong to this one."""
+
+
 def _network_config(network) -> dict:
+    if isinstance(network, PredictedNetwork):
+        raise InputError(
+            f"{network.name}: predictions of recorded rows are no model that could be saved; give "
+            "the model as a callable (docs/your_model.md)"
+        )
+    if isinstance(network, CallableNetwork) and not network.named.found:
+        raise InputError(
+            f"{network.name}: no module has this object under a name, so a saved model could not "
+            "be opened again; define it at the top of a module and import it from there"
+        )
     for name, (kind, fields) in NETWORKS.items():
         if type(network) is kind:
             return {"kind": name, **{field: getattr(network, field) for field in fields}}
@@ -118,6 +144,8 @@ def save_model(
     if model.validation.interval is not None:
         # Beside the validation, where versions without intervals do not look.
         config["interval"] = model.validation.interval.to_json()
+    if model.fitted_rows is not None:
+        config["fitted_rows"] = model.fitted_rows.to_json()
     with new_folder(folder, OWN_FILES) as fresh:
         weights = {name: value.contiguous().cpu() for name, value in model.state_dict().items()}
         # Not by `save_file`, which makes a file that only its owner can read.
@@ -139,19 +167,25 @@ def load_model(
     folder: str | Path | ArmModel,
     device: str | torch.device = "cpu",
     effect_files: Iterable[str | Path] = (),
+    model_code: Iterable[str] = (),
 ) -> ArmModel:
     """The model in a folder, ready to evaluate; bit-equal to the saved one.
 
     `default`, where there is no such folder, is the arm that comes with the package. A model that
-    is open already is returned as it is.
+    is open already is returned as it is. `package.module:object`, `FILE.py:object` or an entry
+    point names a callable model (docs/your_model.md), which then has to state its own range.
 
     effect_files: files of user-defined effects that the model may hold. They are run, so name only
     files that you trust. Raises InputError where the folder holds no model, a damaged one, or one
-    that needs an effect file that was not named.
+    that needs code that was not named. model_code: names of callables that the model may
+    hold; they are imported, so name only what you trust.
     """
     register_effect_files(effect_files)
+    name_callables(model_code)
     if isinstance(folder, ArmModel):
         return folder.to(device)
+    if is_callable_name(str(folder)):
+        return arm_by_itself(named_callable(str(folder))).to(device)
     folder = _place(folder)
     if not (folder / "config.json").is_file():
         raise InputError(
@@ -174,7 +208,11 @@ def load_model(
         kind = network.pop("kind")
         if kind not in NETWORKS:
             raise unknown_name("network", str(kind), NETWORKS)
-        _check_size(folder, NETWORKS[kind][0], low, high, network, weights)
+        if kind == "callable":
+            code = (str(network["name"]), network.get("sha256"))
+            network["named"] = stored_callable(*code, str(folder))
+        else:
+            _check_size(folder, NETWORKS[kind][0], low, high, network, weights)
         check_files(config.get("effect_files", {}), str(folder))
         facts = arm_facts(spec, weights["rest_mm"])
         versions = config.get("effect_versions", {})
@@ -186,7 +224,11 @@ def load_model(
         validation = from_table(Validation, config["validation"] | stated, Where(file))
         model = ArmModel(spec, NETWORKS[kind][0](low, high, **network), effects, None, validation)
         model.load_state_dict(weights)
+        if "fitted_rows" in config:
+            model.fitted_rows = FittedRows.from_json(config["fitted_rows"])
         _check_finite(folder, model.state_dict())
+        if isinstance(model.network, CallableNetwork):
+            _check_same_callable(model, str(folder))
     except InputError:
         raise
     except Exception as error:
@@ -195,6 +237,18 @@ def load_model(
         ) from error
     model.training_residuals = load_training_residuals(folder)
     return model.to(device).eval().requires_grad_(False)
+
+
+def _check_same_callable(model: ArmModel, label: str) -> None:
+    """Raise InputError where a callable is not the one that effects were fitted around."""
+    with torch.no_grad():
+        now = model.network(model.rest[None], torch.zeros_like(model.rest)[None])[0]
+    off = float((now - model.rest_mm).norm(dim=-1).max())
+    if off > SAME_MM:
+        raise InputError(
+            f"{label}: {model.network.name} puts a key point at rest {off:.3g} mm from where it "
+            "was when the effects were fitted; name the callable as it was, or amend it again"
+        )
 
 
 def _check_finite(folder: Path, weights: dict[str, Tensor]) -> None:

@@ -24,6 +24,7 @@ from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Taps
 from surgisoft.surrogate.effects import hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.ensemble import train_ensemble
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.model import ArmModel
@@ -371,6 +372,7 @@ def fit(
     result.model.eval().requires_grad_(False)
     result.known = result.model.residuals_on([train] if valid is None else [train, valid])
     result.model.training_residuals = result.known
+    result.model.fitted_rows = FittedRows.of([train] if valid is None else [train, valid])
     result.seconds = time.perf_counter() - start
     return result
 

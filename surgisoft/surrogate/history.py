@@ -29,6 +29,9 @@ class History:
     NaN, or None for all, where runs begin at rest."""
     noise_mm: float | None = None
     """Standard deviation of one coordinate of the key points, mm, where it is known."""
+    predicted: Tensor | None = None
+    """(R, T, n, 3) float32 key points that the model in question predicts, mm, base frame, where
+    they come from a file; None where the model itself computes them."""
 
     @property
     def runs(self) -> int:
@@ -69,6 +72,7 @@ class History:
             None if self.temperature_C is None else self.temperature_C[runs, :length],
             None if self.stood is None else self.stood[runs],
             self.noise_mm,
+            None if self.predicted is None else self.predicted[runs, :length],
         )
 
     def to(self, device: str | torch.device) -> "History":
@@ -82,6 +86,7 @@ class History:
             None if self.temperature_C is None else self.temperature_C.to(device),
             None if self.stood is None else self.stood.to(device),
             self.noise_mm,
+            None if self.predicted is None else self.predicted.to(device),
         )
 
 
@@ -92,11 +97,12 @@ def pack(
     noise: tuple[float, ...] | None = None,
     temperature_C: list[Tensor] | None = None,
     stood: list[Tensor] | None = None,
+    predicted: list[Tensor] | None = None,
 ) -> History:
     """Runs of any lengths as one padded history.
 
-    Shapes a run: t_s (T,), pressure (T, m), key_points (T, n, 3) in mm, temperature_C (T,),
-    stood (m,).
+    Shapes a run: t_s (T,), pressure (T, m), key_points and predicted (T, n, 3) in mm,
+    temperature_C (T,), stood (m,).
     """
     if not pressure:
         raise InputError("no run: expected at least one with one row; check the recordings")
@@ -121,4 +127,5 @@ def pack(
         noise=noise,
         temperature_C=None if temperature_C is None else stack(temperature_C, torch.float32, None),
         stood=None if stood is None else torch.stack(stood).float(),
+        predicted=None if predicted is None else stack(predicted, torch.float32, None),
     )

@@ -10,8 +10,11 @@ from torch import Tensor, nn
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmSpec, ArmState
 from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.callables.network import CallableNetwork
+from surgisoft.surrogate.callables.predicted import PredictedNetwork
 from surgisoft.surrogate.chain import Chain, Taps
 from surgisoft.surrogate.effects import STAGES, ArmFacts, Context, Effect, Stage
+from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import LEVEL, ErrorInterval, distance_to
 from surgisoft.surrogate.networks import ConstantCurvature, HawEnsemble, HawNN, RecurrentArm
@@ -21,8 +24,10 @@ AWAY_SHARE = 0.15
 """A run begins away from rest where a chamber's measured actuation is farther from it than this
 share of its range."""
 
-Network = HawNN | HawEnsemble | ConstantCurvature | RecurrentArm
-"""Networks that the chain may have."""
+Network = (
+    HawNN | HawEnsemble | ConstantCurvature | RecurrentArm | CallableNetwork | PredictedNetwork
+)
+"""Networks that the chain may have; the last two stand for models of other origin."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,9 @@ class ArmModel(nn.Module):
 
     training_residuals: TrainingResiduals | None = None
     """Residuals of the model on rows of its fit; None where they are not known."""
+    fitted_rows: FittedRows | None = None
+    """Which measured rows the model was fitted to; None for models that were fitted before this
+    was kept."""
 
     def __init__(
         self,
@@ -115,6 +123,7 @@ class ArmModel(nn.Module):
         )
         if not changed:
             fresh.training_residuals = self.training_residuals
+        fresh.fitted_rows = self.fitted_rows
         return fresh.to(self.rest_mm.device).train(self.training)
 
     @torch.no_grad()
@@ -135,6 +144,11 @@ class ArmModel(nn.Module):
         """The chain of this model's links."""
         return Chain(self.network, self.effects, self.rest, self.band, self.still, self.idle)
 
+    def freeze(self) -> None:
+        """Fix what the network's program takes from its parameters, so that it can be a graph."""
+        if isinstance(self.network, ConstantCurvature):
+            self.network.fix_sections()
+
     @property
     def facts(self) -> ArmFacts:
         """The properties of this arm that effects may use, on the CPU."""
@@ -146,8 +160,19 @@ class ArmModel(nn.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether the network has a state of its past."""
-        return isinstance(self.network, RecurrentArm)
+        """Whether key points depend on the past in the network itself, so that every row counts."""
+        network = self.network
+        return network.remembers or (isinstance(network, CallableNetwork) and network.whole_runs)
+
+    @property
+    def takes_effects(self) -> bool:
+        """Whether effects can be placed around the network: not around the recurrent baseline."""
+        return not isinstance(self.network, RecurrentArm)
+
+    @property
+    def trainable(self) -> bool:
+        """Whether the network has weights that can be trained together with effects."""
+        return isinstance(self.network, HawNN | HawEnsemble | ConstantCurvature)
 
     def backbone(self, samples: int = 21, degree: int = 3) -> Backbone:
         """The B-spline through this arm's key points."""
@@ -266,6 +291,10 @@ class ArmModel(nn.Module):
         kind = type(self.network).__name__
         if isinstance(self.network, HawEnsemble):
             kind = f"{self.network.members} x HawNN"
+        if isinstance(self.network, CallableNetwork):
+            kind = f"callable {self.network.name}"
+        if isinstance(self.network, PredictedNetwork):
+            kind = f"predictions of {self.network.name}"
         return (
             f"{kind} ({inputs}), {self.spec.chambers} chambers in "
             f"{self.spec.unit} ({self.spec.actuation}), {self.spec.key_points} key points, "

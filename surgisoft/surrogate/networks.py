@@ -35,6 +35,8 @@ class HawNN(nn.Module):
     its activation; SiLU (Elfwing et al. 2018) is smooth, so that Jacobians are too, and fast.
     """
 
+    remembers = whole_runs = runs_only = False
+
     def __init__(
         self,
         low: Tensor,
@@ -109,6 +111,8 @@ class HawEnsemble(nn.Module):
     part of the error that differs between them (Breiman 1996; Lakshminarayanan et al. 2017). All
     K are evaluated by one batched product a layer.
     """
+
+    remembers = whole_runs = runs_only = False
 
     def __init__(
         self,
@@ -242,6 +246,7 @@ class ConstantCurvature(nn.Module):
     """Key points on constant-curvature arcs; ignores directions (Webster & Jones 2010)."""
 
     directions = False
+    remembers = whole_runs = runs_only = False
 
     def __init__(self, low: Tensor, high: Tensor, key_points: int, sections: int = 0):
         """Pressure range (m,) in the arm's unit; `sections` 0 means one for every 3 chambers."""
@@ -251,6 +256,7 @@ class ConstantCurvature(nn.Module):
         if key_points < 2:
             raise InputError("constant curvature needs at least 2 key points; this arm has 1")
         self.key_points, self.sections = key_points, sections
+        self._on: list[int] | None = None
         centre, half = centre_and_half(low, high)
         self.register_buffer("centre", centre)
         self.register_buffer("half_range", half)
@@ -259,6 +265,15 @@ class ConstantCurvature(nn.Module):
         self.table = nn.Parameter(torch.zeros(sections, 3, chambers + 1))
         self.base_turn = nn.Parameter(torch.zeros(3))
         self.base_mm = nn.Parameter(torch.zeros(3))
+
+    def _sections_of_points(self) -> list[int]:
+        """The section that each key point is on."""
+        place = (self.fraction.detach() * self.sections).floor()
+        return place.clamp(0, self.sections - 1).long().tolist()
+
+    def fix_sections(self) -> None:
+        """Keep each key point on its section from now on, whatever becomes of the spacing."""
+        self._on = self._sections_of_points()
 
     def set_rest(self, rest: Tensor) -> None:
         """Set base, length and spacing from the key points at rest, (n, 3) in mm, base frame."""
@@ -277,13 +292,13 @@ class ConstantCurvature(nn.Module):
         turn = _rotation(self.base_turn).expand(*x.shape[:-1], 3, 3)
         start = self.base_mm.expand(*x.shape[:-1], 3)
         points = [start] * self.key_points
+        on = self._sections_of_points() if self._on is None else self._on
         for section in range(self.sections):
             bend = values[..., section, :2]
             length = self.length / self.sections * values[..., section, 2].exp()
             for k in range(self.key_points):
                 share = self.fraction[k] * self.sections - section
-                last = section == self.sections - 1
-                if (share >= 0 or section == 0) and (share < 1 or last):
+                if on[k] == section:
                     local = arc_point(bend * share, length * share)
                     points[k] = start + (turn @ local[..., None])[..., 0]
             start = start + (turn @ arc_point(bend, length)[..., None])[..., 0]
@@ -358,7 +373,8 @@ class ArcChain(nn.Module):
 class RecurrentArm(nn.Module):
     """Gated recurrent unit (Cho et al. 2014) from pressures and directions to key points."""
 
-    directions = True
+    directions = remembers = True
+    whole_runs = runs_only = False
 
     def __init__(self, low: Tensor, high: Tensor, key_points: int, width: int = 64):
         """Pressure range low, high (m,) in the arm's unit; `width` of the hidden state."""
@@ -382,10 +398,16 @@ class RecurrentArm(nn.Module):
         """(B, width) hidden state of an arm without history, for pressure (B, m)."""
         return pressure.new_zeros(len(pressure), self.width)
 
-    def advance(self, memory: Tensor, pressure: Tensor, direction: Tensor) -> Tensor:
-        """(B, width) hidden state after one row of pressure and direction, each (B, m)."""
-        x = self._inputs(pressure, direction).unsqueeze(1)
-        return self.cell(x, memory.unsqueeze(0))[1].squeeze(0)
+    def advance(
+        self, memory: Tensor, pressure: Tensor, direction: Tensor, dt_s: Tensor | None = None
+    ) -> Tensor:
+        """(B, width) hidden state after one row of pressure and direction, each (B, m).
+
+        dt_s (B,) does not count: a recurrent unit takes row by row.
+        """
+        cell = self.cell
+        weights = (cell.weight_ih_l0, cell.weight_hh_l0, cell.bias_ih_l0, cell.bias_hh_l0)
+        return torch.gru_cell(self._inputs(pressure, direction), memory, *weights)
 
     def scan(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
         """(R, T, width) hidden states along pressure and direction, each (R, T, m)."""

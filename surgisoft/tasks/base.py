@@ -11,13 +11,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.observations import ObservationBlocks
+from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
+from surgisoft.tasks.world.scene import SceneState
 from surgisoft.tasks.world.world import World, WorldState
-
-OBSERVATION_LIMIT = 20.0
-"""Observations are clipped to plus and minus this; tasks scale theirs to be far below it."""
 
 Goal = TypeVar("Goal", bound=TensorDataclass)
 """Type of a task's goal, the part of its state that is not the world: a dataclass of tensors."""
@@ -74,6 +72,43 @@ class Task(Protocol):
 
     def script(self, state: TaskState) -> dict[str, Tensor]:
         """Action of the scripted expert, agent -> (B, m) kPa: privileged inverse kinematics."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A quantity that an exported controller has to be given beside pressures and key points."""
+
+    name: str
+    """Name, an input of the controller."""
+    meaning: str
+    """What is measured."""
+    unit: str
+    """Unit; `-` where it has none."""
+    low: float
+    """Lowest value."""
+    high: float
+    """Highest value."""
+    default: float | None = None
+    """Value where none is given; None: it has to be given; nan: the controller's own estimate."""
+
+
+class MeasuredTask(Task, Protocol):
+    """A task in a scene whose controller can be exported: what it needs of the scene is measured.
+
+    Tasks in empty space need nothing else than their arms, and none of this.
+    """
+
+    signals: tuple[Signal, ...]
+    """What has to be measured."""
+
+    def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
+        """The scene as far as observations need it, from signals name -> (B,)."""
+
+    def true_signals(self, before: TaskState | None, after: TaskState) -> dict[str, Tensor]:
+        """Name -> (B,): the signals at a simulated state, and before it None at the start."""
+
+    def advance_measured(self, state: TaskState, signals: Mapping[str, Tensor]) -> TaskState:
+        """Advance one step after which the world is as measured, signals name -> (B,)."""
 
 
 class DocumentedTask(Task, Protocol):

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.observations import (
     TIME,
@@ -26,7 +26,7 @@ from surgisoft.tasks.observations import (
 )
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut, point_on_closed
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.scene import PHANTOM
+from surgisoft.tasks.world.scene import PHANTOM, SceneState, measured_view
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 BEAM_ERROR = Block(
@@ -35,16 +35,20 @@ BEAM_ERROR = Block(
     "mm",
     "asinh(x / 1 mm)",
 )
-RING_PLACE = Block("ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)")
-RING_DIRECTION = Block("ring_direction", "direction of travel along the ring, +1 or -1", "-", "x")
+RING_PLACE = Block(
+    "ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)", -1.0, 1.0
+)
+RING_DIRECTION = Block(
+    "ring_direction", "direction of travel along the ring, +1 or -1", "-", "x", -1.0, 1.0
+)
 VIEW_ERROR = Block(
     "view_error",
     "perpendicular offset of the lesion's centre from the measured axis of the camera",
     "mm",
     "asinh(x / 1 mm)",
 )
-VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x")
-FIRED = Block("fired", "1 if the beam was on in the last step, else 0", "-", "x")
+VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x", 0.0, 1.0)
+FIRED = Block("fired", "1 if the beam was on in the last step, else 0", "-", "x", 0.0, 1.0)
 APART = Block("apart", "measured tip of the laser arm minus that of the endoscope", "mm", "x / 50")
 
 
@@ -106,7 +110,9 @@ class CircleAblationConfig:
     cut_s: float = 45.0
     """Time for once around with the beam on, s."""
     fire_mm: float = 0.5
-    """Distance of the beam from its target within which the beam is switched on, mm."""
+    """Measured distance of the beam from its target within which the beam is switched on, mm."""
+    approach_s: float = 5.0
+    """Time at the beginning that the measure `pointing_error_mm` leaves out, s."""
     fine_mm: float = 0.1
     """Scale of the reward term `fine`, mm."""
     far_mm: float = 10.0
@@ -119,17 +125,29 @@ class CircleAblationConfig:
     """The simulator and its domain randomization."""
 
     def __post_init__(self):
-        for name in ("cut_s", "fire_mm", "fine_mm", "far_mm", "preview"):
+        for name in ("cut_s", "fire_mm", "approach_s", "fine_mm", "far_mm", "preview"):
             if not getattr(self, name) > 0:
                 raise InputError(f"circle_ablation: {name} is {getattr(self, name)}, expected > 0")
         check_weights("circle_ablation: laser", self.weights.laser)
         check_weights("circle_ablation: endoscope", self.weights.endoscope)
 
 
+def success_rule(config: CircleAblationConfig) -> str:
+    """What an episode needs to be a success, in words; `measures` computes it."""
+    return (
+        f"the whole ring is cut, without contact; the beam is on only within {config.fire_mm:g} mm "
+        f"of its target (fire_mm), which goes once around in {config.cut_s:g} s (cut_s)"
+    )
+
+
 class CircleAblation:
     """The two arms of a scene: agents `laser` and `endoscope`."""
 
     name, agents = "circle_ablation", ("laser", "endoscope")
+    signals = (
+        Signal("view_fraction", "share of the ring that the endoscope sees", "-", 0.0, 1.0),
+        Signal("beam_on", "1 if the beam was on since the last decision, else 0", "-", 0.0, 1.0),
+    )
 
     def __init__(
         self, config: CircleAblationConfig | None = None, device: str | torch.device = "cpu"
@@ -162,17 +180,32 @@ class CircleAblation:
         return self.scene.centres_mm[state.world.scene.lesion]
 
     def beam_error_mm(self, state: TaskState[RingCut]) -> Tensor:
-        """(B,) mm: perpendicular distance of the beam's axis from its target."""
-        laser = state.world.arms["laser"]
-        offset = self.pointing["laser"].offset_mm(laser.points_mm, self.target_mm(state))
-        return offset.norm(dim=1)
+        """(B,) mm: true perpendicular distance of the beam's axis from its target."""
+        return self._off_target_mm(state, state.world.arms["laser"].points_mm)
+
+    def measured_error_mm(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) mm: distance of the beam's axis from its target as measured or estimated."""
+        return self._off_target_mm(state, state.world.arms["laser"].seen_mm)
+
+    def _off_target_mm(self, state: TaskState[RingCut], points_mm: Tensor) -> Tensor:
+        return self.pointing["laser"].offset_mm(points_mm, self.target_mm(state)).norm(dim=1)
 
     def fires(self, state: TaskState[RingCut]) -> Tensor:
-        """(B,) bool: the ring is in view, the beam is near its target, and it hits the organ."""
+        """(B,) bool: as far as is measured the beam is near its target and meets the organ, and the
+        endoscope's picture shows enough of the ring. The true pose of the arms does not enter."""
         scene = state.world.scene
         seen = scene.view.fraction >= self.spec.limits.view_fraction
-        near = self.beam_error_mm(state) <= self.config.fire_mm
-        return seen & near & scene.hit.on_organ
+        near = self.measured_error_mm(state) <= self.config.fire_mm
+        return seen & near & self._on_organ(state)
+
+    def _on_organ(self, state: TaskState[RingCut]) -> Tensor:
+        """(B,) bool: the beam meets the organ, from the measured key points of both arms."""
+        parts, hit = state.world.arms, state.world.scene.hit
+        if all(torch.equal(part.seen_mm, part.points_mm) for part in parts.values()):
+            return hit.on_organ  # what is measured is the truth: the ray was cast already
+        return self.scene.aimed(
+            {name: self.world.arms[name].posed(part, part.seen_mm) for name, part in parts.items()}
+        ).on_organ
 
     def advance(
         self,
@@ -186,6 +219,26 @@ class CircleAblation:
         fired = self.fires(state) if fired is None else fired
         world = self.world.step(state.world, actions, fired * self.spec.laser.power_w)
         return TaskState(world, state.goal.after(fired))
+
+    def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
+        """The view of the ring; see `MeasuredTask.measured_scene`."""
+        return replace(measured_view(signals["view_fraction"]), lesion=lesion)
+
+    def true_signals(
+        self, before: TaskState[RingCut] | None, after: TaskState[RingCut]
+    ) -> dict[str, Tensor]:
+        """The signals of a simulated step; see `MeasuredTask.true_signals`."""
+        return {
+            "view_fraction": after.world.scene.view.fraction,
+            "beam_on": after.goal.fired.float(),
+        }
+
+    def advance_measured(
+        self, state: TaskState[RingCut], signals: Mapping[str, Tensor]
+    ) -> TaskState[RingCut]:
+        """Advance where the beam was on or off as measured; see `MeasuredTask`."""
+        none = {name: arm.low.new_zeros(1, arm.chambers) for name, arm in self.world.arms.items()}
+        return self.advance(state, none, signals["beam_on"] > 0.5)
 
     def blocks(self, state: TaskState[RingCut]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body and pointing error of each arm, and the state of the cut."""
@@ -245,11 +298,18 @@ class CircleAblation:
         return done | state.world.scene.clearance.collides
 
     def measures(self, state: TaskState[RingCut]) -> dict[str, Tensor]:
-        """Beam error, progress of the cut, healthy tissue burnt, view, clearance, success."""
-        scene = state.world.scene
+        """Beam error, progress of the cut, healthy tissue burnt, view, clearance, success.
+
+        beam_error_mm: true error while the beam is on. pointing_error_mm: true error at every step
+        after `approach_s`, with the beam on or off, so that no gate truncates it.
+        """
+        scene, error = state.world.scene, self.beam_error_mm(state)
         ring, hit = self.scene.ablation.report(scene.dose), scene.clearance.collides
         return {
-            "beam_error_mm": self.beam_error_mm(state).where(state.goal.fired, float("nan")),
+            "beam_error_mm": error.where(state.goal.fired, float("nan")),
+            "pointing_error_mm": error.where(
+                state.world.steps * self.dt_s > self.config.approach_s, float("nan")
+            ),
             "completion": ring.completion,
             "largest_gap_mm": ring.largest_gap_mm,
             "healthy_mm2": ring.healthy_mm2,

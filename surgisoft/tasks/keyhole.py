@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
 from surgisoft.tasks.trajectories.waypoints import (
@@ -26,6 +26,7 @@ from surgisoft.tasks.trajectories.waypoints import (
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.plate import SlottedPlate, clear_routes, plate_world
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.scene import SceneState, measured_clearance
 from surgisoft.tasks.world.world import WorldConfig
 
 TARGET = Block("target", "target minus measured tip", "mm", "asinh(x / 1 mm)")
@@ -33,7 +34,7 @@ ONWARD = Block(
     "onward", "point of the route one stride ahead minus measured tip", "mm", "asinh(x / 1 mm)"
 )
 CLEARANCE = Block("clearance", "least distance of the arm from the plate", "mm", "x / 10")
-VISITS = Block("visits", "share of the targets reached", "-", "x")
+VISITS = Block("visits", "share of the targets reached", "-", "x", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,17 @@ class Keyhole:
     """One arm and a slotted plate."""
 
     name, agents = "keyhole", ("arm",)
+    signals = (
+        Signal("clearance_mm", "least distance of the arm from the plate", "mm", -20.0, 100.0),
+        Signal(
+            "at_target",
+            "1 if the tip is within reach_mm of its target, else 0",
+            "-",
+            0.0,
+            1.0,
+            float("nan"),
+        ),
+    )
 
     def __init__(self, config: KeyholeConfig | None = None, device: str | torch.device = "cpu"):
         c = self.config = config or KeyholeConfig()
@@ -121,13 +133,42 @@ class Keyhole:
         return (state.world.arms["arm"].tip_mm - self.route_mm(state)[:, -1]).norm(dim=1)
 
     def advance(
-        self, state: TaskState[WaypointSequence], actions: Mapping[str, Tensor]
+        self,
+        state: TaskState[WaypointSequence],
+        actions: Mapping[str, Tensor],
+        at_target: Tensor | None = None,
     ) -> TaskState[WaypointSequence]:
-        """Advance the arm; when the tip reaches a target, the next one becomes active."""
+        """Advance the arm; when the tip reaches a target, the next one becomes active.
+
+        at_target: (B,) 1 where the tip is at its target, 0 where it is not, nan or None where the
+        state decides.
+        """
         state = replace(state, world=self.world.step(state.world, actions))
-        near = (self.error_mm(state) <= self.config.reach_mm) & ~self.ended(state)
+        near = self.error_mm(state) <= self.config.reach_mm
+        if at_target is not None:
+            near = torch.where(at_target.isnan(), near, at_target > 0.5)
+        near = near & ~self.ended(state)
         reached = (state.goal.reached + near).clamp(max=self.config.visits)
         return replace(state, goal=replace(state.goal, reached=reached))
+
+    def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
+        """The arm's clearance; see `MeasuredTask.measured_scene`."""
+        return measured_clearance(signals["clearance_mm"])
+
+    def true_signals(
+        self, before: TaskState[WaypointSequence] | None, after: TaskState[WaypointSequence]
+    ) -> dict[str, Tensor]:
+        """The signals of a simulated step; see `MeasuredTask.true_signals`."""
+        least = after.world.scene.clearance.least_mm
+        reached = after.goal.reached - (0 if before is None else before.goal.reached)
+        return {"clearance_mm": least, "at_target": reached.float()}
+
+    def advance_measured(
+        self, state: TaskState[WaypointSequence], signals: Mapping[str, Tensor]
+    ) -> TaskState[WaypointSequence]:
+        """Advance with the targets that were reached as measured; see `MeasuredTask`."""
+        none = {"arm": self.arm.low.new_zeros(1, self.arm.chambers)}
+        return self.advance(state, none, signals["at_target"])
 
     def blocks(self, state: TaskState[WaypointSequence]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body, target, next stride, clearance, visits and time."""
@@ -193,4 +234,4 @@ def _tip_error(points_mm: Tensor, target_mm: Tensor) -> Tensor:
     return points_mm[:, -1] - target_mm
 
 
-KEYHOLE = TaskSpec(Keyhole, KeyholeConfig(), ("arm",))
+KEYHOLE = TaskSpec(Keyhole, KeyholeConfig(), ("arm",), training_steps=2_000_000)

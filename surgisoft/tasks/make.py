@@ -13,7 +13,10 @@ def make(task: str, **options: Any) -> SingleEnv | SurgicalEnv:
 
     A task of one agent becomes a `gymnasium.Env`, a task of several a PettingZoo `ParallelEnv`.
 
-    options: those of `parallel_env`: `config`, `device`, `scene`, `arm`, `geometry`.
+    options: those of `parallel_env`: `config`, `device`, `scene`, `arm`, `geometry`,
+    `render_mode`.
     """
     env = parallel_env(task, **options)
-    return SingleEnv(env.task) if len(env.possible_agents) == 1 else env
+    return (
+        SingleEnv(env.task, render_mode=env.render_mode) if len(env.possible_agents) == 1 else env
+    )

@@ -8,12 +8,40 @@ from typing import Any
 import numpy as np
 import torch
 
-from surgisoft.errors import InputError
-from surgisoft.tasks.base import OBSERVATION_LIMIT, Episodes, Outcome, Task, TaskState
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.observations import OBSERVATION_LIMIT
+from surgisoft.tasks.world.picture import WorldPicture
 from surgisoft.tasks.world.random_streams import joined, streams
 
 Bounds = tuple[Any, Any, tuple[int, ...], Any]
 """Lowest value, highest value, shape and dtype: the arguments of a Gymnasium Box."""
+
+
+RGB_ARRAY = "rgb_array"
+"""The render mode of the environments: pictures as arrays."""
+
+
+class Pictures:
+    """Pictures of a task's first environment, for the render mode `rgb_array`."""
+
+    def __init__(self, task: Task, mode: str | None):
+        """mode: `rgb_array`, or None for no pictures."""
+        if mode not in (None, RGB_ARRAY):
+            raise unknown_name("render_mode", mode, [RGB_ARRAY])
+        self._task, self._mode = task, mode
+        self._picture: WorldPicture | None = None
+
+    @torch.inference_mode()
+    def of(self, state: TaskState | None) -> np.ndarray | None:
+        """(H, W, 3) uint8 picture of a state, made with the camera's first use."""
+        if self._mode is None:
+            return None
+        if state is None:
+            raise InputError("render before reset: call reset() first")
+        if self._picture is None:
+            self._picture = WorldPicture(self._task.world)
+        return self._picture.image(state.world, self._task.trace(state)[0])
 
 
 def entropy_seed() -> int:

@@ -7,12 +7,15 @@ the top of the task's file; `surgisoft.tasks.describe` lists them with their ind
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from surgisoft.tasks.world.arm import Arm, ArmPart
+
+OBSERVATION_LIMIT = 20.0
+"""Observations are clipped to plus and minus this; tasks scale theirs to be far below it."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,10 @@ class Block:
     """Unit of x before scaling; `-` where it has none."""
     scale: str = field(compare=False)
     """The observed value as a function of x."""
+    low: float = field(default=-OBSERVATION_LIMIT, compare=False)
+    """Lowest observed value; noise may carry a measured one past it, as far as the clipping."""
+    high: float = field(default=OBSERVATION_LIMIT, compare=False)
+    """Highest observed value."""
 
 
 ObservationBlocks = Mapping[Block, Tensor]
@@ -44,28 +51,29 @@ def numbered(block: Block, values: Iterable[Tensor], unit: str = "step") -> Obse
     unit: what `ahead` counts.
     """
     return {
-        Block(
-            f"{block.name}_{ahead}" if ahead else block.name,
-            f"{block.meaning}, {ahead} {unit}{'s' * (ahead > 1)} ahead" if ahead else block.meaning,
-            block.unit,
-            block.scale,
+        replace(
+            block,
+            name=f"{block.name}_{ahead}" if ahead else block.name,
+            meaning=block.meaning + f", {ahead} {unit}{'s' * (ahead > 1)} ahead" * (ahead > 0),
         ): value
         for ahead, value in enumerate(values)
     }
 
 
 SHAPE = Block("shape", "measured key points relative to the base, base excluded", "mm", "x / 50")
-COMMAND = Block("command", "commanded pressures", "kPa", "range to -1..1")
-PRESSURE = Block("pressure", "measured pressures", "kPa", "range to -1..1")
-DIRECTION = Block("direction", "the model's direction of pressure change", "-", "x")
+COMMAND = Block("command", "commanded pressures", "kPa", "range to -1..1", -1.0, 1.0)
+PRESSURE = Block("pressure", "measured pressures", "kPa", "range to -1..1", -1.0, 1.0)
+DIRECTION = Block("direction", "the model's direction of pressure change", "-", "x", -1.0, 1.0)
 REVERSAL = Block(
     "reversal",
     "pressure change since the last direction change, in dead bands; at -1 or 1 the model's "
     "direction reverses and the arm jumps",
     "-",
     "clip(x, -1.5, 1.5)",
+    -1.5,
+    1.5,
 )
-TIME = Block("time", "elapsed share of the episode", "-", "x")
+TIME = Block("time", "elapsed share of the episode", "-", "x", 0.0, 1.0)
 
 
 def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
@@ -77,13 +85,15 @@ def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
 def pressure_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
     """Commands, measured pressures, directions of change and distances to a reversal, (B, m) each.
 
-    The last two come from the model beside the arm, fed with the arm's pressures.
+    The last two come from the model beside the arm, fed with the arm's pressures (with an observer:
+    with the measured ones).
     """
     half = 0.5 * (arm.high - arm.low)
-    back = (part.arm.pressure - part.arm.anchor) / arm.model.band.clamp(min=1e-3)
+    beside = part.model_beside
+    back = (beside.pressure - beside.anchor) / arm.model.band.clamp(min=1e-3)
     return {
         COMMAND: (part.command - arm.low) / half - 1.0,
         PRESSURE: (part.seen_kPa - arm.low) / half - 1.0,
-        DIRECTION: part.arm.direction,
+        DIRECTION: beside.direction,
         REVERSAL: back.clamp(-1.5, 1.5),
     }

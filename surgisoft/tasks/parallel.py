@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import NumpyAdapter, entropy_seed
+from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed
 from surgisoft.tasks.registry import make_with
 
 
@@ -24,9 +24,14 @@ class SurgicalEnv(ParallelEnv):
     terms, and the task's measures where they apply.
     """
 
-    def __init__(self, task: Task):
-        self.metadata = {"name": task.name, "render_modes": [], "is_parallelizable": True}
-        self.render_mode = None
+    def __init__(self, task: Task, render_mode: str | None = None):
+        self.metadata = {
+            "name": task.name,
+            "render_modes": [RGB_ARRAY],
+            "render_fps": round(1.0 / task.world.config.dt_s),
+            "is_parallelizable": True,
+        }
+        self.render_mode, self._pictures = render_mode, Pictures(task, render_mode)
         self.task, self._adapter, self._state = task, NumpyAdapter(task), None
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
@@ -90,8 +95,9 @@ class SurgicalEnv(ParallelEnv):
         seen = self._adapter.observations(self._state)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
-    def render(self) -> None:
-        """Do nothing: `surgisoft.replay` draws episodes."""
+    def render(self) -> np.ndarray | None:
+        """(H, W, 3) uint8: the present state from outside; None without a render mode."""
+        return self._pictures.of(self._state)
 
     def close(self) -> None:
         """Do nothing: the environment holds no resources."""
@@ -108,12 +114,14 @@ def parallel_env(
     scene: str | Path | None = None,
     arm: str | Path | None = None,
     geometry: str = "fcl",
+    render_mode: str | None = None,
 ) -> SurgicalEnv:
     """The named task as a PettingZoo ParallelEnv.
 
     config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
     exact collision checker, or `batched`, the faster engine of training, for contact and for the
-    beam's hit; near contact the two agree to 0.1 mm.
+    beam's hit; near contact the two agree to 0.1 mm. render_mode: `rgb_array`, for pictures by
+    `render`, or None.
     """
-    return SurgicalEnv(make_with(task, config, device, scene, arm, geometry))
+    return SurgicalEnv(make_with(task, config, device, scene, arm, geometry), render_mode)

@@ -53,7 +53,7 @@ PRESSURE_HISTORY = Block(
 POINT_HISTORY = Block(
     "point_history", "movements of the measured point, newest first", "mm", "x / 1 mm"
 )
-TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1")
+TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1", -1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,10 +56,19 @@ def make_with(
 ) -> Task:
     """Build the named task with fields of its config changed; None leaves one as it is.
 
-    config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
-    model's folder or `default`. geometry: `fcl` or `batched`, see `world.scene.GEOMETRIES`.
+    config: the task's whole config, or a TOML file with fields of it; None: its default one. scene:
+    a scene's folder. arm: an arm model's folder or `default`. geometry: `fcl` or `batched`, see
+    `world.scene.GEOMETRIES`.
     """
-    config = config_of(name) if config is None else config
+    default = config_of(name)
+    if isinstance(config, str | Path):
+        config = read_config(name, Path(config))
+    config = default if config is None else config
+    if not isinstance(config, type(default)):
+        raise InputError(
+            f"config of '{name}' is of type {type(config).__name__}, expected "
+            f"{type(default).__name__} or the path of a TOML file"
+        )
     changes = {"scene": scene, "arm": arm, "geometry": geometry}
     given = {field: value for field, value in changes.items() if value is not None}
     return make_task(name, with_fields(config, **given), device)

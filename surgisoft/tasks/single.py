@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from surgisoft.environments import register
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import NumpyAdapter, entropy_seed
+from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed
 from surgisoft.tasks.registry import make_with
 
 
@@ -48,7 +48,7 @@ class SingleEnv(gymnasium.Env):
     The info of a step holds the weighted reward terms and the measures that apply.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
+    metadata = {"render_modes": [RGB_ARRAY], "render_fps": 10}  # noqa: RUF012  (Gymnasium's form)
 
     def __init__(
         self,
@@ -58,9 +58,17 @@ class SingleEnv(gymnasium.Env):
         scene: str | Path | None = None,
         arm: str | Path | None = None,
         geometry: str | None = None,
+        render_mode: str | None = None,
     ):
-        """The task's name, and changes to its config as for `registry.make_with`; or a task."""
+        """The task's name, and changes to its config as for `registry.make_with`; or a task.
+
+        render_mode: `rgb_array`, for pictures by `render`, or None.
+        """
         self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry)
+        self._pictures = Pictures(self._adapter.task, render_mode)
+        self.render_mode = render_mode
+        fps = round(1.0 / self._adapter.task.world.config.dt_s)
+        self.metadata = {**self.metadata, "render_fps": fps}
         self._state = None
         self.observation_space = Box(*self._adapter.observation_bounds(self._agent))
         self.action_space = Box(*self._adapter.action_bounds(self._agent))
@@ -92,6 +100,10 @@ class SingleEnv(gymnasium.Env):
             bool(outcome.truncated),
             info,
         )
+
+    def render(self) -> np.ndarray | None:
+        """(H, W, 3) uint8: the present state from outside; None without a render mode."""
+        return self._pictures.of(self._state)
 
 
 class BatchedEnv(VectorEnv):

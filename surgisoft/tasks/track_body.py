@@ -20,6 +20,7 @@ from surgisoft.tasks.observations import (
     numbered,
     pressure_blocks,
 )
+from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS
 from surgisoft.tasks.track import level_world
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random_streams import Stream
@@ -32,7 +33,7 @@ STUCK_MM = 0.02
 
 SHAPE = Block("shape", "measured key points relative to their rest positions", "mm", "x / 10")
 ERROR = Block("error", "target minus measured key points, base excluded", "mm", "asinh(x / 1 mm)")
-TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1")
+TIME = Block("time", "elapsed share of the episode", "-", "2 x - 1", -1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -181,4 +182,6 @@ class TrackBody:
         return {"arm": action_towards(self.arm, part, target, error, self.dt_s, STUCK_MM)}
 
 
-TRACK_BODY = TaskSpec(TrackBody, TrackBodyConfig(), ("arm",))
+TRACK_BODY = TaskSpec(
+    TrackBody, TrackBodyConfig(), ("arm",), preset=FOLLOW_PRESET, training_steps=FOLLOW_STEPS
+)

@@ -10,9 +10,10 @@ import torch
 from surgisoft.agents.evaluate import bootstrap, episode_table, summary
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
+from surgisoft.agents.session import evaluate
 from surgisoft.cli import run
 from surgisoft.tasks.circle_ablation import CircleAblation
-from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.registry import make_task, read_config
 
 NAN = float("nan")
 
@@ -174,3 +175,26 @@ def test_a_run_brings_its_task_and_refuses_another(tmp_path, capsys, short):
     assert found["task_config"]["follow"]["loop_s"] == 1.5
     times = found["drivers"][folder]["per_episode"]["time_s"]
     assert times == pytest.approx([2.0, 2.0])
+
+
+def test_another_seed_gives_other_episodes(tmp_path):
+    """By the command and in Python; the same seed gives the same ones."""
+    (tmp_path / "short.toml").write_text("[follow]\nloop_s = 0.6\napproach_s = 0.2\n")
+    config = ["--config", str(tmp_path / "short.toml")]
+
+    def errors(name, *seed):
+        file = tmp_path / f"{name}.json"
+        arguments = ["evaluate", "random", "--task", "track_circle", "--episodes", "2", *config]
+        assert run([*arguments, *seed, "--json", str(file)]) == 0
+        found = json.loads(file.read_text())
+        return found["seed"], found["drivers"]["random"]["per_episode"]["error_mean_mm"]
+
+    given = [
+        errors(n, *s) for n, s in zip("abc", ([], ["--seed", "0"], ["--seed", "7"]), strict=True)
+    ]
+    assert [seed for seed, _ in given] == [0, 0, 7]
+    assert given[0][1] == given[1][1]
+    assert given[0][1] != given[2][1]
+    task = read_config("track_circle", tmp_path / "short.toml")
+    asked = evaluate("random", "track_circle", config=task, episodes=2, seed=7)
+    assert asked.results[0].per_episode["error_mean_mm"].tolist() == given[2][1]

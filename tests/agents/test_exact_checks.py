@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surgisoft.agents.evaluate import evaluate
-from surgisoft.agents.exact_checks import ExactChecks, has_obstacles
+from surgisoft.agents.exact_checks import Contact, ExactChecks, has_obstacles
 from surgisoft.agents.policies import Random
 from surgisoft.agents.rollout import Instant
 from surgisoft.scene.folder import open_scene
@@ -81,3 +81,56 @@ def test_on_real_episodes_the_batched_path_agrees(task):
 
 def test_nothing_around_needs_no_referee():
     assert not has_obstacles(make_task("track_circle"))
+
+
+def with_hit(state, **fields):
+    scene = state.world.scene
+    scene = replace(scene, hit=replace(scene.hit, **fields))
+    return replace(state, world=replace(state.world, scene=scene))
+
+
+def test_a_beam_that_ends_elsewhere_or_on_something_else_is_found(task):
+    """The batched geometry's hit is moved by 3 mm, and then said to be on something else."""
+    state = Episodes(task).seeded(0, 1)
+    hit = state.world.scene.hit
+    whole = looked_at(task, state)
+    assert (whole.beam_differs, whole.beam_off_mm < 1e-3) == (0, True)
+    moved = with_hit(state, point_mm=hit.point_mm + torch.tensor([0.0, 3.0, 0.0]))
+    assert looked_at(task, state, moved).beam_off_mm == pytest.approx(3.0, abs=1e-3)
+    assert looked_at(task, moved, state).beam_off_mm == pytest.approx(3.0, abs=1e-3)
+    other = with_hit(state, struck=(hit.struck + 1) % 3)
+    assert looked_at(task, state, other).beam_differs == 1
+
+
+def test_the_first_contact_is_the_one_that_is_reported(task):
+    state = Episodes(task).seeded(0, 1)
+    organ = open_scene(PHANTOM).organ
+    inside = torch.tensor(organ.world_mesh.vertices_mm.mean(0), dtype=torch.float32)
+    line = state.world.arms["laser"].line_mm[0]
+    into = line[0] + torch.linspace(0.0, 1.0, 21)[:, None] * (inside - line[0])
+    seen = [
+        at(replace(state, world=replace(state.world, steps=state.world.steps + k)), into)
+        for k in (2, 5)
+    ]
+    assert looked_at(task, *seen).contact.time_s == pytest.approx(0.2)
+
+
+def test_an_exact_contact_is_no_success(task, monkeypatch):
+    short = CircleAblation(CircleAblationConfig())
+    short.steps = 3
+    kept = short.measures
+
+    def cut(state):
+        return kept(state) | {"success": torch.ones_like(state.world.steps, dtype=torch.float32)}
+
+    short.measures = cut
+    free = evaluate(short, "random", Random(2), 1, seed=1)
+    assert free.per_episode["success"].tolist() == [1.0]
+    touched = Contact(0.1, ("laser", "liver"))
+    whole = ExactChecks.checks
+    monkeypatch.setattr(
+        ExactChecks, "checks", lambda self: [replace(one, contact=touched) for one in whole(self)]
+    )
+    found = evaluate(short, "random", Random(2), 1, seed=1)
+    assert found.per_episode["success"].tolist() == [0.0]
+    assert found.per_episode["collided"].tolist() == [1.0]

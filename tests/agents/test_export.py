@@ -1,6 +1,10 @@
-"""Exported policies: read by other programs, with the same actions."""
+"""Exported policies: networks and whole controllers, read by programs without surgisoft."""
 
 import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -8,26 +12,50 @@ import pytest
 import torch
 from onnx.reference import ReferenceEvaluator
 
+from surgisoft.agents.controller import ControllerGraph
+from surgisoft.agents.controller_runner import Controller
 from surgisoft.agents.distributed import Processes
-from surgisoft.agents.export import export
-from surgisoft.agents.learned import LearnedPolicy
+from surgisoft.agents.export import export, running
+from surgisoft.agents.learned import ActorPolicy, LearnedPolicy, agent_sizes
+from surgisoft.agents.on_rig import RigConfig
 from surgisoft.agents.presets import Plan, Preset
+from surgisoft.agents.rig_check import check_on_rig
 from surgisoft.agents.training import train_new
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.registry import config_of
+from surgisoft.tasks.registry import config_of, make_task, with_fields
 
-TINY = Preset(envs=4, rollout=8, epochs=1, batches=2, evaluate_every=9, evaluation_episodes=1)
+TINY = Preset(
+    envs=4, rollout=8, epochs=1, batches=2, evaluate_every=9, evaluation_episodes=1, normalise=True
+)
+SHORT = {
+    "track_circle": {"loop_s": 2.0, "approach_s": 0.5},
+    "track_body": {"time_s": 2.0, "approach_s": 0.5},
+    "laser_plane": {"loop_s": 2.0, "approach_s": 0.5},
+    "keyhole": {"time_s": 3.0},
+    "circle_ablation": {},
+}
+"""Fields that make an episode of a task short."""
+STRANGE = RigConfig(seed=1, settle_s=0.3)
+"""Another robot than the one that the model was fitted to."""
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["plain", "normalised"])
-def policy(request, tmp_path_factory):
-    preset = Preset(**{**vars(TINY), "normalise": request.param})
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=64)
+    config = with_fields(config_of("track_circle"), **SHORT["track_circle"])
+    plan = Plan("track_circle", config, "fast", TINY, steps=64)
     train_new(folder, plan, Processes(), torch.device("cpu"))
     return LearnedPolicy(folder)
+
+
+@pytest.fixture(scope="module")
+def exported(policy, tmp_path_factory):
+    """The folder of the exported policy."""
+    folder = tmp_path_factory.mktemp("exported") / "out"
+    assert surgisoft(["export", str(policy.run.path), "-o", str(folder)]) == 0
+    return folder
 
 
 def seen_and_done(policy):
@@ -40,27 +68,139 @@ def seen_and_done(policy):
     return seen, policy.act(task, state, {"arm": seen})["arm"].clone().numpy()
 
 
-def test_other_programs_get_the_same_actions(policy, tmp_path):
-    assert surgisoft(["export", str(policy.run.path), "-o", str(tmp_path / "out")]) == 0
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
-        "arm.onnx",
-        "arm.pt",
+def test_other_programs_get_the_same_actions(policy, exported):
+    assert sorted(file.name for file in exported.iterdir()) == [
+        *("arm.onnx", "arm.pt", "controller.onnx", "controller.pt", "controller.py"),
         "policy.json",
     ]
     seen, done = seen_and_done(policy)
     assert np.abs(done).max() > 1e-3
-    onnx.checker.check_model(str(tmp_path / "out" / "arm.onnx"))
-    session = ReferenceEvaluator(str(tmp_path / "out" / "arm.onnx"))
-    script = torch.jit.load(str(tmp_path / "out" / "arm.pt"))
+    onnx.checker.check_model(str(exported / "arm.onnx"))
+    session = ReferenceEvaluator(str(exported / "arm.onnx"))
+    script = torch.jit.load(str(exported / "arm.pt"))
     for rows in (slice(None), slice(3, 4)):
         (answer,) = session.run(None, {"observation": seen[rows].numpy()})
         np.testing.assert_allclose(answer, done[rows], atol=1e-5)
         np.testing.assert_allclose(script(seen[rows]).numpy(), done[rows], atol=1e-5)
-    about = json.loads((tmp_path / "out" / "policy.json").read_text())
+    about = json.loads((exported / "policy.json").read_text())
     assert about["task"] == "track_circle"
-    assert about["agents"]["arm"]["observation"] == seen_and_done(policy)[0].shape[1]
+    assert about["agents"]["arm"]["observation"] == seen.shape[1]
     with pytest.raises(InputError, match="already there"):
-        export(policy, tmp_path / "out")
+        export(policy, exported)
+
+
+@pytest.mark.parametrize("engine", ["torch", "onnx"])
+def test_the_exported_controller_does_on_the_rig_what_evaluate_does(engine, policy, exported):
+    """To 1e-4 mm, on a robot that the model does not know, from measurements alone."""
+    found = check_on_rig(Controller(exported, engine), policy.run.task(), policy, STRANGE, seed=4)
+    assert found.decisions == 25
+    assert found.points_mm < 1e-4
+    assert found.commands_kPa < 1e-3
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
+    task = make_task(name, with_fields(config_of(name), **SHORT[name]))
+    task.steps = min(task.steps, 25)
+    torch.manual_seed(3)
+    actors = {
+        agent: torch.nn.Linear(size["observation"], size["chambers"]).requires_grad_(False)
+        for agent, size in agent_sizes(task).items()
+    }
+    controller = running(ControllerGraph(task, actors))
+    found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=2)
+    assert found.decisions == 25
+    assert found.points_mm < 1e-4
+    assert found.commands_kPa < 1e-3
+
+
+def test_the_check_sees_a_wrong_observer(policy):
+    """A controller that filters otherwise drives the robot otherwise."""
+    task = policy.run.task()
+    other = replace(STRANGE, observer_gain=0.9)
+    found = check_on_rig(running(ControllerGraph(task, policy.actors)), task, policy, other)
+    assert found.points_mm > 1e-3
+
+
+def test_policy_json_names_every_entry_of_the_observation(policy, exported):
+    about = json.loads((exported / "policy.json").read_text())
+    blocks = about["observations"]["arm"]
+    indices = [i for block in blocks for i in range(block["first"], block["last"] + 1)]
+    assert indices == list(range(policy.run.agents["arm"]["observation"]))
+    assert all(block["unit"] and block["scale"] and block["meaning"] for block in blocks)
+    told = about["controller"]
+    assert set(told["tensors"]) == {*told["inputs"], *told["outputs"]}
+    for name in ("arm_pressure_kPa", "arm_command_kPa"):
+        tensor = told["tensors"][name]
+        assert (tensor["unit"], tensor["shape"]) == ("kPa", [1, 3])
+        assert tensor["low"] < 0.0 < tensor["high"]
+    assert {goal["name"] for goal in told["goal"]} >= {"goal.traversal.start"}
+    assert all(goal["meaning"] for goal in told["goal"])
+
+
+DRIVE = """
+import json, sys
+sys.modules["surgisoft"] = sys.modules["torch"] = None
+import numpy as np
+from controller import Controller
+rows = json.load(open("rows.json"))
+controller = Controller(".", "onnx")
+controller.limit([0.0] * 3, [40.0] * 3)
+found = []
+for number, (p, points, commanded) in enumerate(rows):
+    if number < 3:
+        controller.observe(p, points, commanded, 0.05)
+    elif number == 3:
+        goal = {"traversal.start": 0.3, "traversal.direction": -1.0}
+        found.append(controller.begin(p, points, commanded, 0.05, goal=goal).tolist())
+    else:
+        found.append(controller.step(p, points, 0.05).tolist())
+print(json.dumps([found, controller.steps, controller.outputs["arm_observation"].tolist()]))
+"""
+
+
+def test_the_runner_needs_neither_surgisoft_nor_torch(policy, exported):
+    """Two decisions in four samples, within other limits, from a start that is chosen."""
+    random, task = np.random.default_rng(0), policy.run.task()
+    rest = task.arm.model.rest_mm.numpy()
+    rows = []
+    for _ in range(8):
+        pressure = 20.0 + 3.0 * random.standard_normal(3)
+        points = rest + random.standard_normal(rest.shape)
+        rows.append([pressure.tolist(), points.tolist(), [20.0, 39.5, 0.2]])
+    rows[5][1][2] = [float("nan")] * 3
+    (exported / "rows.json").write_text(json.dumps(rows))
+    done = subprocess.run(
+        [sys.executable, "-c", DRIVE],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=exported,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )
+    (exported / "rows.json").unlink()
+    commands, steps, seen = json.loads(done.stdout)
+    assert steps == 2
+    assert commands[0] == commands[1] != commands[2]
+    assert np.min(commands) >= 0.0
+    assert np.max(commands) <= 40.0
+    assert np.abs(np.subtract(commands[0], [20.0, 39.5, 0.2])).max() <= 3.0
+    assert np.isfinite(seen).all()
+
+
+def test_the_runner_says_what_is_wrong_with_a_measurement(exported):
+    controller = Controller(exported, "torch")
+    points, rest = np.zeros((5, 3)), np.zeros(3)
+    with pytest.raises(ValueError, match="step before begin"):
+        controller.step(rest, points, 0.1)
+    with pytest.raises(ValueError, match=r"shape \(2,\), expected \(3,\)"):
+        controller.observe([1.0, 2.0], points, rest, 0.1)
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        controller.observe([1.0, 2.0, np.nan], points, rest, 0.1)
+    with pytest.raises(ValueError, match=r"'start' is not known, expected traversal\.start"):
+        controller.begin(rest, points, rest, 0.1, goal={"start": 0.5})
+    with pytest.raises(ValueError, match="engine 'onx' is not known"):
+        Controller(exported, "onx")
 
 
 def test_command_refuses_a_folder_without_a_run(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Tasks on the virtual rig: measurements, the truth beside them, and what feedback is worth."""
 
 import gc
+import re
 import weakref
 from dataclasses import replace
 
@@ -238,3 +239,65 @@ def test_one_arm_is_on_a_real_bench_and_the_other_on_a_virtual_one():
     assert endoscope.config.rigs == ("virtual:seed=2",)
     assert isinstance(endoscope.build(endoscope.config, 0), VirtualRig)
     assert rigs_in("virtual") == ("virtual",)
+
+
+def test_a_model_of_another_robot_is_warned_of_once():
+    brief = track_circle(TrackConfig(FollowConfig(loop_s=0.2, approach_s=0.1)))
+    for seed, said in ((0, 0), (1, 1)):
+        warned = []
+        moved = on_rig(brief, RigConfig(seed=seed, settle_s=1.0), on_warning=warned.append)
+        rollout(moved, Random(), 2, seed=0, batch=1)
+        assert len(warned) == said
+    assert re.match(r"arm 'arm': its model is [12]\.\d mm off the first 4 poses", warned[0])
+    assert "validated at 0.1 mm: it is a model of another robot, or the robot has" in warned[0]
+
+
+def test_evaluate_passes_the_warning_on():
+    warned = []
+    short = TrackConfig(FollowConfig(loop_s=0.2, approach_s=0.1))
+    evaluate(
+        "random",
+        "track_circle",
+        episodes=1,
+        rig=RigConfig(seed=3, settle_s=1.0),
+        config=short,
+        on_warning=warned.append,
+    )
+    assert len(warned) == 1
+
+
+def seen_after(task, gain, steps=4):
+    """(steps, n, 3) mm: key points as observed, and as they truly are, of one rig."""
+    config = RigConfig(settle_s=0.5, observer_gain=gain, drift_gain=0.0)
+    play = Episodes(on_rig(task, config))
+    state, seen, true = play.seeded(3, 1), [], []
+    for _ in range(steps):
+        state, _ = play.step(state, {"arm": torch.ones(1, 3)})
+        part = state.world.arms["arm"]
+        seen.append(part.seen_mm[0])
+        true.append(part.points_mm[0])
+    return torch.stack(seen), torch.stack(true)
+
+
+def test_the_observer_gain_decides_how_far_the_cameras_are_followed(task):
+    """With gain 1 the estimate is the measurement, whose noise it keeps; with 0 the model's."""
+    (raw, true), (held, again), (some, _) = (seen_after(task, gain) for gain in (1.0, 0.0, 0.3))
+    assert torch.equal(true, again), "the rig does not depend on the observer"
+    noise = (raw - true).norm(dim=2).mean()
+    assert 0.01 < noise < 0.3, "policies observe measurements, not the truth"
+    assert not torch.allclose(some, raw, atol=1e-4)
+    assert not torch.allclose(some, held, atol=1e-4)
+    torch.testing.assert_close(some[0], held[0] + 0.3 * (raw[0] - held[0]), atol=1e-4, rtol=0)
+
+
+def test_the_rig_is_reset_before_an_episode(task):
+    class Counted(VirtualRig):
+        resets = 0
+
+        def reset(self):
+            super().reset()
+            self.resets += 1
+
+    play = Episodes(on_rig(task, RigConfig(settle_s=0.5), lambda config, _: Counted(config.seed)))
+    (rig,) = play.seeded(3, 1).world.arms["arm"].plant.rigs.items
+    assert rig.resets == 1

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from surgisoft.agents.policies import Random, open_policy
+from surgisoft.agents.policy_network import ScaledActor, empty_actor
+from surgisoft.agents.presets import Preset
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.registry import make_task
@@ -52,3 +54,13 @@ def test_what_drives_nothing_is_one_line(name, task):
     with pytest.raises(InputError, match="scripted") as error:
         open_policy(name, task)
     assert name in str(error.value)
+
+
+def test_outputs_are_scaled_and_clipped_to_the_pumps_step():
+    torch.manual_seed(0)
+    preset = Preset(hidden=(5,), action_kPa=2.5)
+    actor, seen = empty_actor("arm", 7, 3, preset), 20.0 * torch.randn(50, 7)
+    plain = actor.as_jit()(seen)
+    found = ScaledActor(actor, preset.action_kPa, 0.4)(seen)
+    torch.testing.assert_close(found, (2.5 * plain).clamp(-0.4, 0.4))
+    assert (2.5 * plain).abs().min() < 0.4 < plain.abs().max()

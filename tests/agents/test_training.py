@@ -12,10 +12,14 @@ import torch
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
+from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import PRESETS, Plan, Preset, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
-from surgisoft.agents.selection import evaluate_checkpoint, is_better
+from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
+from surgisoft.agents.session import EvaluationRequest
 from surgisoft.agents.training import Training, resume, train_new
+from surgisoft.agents.training_request import TrainingRequest
+from surgisoft.agents.vec_env import STATE, JointEnv
 from surgisoft.errors import InputError
 from surgisoft.tasks.registry import config_of, make_task, with_fields
 
@@ -295,3 +299,91 @@ def test_damaged_checkpoints_are_one_line(run, tmp_path, which, path, value, sai
     RunFolder(copy).save(which, saved)
     with pytest.raises(InputError, match=said):
         LearnedPolicy(copy) if which == BEST else resume(copy, Processes(), CPU)
+
+
+def test_rsl_rl_learns_with_the_presets_numbers():
+    """Every number differs from every default, so that none can stand in for another."""
+    preset = Preset(
+        envs=6, rollout=5, epochs=3, batches=2, gamma=0.81, lam=0.73, clip=0.11, entropy=0.017,
+        learning_rate=2.3e-4, desired_kl=0.019, hidden=(9,), activation="elu", noise=0.37,
+    )  # fmt: skip
+    env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+    (ppo,) = make_ppo(env, preset, Processes()).values()
+    assert (ppo.num_learning_epochs, ppo.num_mini_batches) == (3, 2)
+    assert (ppo.gamma, ppo.lam, ppo.clip_param) == (0.81, 0.73, 0.11)
+    assert (ppo.entropy_coef, ppo.learning_rate, ppo.desired_kl) == (0.017, 2.3e-4, 0.019)
+    assert ppo.schedule == "adaptive"
+    assert ppo.optimizer.param_groups[0]["lr"] == 2.3e-4
+    assert (
+        algorithm_config("a", replace(preset, desired_kl=None), Processes())["algorithm"][
+            "schedule"
+        ]
+        == "fixed"
+    )
+    policy = ppo.get_policy()
+    assert policy.mlp[0].out_features == 9
+    torch.testing.assert_close(policy.distribution.log_std_param.exp(), torch.full((3,), 0.37))
+
+
+def test_critics_see_all_agents_and_actors_their_own():
+    groups = algorithm_config("laser", TINY, Processes())["obs_groups"]
+    assert groups == {"actor": ["laser"], "critic": [STATE]}
+
+
+def test_noise_falls_evenly_in_its_logarithm():
+    preset = replace(TINY, noise=0.4, last_noise=0.004)
+    env = JointEnv(make_task("track_circle"), preset.envs, 0, preset.action_kPa)
+    (ppo,) = make_ppo(env, preset, Processes()).values()
+    for progress, noise in ((0.0, 0.4), (0.5, 0.04), (1.0, 0.004)):
+        set_noise(ppo, preset, progress)
+        found = ppo.get_policy().distribution.log_std_param.exp()
+        torch.testing.assert_close(found, torch.full_like(found, noise))
+
+
+def test_a_time_out_is_bootstrapped_and_an_end_is_not():
+    """At a time-out rsl-rl adds gamma V(s) to the reward (Pardo et al. 2018), else nothing."""
+    env = JointEnv(make_task("track_circle"), TINY.envs, 0, TINY.action_kPa)
+    agents = make_ppo(env, TINY, Processes())
+    (ppo,) = agents.values()
+    step, marks = env.step, torch.arange(TINY.envs) % 2 == 0
+    rewards = []
+
+    def stepped(actions):
+        seen, reward, done, extras = step(actions)
+        rewards.append(reward["arm"].clone())
+        return seen, reward, torch.ones_like(done), extras | {"time_outs": marks}
+
+    env.step = stepped
+    collect_rollout(env, agents, env.get_observations(), TINY.rollout)
+    added = ppo.storage.rewards[:, :, 0] - torch.stack(rewards)
+    torch.testing.assert_close(added, TINY.gamma * ppo.storage.values[:, :, 0] * marks)
+    assert (added[:, marks] != 0.0).all()
+
+
+def test_the_better_checkpoint_is_kept():
+    one = {"success": 0.5, "error_mm": 0.1}
+    assert is_better(one, None)
+    assert is_better({"success": 0.6, "error_mm": 9.0}, one), "success comes first"
+    assert not is_better({"success": 0.4, "error_mm": 0.0}, one)
+    assert is_better({"success": 0.5, "error_mm": 0.09}, one)
+    assert not is_better(one, one)
+    assert not is_better({"success": 0.5, "error_mm": float("nan")}, one)
+
+
+def test_the_seed_that_selects_judges_nothing():
+    """No default and no small seed, as users give them, is that of the selection."""
+    used = {TrainingRequest("track_circle").seed, EvaluationRequest(("random",), "x").seed}
+    assert used == {0}
+    assert SEED > 10_000
+
+
+def test_weights_of_a_new_training_follow_from_its_seed():
+    """The first weights alone, before any episode of the seed is seen."""
+
+    def first(seed):
+        plan = plan_of(seed=seed)
+        (ppo,) = Training(plan, make_task(plan.task, plan.task_config), Processes()).agents.values()
+        return ppo.get_policy().mlp[0].weight.detach()
+
+    assert torch.equal(first(3), first(3))
+    assert not torch.equal(first(3), first(4))

@@ -216,15 +216,33 @@ def test_table_counts():
     text = markdown(outcomes)
     assert "| right effect first, memory effects | 97 % | 50.0 % (1 of 2;" in text
     assert "| right among the first two, as before | 97 % | 100.0 % (2 of 2;" in text
+    assert "| the verdict names it alone, memory effects |  | 50.0 % (1 of 2;" in text
+    assert "| the verdict names it, alone or in a set | 90 % | 50.0 % (1 of 2;" in text
     assert "| an effect named on a clean robot | 2 % | 0.0 % (0 of 1;" in text
+    assert "less than 2 % | 189 | 1 of 189: too few for the goal |" in text
     assert "| outside the list: `unknown_effect` | 80 % | 100.0 % (1 of 1;" in text
     assert "| statements with confidence >= 0.95 right | 97 % | 100.0 % (1 of 1;" in text
     # Two statements: 0.99 that is right, 0.6 that is wrong.
     assert calibration_error(outcomes[:2]) == pytest.approx((0.01 + 0.6) / 2)
 
 
+def test_only_a_verdict_of_exactly_both_names_both():
+    """A set of two of which one is missing, one name more, and right first alone do not count."""
+    pair = replace(CLEAN, hidden=(("creep", 1.0), ("payload", 1.0)))
+    verdicts = [
+        ("several", ("payload", "creep")),
+        ("ambiguous", ("creep", "payload")),
+        ("several", ("creep", "payload", "drift")),
+        ("identified", ("creep",)),
+    ]
+    outcomes = [
+        replace(said(pair, kind, effects, 0.9), effects=effects) for kind, effects in verdicts
+    ]
+    assert "| two at once, both named | 85 % | 25.0 % (1 of 4;" in markdown(outcomes)
+
+
 def test_experiments_and_amendments_are_counted():
-    """Three ambiguous robots: settled rightly, wrongly, and one whose effect is no rival."""
+    """Three ambiguous robots: settled rightly, wrongly, and one whose effect was no rival."""
     twist, lag, drift = (
         replace(CLEAN, hidden=((name, 1.0),)) for name in ("twist", "line_lag", "thermal_drift")
     )
@@ -243,12 +261,12 @@ def test_experiments_and_amendments_are_counted():
     ]
     text = markdown(outcomes)
     assert (
-        "| ambiguous: the recommended experiment names the right one | 90 % | 50.0 % (1 of 2;"
+        "| ambiguous: the recommended experiment names the right one | 90 % | 33.3 % (1 of 3;"
         in text
     )
-    assert "| the same where nobody may change the bench |  | 50.0 % (1 of 2;" in text
-    assert "| ambiguous: the experiment names a wrong one |  | 50.0 % (1 of 2;" in text
-    assert "| minutes on the bench | 15 | median 11.5, longest 15.0 |" in text
+    assert "| the same where nobody may change the bench |  | 33.3 % (1 of 3;" in text
+    assert "| ambiguous: the experiment names a wrong one |  | 66.7 % (2 of 3;" in text
+    assert "| minutes on the bench | 15 | median 8.0, longest 15.0 |" in text
     assert "| right effect first, static effects | 85 % | 0.0 % (0 of 1;" in text
     assert "| right first, static effects, after the experiment | 95 % | 100.0 % (1 of 1;" in text
     assert "| line_lag | rate_dependence, line_lag | short_tube: steps | 8 | 1.00 " in text

@@ -266,7 +266,7 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
         "--roll-deg 90",
         None,
     )
-    monkeypatch.setattr(designing, "next_experiment", lambda *_: found)
+    monkeypatch.setattr(designing, "next_experiment", lambda *_, **__: found)
     plan, new = tmp_path / "s.csv", tmp_path / "new.parquet"
     command = ["next-experiment", "default", "-o", str(plan), "--force", "--record", str(new)]
     assert run([*command, "--rig", "tests.rig.own_rig:OwnRig:port=x"]) == 2

@@ -48,7 +48,6 @@ NO_MODEL = {
     "rig list": "lists rigs and their options",
     "replay": "shows what was recorded",
     "experiment list": "reads experiment files",
-    "export": "opens policies, which hold no arm",
 }
 """Commands that open no arm model, and why."""
 
@@ -60,6 +59,7 @@ COMMANDS = {
     "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
     "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
+    "export": "export arm -o exported",
     "evaluate": "evaluate scripted --task track_circle --arm arm --episodes 1",
     "scene new": "scene new ball.ply --unit mm --arm arm -o placed",
     "scene check": "scene check scene",

@@ -1,9 +1,11 @@
 """`amend`: falls by hand, claims that hold, and every wrong turn in one line."""
 
+import copy
 import hashlib
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import Fall, amend, fall_of
 from surgisoft.diagnosis.compare import compare
-from surgisoft.diagnosis.residuals import held_out_rows, problem_of
+from surgisoft.diagnosis.estimation.network import Retuned, retune
+from surgisoft.diagnosis.residuals import held_out_rows, problem_of, residual_table
 from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import Recording, load_recording, save_recording
@@ -231,3 +234,75 @@ def test_a_network_is_retuned_behind_an_effect_that_is_there_and_earns_it_no_cla
     assert not without.claimed
     assert not without.retuned
     assert without.held_out == without.alone
+
+
+def test_a_fall_is_claimed_where_it_is_significant_and_large():
+    """Above the floor stand 1.0 mm: what counts is more than a twentieth of them."""
+    fall = Fall(1.2, 1.0, 0.2, fall=0.2, ci95=(0.1, 0.3), rows=9, blocks=3)
+    assert fall.claimed
+    assert not replace(fall, ci95=(-0.01, 0.4)).claimed
+    assert not replace(fall, fall=0.04, ci95=(0.02, 0.06)).claimed
+    assert replace(fall, fall=0.06, ci95=(0.02, 0.1)).claimed
+
+
+def test_the_fall_is_that_of_the_rms_distance():
+    """Errors of 3 mm that become 2 mm at one key point of two, in 12 blocks of 5 rows."""
+    block = np.repeat(np.arange(12), 5)
+    residual = np.zeros((60, 2, 3))
+    residual[:, 0, 1] = 3.0
+    before = SimpleNamespace(
+        residual=residual,
+        block=block,
+        floor_mm=0.1,
+        index=np.arange(60),
+        model=SimpleNamespace(fitted_rows=None),
+    )
+    after = SimpleNamespace(residual=residual * (2 / 3), block=block)
+    found = fall_of(before, after)
+    assert found.before == pytest.approx(3.0 / np.sqrt(2))
+    assert found.after == pytest.approx(2.0 / np.sqrt(2))
+    assert found.fall == pytest.approx(1.0 / np.sqrt(2))
+    assert found.ci95 == pytest.approx((found.fall, found.fall))
+    assert (found.rows, found.blocks) == (60, 12)
+
+
+def test_the_last_layer_is_tuned_on_training_rows_alone(lab, monkeypatch):
+    """What `retune` is given holds no measurement of a held-out row."""
+    seen = []
+
+    def retune(model, problem):
+        seen.append(problem.table)
+        return Retuned(model, False, 0.0)
+
+    monkeypatch.setattr("surgisoft.diagnosis.amend.retune", retune)
+    amend(lab / "arm", lab / "creep.parquet", "creep", refit="never")
+    (table,) = seen
+    assert table.held_out.sum() > 100
+    assert np.isnan(table.measured_mm[table.held_out]).all()
+    assert np.isfinite(table.measured_mm[~table.held_out]).any()
+
+
+def test_a_layer_that_held_out_motion_does_not_reward_is_not_changed():
+    """The model is the truth: what a new layer would gain is noise."""
+    arm = bare_arm()
+    problem = residual_table(arm, [measured_on(arm)]).training()
+    found = retune(arm, problem)
+    assert not found.kept
+    assert found.model is arm
+    assert found.gain < 0.05
+
+
+def test_a_tuned_layer_that_makes_the_error_larger_is_not_kept(lab, monkeypatch):
+    """Whatever the tuning says of itself: the network's output is moved by 1 mm here."""
+
+    def worse(model, problem):
+        network = copy.deepcopy(model.network)
+        with torch.no_grad():
+            network.mean += 1.0
+        return Retuned(model.replace(network=network).eval(), True, 0.5)
+
+    monkeypatch.setattr("surgisoft.diagnosis.amend.retune", worse)
+    found = amend(lab / "arm", lab / "creep.parquet", "creep", refit="never")
+    assert not found.retuned
+    assert found.alone.claimed
+    assert found.held_out.after == pytest.approx(found.alone.after)

@@ -256,3 +256,33 @@ def test_an_asset_of_other_features_is_refused(tmp_path):
 def test_evidence_survives_json():
     full = replace(GOOD, proposals=(ALONE, replace(PAIR, instead=("drift",), instead_left=(0.1,))))
     assert Evidence.from_json(json.loads(json.dumps(full.to_json()))) == full
+
+
+@given(
+    missing=st.floats(-6, 9), known=st.floats(-6, 9), two=st.floats(-9, 9), network=st.floats(-9, 6)
+)
+def test_the_confidence_is_the_probability_of_what_is_said(missing, known, two, network):
+    """Summed by hand from the probabilities, for every kind of result."""
+    model = given_odds(missing, known, two, network, CLEAR)
+    for evidence in (GOOD, QUIET, STATIC, replace(GOOD, proposals=(ALONE, PAIR))):
+        found, p = decide(evidence, model), probabilities(evidence, model)
+        right = {
+            "identified": sum(p.effects.get(name, 0.0) for name in found.effects),
+            "ambiguous": sum(p.effects.get(name, 0.0) for name in found.effects),
+            "several": p.pair,
+            "unknown_effect": p.unknown,
+            "nothing_missing": p.nothing + p.network,
+        }
+        if found.kind in right:
+            assert found.confidence == pytest.approx(right[found.kind])
+        if found.kind == "surrogate_undertrained":
+            assert found.confidence in (p.network, p.nothing + p.network)
+
+
+def test_a_result_without_worth_is_not_told():
+    """Missing for sure, and in the list or not by the toss of a coin: any name may harm."""
+    found = decide(GOOD, given_odds(missing=0.0, known=0.0, first=CLEAR))
+    assert found.kind == "cannot_tell"
+    sure = decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR), Worth(needless_name=-9.0))
+    assert sure.kind == "cannot_tell"
+    assert decide(GOOD, given_odds(missing=2.5, known=2.5, first=CLEAR)).kind == "identified"

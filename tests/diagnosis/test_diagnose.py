@@ -121,6 +121,7 @@ def test_too_little_data_is_told(tmp_path, capsys):
         commanded=short.commanded[keep],
         key_points_mm=short.key_points_mm[keep],
         run=np.zeros(60, np.int64),
+        temp_C=short.temp_C[keep],
     )
     save_recording(short, tmp_path / "x.parquet")
     assert run(["diagnose", str(tmp_path / "arm"), str(tmp_path / "x.parquet")]) == 2

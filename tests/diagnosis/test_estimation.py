@@ -217,3 +217,28 @@ def test_runs_that_repeat_each_other_are_left_out_together():
     shapes = [saw * [1, 0, 0]] * 3 + [saw * [0, 1, 0], saw * [0.5, 0, 0]]
     pressure = np.concatenate([s + rng.normal(0, 0.01, s.shape) for s in shapes])
     assert kinds(pressure, np.repeat(np.arange(5), 50)).tolist() == [0, 0, 0, 1, 2]
+
+
+def test_an_interval_contains_the_error_of_the_network():
+    """A network that is off by more makes the interval wider, on the same recording."""
+    truth, widths, sizes = TRUTHS["gain_mismatch"], [], (0.01, 0.4)
+    made = measured_on(truth)
+    for size in sizes:
+        problem = problem_of(bare_arm(), [made], part="training")
+        problem = replace(problem, discrepancy_mm=np.full(5, size))
+        (parameter,) = fit_effects(problem, ["gain_mismatch"]).parameters
+        widths.append(np.mean(np.subtract(parameter.high, parameter.low)))
+    assert widths[1] > 3 * widths[0]
+
+
+def test_amplitudes_of_an_effect_that_is_not_there_are_no_surprise():
+    """The test's null: a network that is off, no effect. And its power: an effect that is there."""
+    there = problem_of(bare_arm(), [measured_on(TRUTHS["gain_mismatch"])], part="training")
+    assert fit_effects(there, ["gain_mismatch"]).p_value < 1e-3
+    off, generator = bare_arm(), torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for layer in off.network.layers[::2]:
+            change = torch.randn(layer.weight.shape, generator=generator)
+            layer.weight.add_(0.01 * layer.weight.std() * change)
+    absent = problem_of(off, [measured_on(bare_arm())], part="training")
+    assert fit_effects(absent, ["gain_mismatch"]).p_value > 0.05

@@ -11,6 +11,7 @@ from surgisoft.diagnosis import improve as loop
 from surgisoft.diagnosis.decision import Probabilities
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
 from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
+from surgisoft.diagnosis.residuals import held_out_rows
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.surrogate.checkpoint import load_model, save_model
@@ -37,7 +38,8 @@ def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
     """Nothing by rote here: the diagnosis has to name creep and gains by itself."""
     truth = with_truth("gain_mismatch", {"gain": [0.06, -0.02, -0.05]}, TRUTHS["creep"])
     save_model(bare_arm(), tmp_path / "arm")
-    save_recording(measured_on(truth), tmp_path / "both.parquet")
+    both = measured_on(truth)
+    save_recording(both, tmp_path / "both.parquet")
     command = ["improve", str(tmp_path / "arm"), str(tmp_path / "both.parquet")]
     options = ["--json", str(tmp_path / "rounds.json"), "--report", str(tmp_path / "report")]
     assert run([*command, "-o", str(tmp_path / "new"), *options]) == 0
@@ -49,6 +51,7 @@ def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
     errors = [r["error_mm"] for r in values["rounds"] if r["step"]]
     assert errors == sorted(errors, reverse=True)
     assert values["error_mm"]["after"] == pytest.approx(errors[-1])
+    assert values["error_mm"]["rows"] == held_out_rows([both]).sum(), "judged on held-out rows"
     assert values["error_mm"]["after"] < 1.1 * values["error_mm"]["floor"]
     assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
     assert (tmp_path / "report" / "waterfall.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

@@ -201,7 +201,8 @@ def rig_takes():
         rig = VirtualRig(0, take=take, hidden=hidden)
         takes.append(rig.record(make_protocol("mixed", rig.limits, 2400, seed=5))[0])
     before, after = takes
-    cut = {n: getattr(after, n)[50:] for n in ("measured", "key_points_mm", "commanded", "run")}
+    columns = ("measured", "key_points_mm", "commanded", "run", "temp_C")
+    cut = {name: getattr(after, name)[50:] for name in columns}
     later = replace(after, name="after", t_s=after.t_s[50:] - after.t_s[50], **cut)
     return replace(before, name="before"), later
 

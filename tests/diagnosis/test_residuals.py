@@ -1,9 +1,11 @@
 """The model's own error is the validated one without the noise of its validation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.residuals import model_discrepancy, problem_of
+from surgisoft.diagnosis.residuals import held_out_rows, model_discrepancy, problem_of
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.noise import known_noise
 from surgisoft.surrogate.fit import FitConfig, fit
@@ -69,3 +71,13 @@ def test_a_long_recording_is_cut_into_blocks_of_enough_fitted_rows():
     assert len(problem.block) == 2000
     assert np.bincount(problem.block).min() >= 7
     assert 240 <= problem.block.max() + 1 <= 250
+
+
+def test_the_last_quarter_is_held_out():
+    """The last rows of a recording of few runs, the last runs of one of many; as a whole number."""
+    few = recording(np.zeros(400), walk(400))
+    expected = np.arange(400) >= 300
+    assert held_out_rows([few]).tolist() == expected.tolist()
+    many = replace(few, run=np.repeat(np.arange(40), 10))
+    assert held_out_rows([many]).tolist() == expected.tolist()
+    assert held_out_rows([few, many]).tolist() == [*expected, *expected]

@@ -1,6 +1,7 @@
 """Forward, exchanged, back: on a hand-made table of losses, and on a robot that hides two."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from surgisoft.diagnosis import selection
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.diagnose import diagnose
 from surgisoft.diagnosis.residuals import problem_of
-from surgisoft.diagnosis.selection import ModelSelection, Option, RelaxedFit, Score
+from surgisoft.diagnosis.selection import ModelSelection, Option, RelaxedFit, Score, propose
 from surgisoft.diagnosis.statistics import sign_flip_p_values
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.rig import VirtualRig
@@ -140,3 +141,23 @@ def test_what_is_outside_the_list_is_not_called_by_its_nearest_relative(name):
     assert max(row.confidence for row in found.ranking) < 0.8
     if name == "breathing":
         assert found.verdict.kind == "unknown_effect"
+
+
+def test_an_effect_within_chance_is_not_proposed():
+    """Selection that would go on with it fails here: nothing of it is there."""
+    score = Score("creep", None, np.zeros(3), np.zeros(3), p_value=0.9, gain=0.1)
+    nothing = SimpleNamespace(in_fit=lambda effect: False)
+    assert propose(nothing, [score]) == ()
+    for better in (replace(score, p_value=0.01), replace(score, gain=0.9)):
+        with pytest.raises(AttributeError):
+            propose(nothing, [better])
+
+
+def test_what_is_reached_can_be_explained():
+    """A floor that is stated too large leaves an excess of 4 of 10; a candidate explains 9."""
+    before, after = np.array([6.0, 4.0]), np.array([0.5, 0.5])
+    known = SimpleNamespace(excess=lambda losses: losses.sum() - 6.0)
+    whole = ModelSelection.explainable(known, before, [after])
+    assert whole == pytest.approx(9.0)
+    assert (before.sum() - after.sum()) / whole <= 1.0
+    assert ModelSelection.explainable(known, before, []) == pytest.approx(4.0)

@@ -2,14 +2,19 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pyarrow.parquet as pq
 import pytest
 
+from surgisoft.agents import session
+from surgisoft.agents.evaluate import Evaluation
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import load_experiment
+from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from tests.experiments.tiny import TINY, write
 from tests.report.browser import chromium, look
 
@@ -115,3 +120,38 @@ def test_a_damaged_row_is_one_line(whole, tmp_path):
             run_experiment(spec, tmp_path / "results")
     row.write_text(json.dumps(content))
     assert len(run_experiment(spec, tmp_path / "results")) == 3
+
+
+def test_success_is_one_rule_in_experiment_and_evaluate(whole, tmp_path, monkeypatch, capsys):
+    """The rules of an experiment's file reach `evaluate`, and both commands state them."""
+    file, folder = whole
+    spec = load_experiment(file)
+    rule = success_rule(spec.task)
+    assert "within 50 mm of its target (fire_mm)" in rule
+    assert f"Success: {rule}; nothing is aborted." in (folder / "summary.md").read_text()
+    assert rule in (folder / "report.html").read_text()
+    asked = []
+
+    def stop(policies, task, **fields):
+        asked.append((task, fields["config"]))
+        raise InputError("stop here")
+
+    monkeypatch.setattr(session, "evaluate", stop)
+    assert run(["evaluate", "scripted", "--rules", str(file)]) == 2
+    played = build_task(spec, settings(spec)[0]).base.config
+    ((task, config),) = asked
+    assert task == "circle_ablation"
+    assert replace(config, arm=played.arm) == played, "what the experiment plays"
+    assert run(["evaluate", "scripted", "--rules", str(file), "--config", "x.toml"]) == 2
+    assert "--config and --rules both" in capsys.readouterr().err
+    assert run(["evaluate", "scripted", "--rules", "liver", "--task", "track_circle"]) == 2
+    assert "is an experiment of circle_ablation, not of track_circle" in capsys.readouterr().err
+
+
+def test_evaluate_states_the_rule_of_success(monkeypatch):
+    empty = Evaluation("random", {}, {}, None)
+    monkeypatch.setattr(session, "evaluate_policy", lambda *_, **__: empty)
+    fast = CircleAblationConfig(cut_s=30.0, fire_mm=0.7)
+    found = session.evaluate("random", "circle_ablation", config=fast)
+    assert found.to_json()["success_rule"] == success_rule(fast)
+    assert "within 0.7 mm of its target" in found.success_rule

@@ -115,7 +115,7 @@ def test_a_reader_that_names_more_columns_than_its_cells_have(tmp_path, monkeypa
     [
         ("broken", "reader 'broken' of npy_reader:BROKEN: is no Reader; expected an instance"),
         ("absent", "reader 'absent' of npy_reader_absent:READER: cannot be loaded"),
-        ("npz", "expected one of auto, text, parquet, motive, npy, broken, absent"),
+        ("npz", "expected one of auto, text, parquet, motive, mcap, npy, broken, absent"),
     ],
 )
 def test_what_is_wrong_with_a_reader_of_another_package(tmp_path, plugin, name, expected):

@@ -1,6 +1,8 @@
 """What is drawn of a scene: tubes of the right size, the recording's content, a picture of it."""
 
 import contextlib
+import socket
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,8 @@ from rerun.chunk import RrdReader
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.replay.shapes import carried_frames, finer, polar_patch, tube, view_cone
-from surgisoft.replay.viewer import take_screenshot, web_address
+from surgisoft.replay.show import open_replay
+from surgisoft.replay.viewer import free_port, serve_viewer, take_screenshot, web_address
 from surgisoft.scene.folder import open_scene
 from surgisoft.scene.mesh import Mesh
 
@@ -141,3 +144,33 @@ def test_only_this_machine_is_served():
     assert web_address(9090, 9876).startswith(
         "http://127.0.0.1:9090/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1"
     )
+
+
+def test_the_page_is_served_on_the_given_port(recording):
+    """The page answers on the port and the data on the next one, until the command ends."""
+    port = free_port()
+    told, answers = [], []
+
+    def look(url):
+        told.append(url)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
+            answers.append(page.status)
+        with socket.create_connection(("127.0.0.1", port + 1), 5.0):
+            answers.append("data")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        serve_viewer(recording, look, port)
+    assert told == [web_address(port, port + 1)]
+    assert answers == [200, "data"]
+
+
+def test_a_port_in_use_is_one_line(recording):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(InputError, match=f"--port {port}: cannot be used"):
+            serve_viewer(recording, print, port)
+    with pytest.raises(InputError, match="give --web too"):
+        open_replay(recording, port=9000)

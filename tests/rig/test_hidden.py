@@ -245,3 +245,30 @@ def test_a_fibre_breaks_once_and_no_rest_mends_it():
     assert 40.0 < 30.0 + 12.0 * late < 115.0
     np.testing.assert_allclose(shift[late + 1 :], shift[-1], rtol=0.1)
     assert shift[-1] > 1.0
+
+
+@pytest.mark.parametrize("hidden", [(), (("creep", 1.0),), (("thermal_drift", 1.0),)])
+def test_the_temperature_is_written_whatever_is_hidden(hidden):
+    """A column that only one hidden effect writes would give it away."""
+    rig = VirtualRig(0, hidden=hidden)
+    made, _ = rig.record(make_protocol("mixed", rig.limits, 600, seed=1))
+    plain = VirtualRig(0)
+    same, _ = plain.record(make_protocol("mixed", plain.limits, 600, seed=1))
+    np.testing.assert_array_equal(made.temp_C, same.temp_C)
+    assert np.ptp(made.temp_C) > 0.0
+
+
+@pytest.mark.parametrize("name", ["creep", "softening"])
+def test_venting_and_resting_undo_what_the_last_run_left(name):
+    """After a reset the arm is where a robot is that never moved."""
+    used, fresh = (VirtualRig(0, hidden=[(name, 1.0)], noise=0.0) for _ in range(2))
+    used.reset()
+    used.command(np.array([50.0, 0.0, 0.0]))
+    used.wait(60.0)
+    tips = []
+    for rig in (used, fresh):
+        rig.reset()
+        rig.command(np.array([20.0, 0.0, 0.0]))
+        rig.wait(5.0)
+        tips.append(rig.read_beside_truth()[1].noise_free_mm[0, -1])
+    np.testing.assert_allclose(*tips, atol=1e-6)

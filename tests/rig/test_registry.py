@@ -12,7 +12,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recording
 from surgisoft.rig import SafeRig, VirtualRig, open_rig
 from surgisoft.rig.interface import close, is_simulated, vent
-from surgisoft.rig.registry import RIGS, parse_rig, rig_names, rig_options
+from surgisoft.rig.registry import RIGS, SIMULATED, parse_rig, rig_names, rig_options
 from tests.rig.own_rig import OwnRig
 
 OWN = "tests.rig.own_rig:OwnRig"
@@ -110,7 +110,9 @@ def test_every_option_is_explained(name, capsys):
     assert run(["rig", "list", name]) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"{name}: ")
-    assert out.count("\n") == 1 + len(rig_options(name))
+    shown = [line.split()[0] for line in out.splitlines()[1:] if line.startswith("  ")]
+    assert shown[: len(rig_options(name))] == list(rig_options(name))
+    assert ("hold_ms" in shown) == (name not in SIMULATED)
 
 
 def test_the_seed_in_the_text_is_the_seed_of_collect(tmp_path):

@@ -120,9 +120,11 @@ def test_a_jump_becomes_a_ramp_that_arrives():
         [15.0, -10.0],
         [20.0, -10.0],
     ]
-    rig.command([0.0, 0.0])
+    assert rig.counts["clipped"] == 0
+    rig.command([0.0, -60.0])
     rig.wait(1.0)
-    assert bench.at.tolist() == [0.0, 0.0]
+    assert bench.at.tolist() == [0.0, -10.0]
+    assert rig.counts["clipped"] == 1
     assert bench.t_s == pytest.approx(0.2 + 1.0)
 
 

@@ -12,6 +12,7 @@ from surgisoft.measurement.protocols import Protocol, make_protocol
 from surgisoft.measurement.recordings import ArmInfo, load_recordings, save_recording
 from surgisoft.rig import Sample, VirtualRig, VirtualRigConfig, collect
 from surgisoft.rig.hidden import HIDDEN
+from surgisoft.rig.motion_capture import CameraDesign
 
 EVERYTHING = [(name, 0.5) for name in HIDDEN]
 COLUMNS = ("t_s", "measured", "commanded", "key_points_mm", "run", "temp_C", "payload_g")
@@ -35,6 +36,32 @@ def test_fast_path_equals_commanding_and_reading(name, points, hidden):
     slow = collect(rigs[1], protocol)
     assert fast.samples == points
     assert_same(fast, slow)
+
+
+LATER = [("payload", 1.0, 8.0), ("creep", 0.5), ("hysteresis", 0.5, 9.0), ("valve_jam", 1.0, 3.02)]
+
+
+@pytest.mark.parametrize(("name", "points"), [("validation", 12), ("mixed", 400)])
+def test_an_effect_that_begins_later_is_there_from_then_on(name, points):
+    """Before it the data are those without it, however the rig is driven."""
+    rigs = [VirtualRig(5, hidden=LATER) for _ in range(2)]
+    protocol = make_protocol(name, rigs[0].limits, points, seed=2)
+    fast, _ = rigs[0].record(protocol)
+    assert_same(fast, collect(rigs[1], protocol))
+    without, _ = VirtualRig(5, hidden=[("creep", 0.5)]).record(protocol)
+    change = np.linalg.norm(fast.key_points_mm - without.key_points_mm, axis=-1)[:, -1]
+    begins_s = 3.0 if name == "validation" else 3.1
+    assert not np.nan_to_num(change[fast.t_s + 4.0 < begins_s]).any()
+    assert np.nanmean(change[fast.t_s > 40.0]) > 0.3
+
+
+def test_effects_that_begin_later_are_checked():
+    with pytest.raises(InputError, match=r"hidden effect 'payload' begins at -1\.0 s"):
+        VirtualRig(0, hidden=[("payload", 1.0, -1.0)])
+    with pytest.raises(InputError, match="given twice"):
+        VirtualRig(0, hidden=[("payload", 1.0), ("payload", 1.0, 5.0)])
+    with pytest.raises(InputError, match="15 frames a second, expected a period that is a"):
+        VirtualRig(0, cameras=CameraDesign(rate_Hz=15.0))
 
 
 def test_same_seed_same_data_other_trial_other_noise():

@@ -14,7 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene import batched, field, frames
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.bvh import build_tree, segment_triangle_d2
-from surgisoft.scene.capsules import ArmShape, segment_distance, self_contact_gap_mm
+from surgisoft.scene.capsules import ArmShape, BatchClearance, segment_distance, self_contact_gap_mm
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.inside import winding_numbers
 from surgisoft.scene.mesh import Body, Mesh
@@ -310,3 +310,12 @@ def test_a_rigid_shaft_is_as_exact_as_short_segments(organ_scene):
                 assert found[i].item() == pytest.approx(truth, abs=1.0)
     assert (found < 0).any()
     assert (found > 5).any()
+
+
+def test_each_kind_of_overlap_is_a_collision():
+    apart = torch.full((4, 2), 1.0)
+    bodies, arms, own = (apart.clone() for _ in range(3))
+    bodies[1, 0] = arms[2, 1] = own[3, 0] = -0.1
+    found = BatchClearance(bodies[:, :, None], arms, own)
+    assert found.collides.tolist() == [False, True, True, True]
+    torch.testing.assert_close(found.least_mm, torch.tensor([1.0, -0.1, -0.1, 1.0]))

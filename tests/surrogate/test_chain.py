@@ -7,6 +7,7 @@ import torch
 
 from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of
 from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of
+from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.networks import ConstantCurvature
 from tests.surrogate.effects.test_in_models import ALL, history, model
@@ -190,3 +191,17 @@ def test_a_replaced_part_is_new_and_all_others_are_shared():
     assert torch.equal(other.rest_mm, arm.rest_mm)
     assert not other.training
     assert list(arm.effects) == ["creep", "payload"]
+
+
+def test_a_drift_of_the_actuation_begins_with_the_recording(away):
+    """The time for which an arm is assumed to have been held before is no time of the recording."""
+    plain = model(())
+    drift = Drift(plain.facts, kind="actuation", tau_s=20.0)
+    drift.gain.data.fill_(0.3)
+    arm = plain.replace(effects={"drift": drift})
+    seen = replace(away, t_s=away.t_s - away.t_s[:, :1])
+    with torch.no_grad():
+        expected = arm.predict(seen)
+        for t, (_, points) in enumerate(stepped(arm, seen)):
+            torch.testing.assert_close(points, expected[:, t], atol=1e-3, rtol=0.0)
+        assert (expected - plain.predict(seen)).abs().max() > 0.1

@@ -10,7 +10,10 @@ from surgisoft.errors import InputError
 from surgisoft.surrogate.fit import FitConfig, excitation, fit
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.interval import coverage_of
-from surgisoft.surrogate.networks import HawEnsemble
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import HawEnsemble, HawNN, range_weights, weighted_mse
+from surgisoft.surrogate.training import Data, model_rows, normalise
+from surgisoft.surrogate.training import train as train_model
 from tests.surrogate.truth import SPEC, history, shape, traverse, walk
 
 NOISE = 0.05
@@ -297,3 +300,40 @@ def test_auto_adds_nothing_to_an_arm_without_memory():
 def test_impossible_ensembles_are_refused(walks, change, message):
     with pytest.raises(InputError, match=message):
         fit(walks[0], walks[1], SPEC, FitConfig(**change))
+
+
+def test_training_ends_with_the_weights_that_validated_best():
+    """Validation data of a mirrored arm: what is learned makes them worse and worse."""
+    rng = np.random.default_rng(3)
+    train, valid = (history([walk(60, rng)] * 2, seed=s) for s in (1, 2))
+    mirrored = replace(valid, key_points=valid.key_points * torch.tensor([-1.0, -1.0, 1.0]))
+    low, high = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
+    torch.manual_seed(0)
+    model = ArmModel(SPEC, HawNN(low, high, SPEC.key_points, (16,), directions=False))
+    normalise(model.network, train)
+    data, losses = Data.split(train, mirrored, 0), []
+    rows, weights = data.validation_rows(model), range_weights(data.fitted_rows(model).target)
+
+    def loss():
+        return float(weighted_mse(model_rows(model, rows), rows.target, weights))
+
+    first = loss()
+    train_model(model, data, "pressure", 40, replace(QUICK, learning_rate=3e-2), losses, None)
+    validated = [row[3] for row in losses]
+    assert validated[-1] > 1.05 * min(first, *validated), "else the last weights are the best ones"
+    assert loss() == pytest.approx(min(first, *validated), rel=1e-5)
+
+
+def test_held_out_rows_are_not_fitted():
+    """Held-out and fitted rows are all measured rows, and none of them twice."""
+    rng = np.random.default_rng(4)
+    one = history([walk(200, rng)], seed=1)
+    low, high = torch.tensor(SPEC.low), torch.tensor(SPEC.high)
+    model = ArmModel(SPEC, HawNN(low, high, SPEC.key_points, (4,), directions=False))
+    data = Data.split(one, None, 0)
+    fitted, held = data.fitted_rows(model), data.validation_rows(model)
+    assert len(fitted.target) + len(held.target) == 200
+    assert 20 <= len(held.target) <= 80
+    both = {tuple(row) for row in fitted.target.flatten(1).tolist()}
+    assert not both & {tuple(row) for row in held.target.flatten(1).tolist()}
+    assert int(data.targets[one.valid].isnan().all(-1).all(-1).sum()) == len(held.target)

@@ -192,9 +192,9 @@ def test_saving_never_half_writes_nor_overwrites(tmp_path):
     ("damage", "message"),
     [
         (lambda d: (d / "config.json").unlink(), "config.json is missing"),
-        (lambda d: (d / "config.json").write_text("{"), "damaged model"),
+        (lambda d: (d / "config.json").write_text("{"), "not valid JSON"),
         (lambda d: (d / "weights.safetensors").write_bytes(b"123"), "damaged model"),
-        (lambda d: (d / "config.json").write_text('{"format": 99}'), "format 99"),
+        (lambda d: (d / "config.json").write_text('{"format": 99}'), "format .*99"),
     ],
 )
 def test_a_damaged_model_is_one_line(tmp_path, damage, message):

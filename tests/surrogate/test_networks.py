@@ -120,3 +120,17 @@ def test_an_ensemble_is_the_mean_of_its_members():
     other = torch.rand(3, 7, 3) * 60 - 10, torch.randn(3, 7, 3).sign()
     apart = torch.stack([network(*(x[k] for x in other)) for k, network in enumerate(networks)])
     assert torch.allclose(ensemble.members_at(*other), apart, atol=1e-5)
+
+
+def test_what_was_not_measured_does_not_count():
+    """Two key points, of which the second was lost in the second row; the first is off by 1 mm."""
+    measured = torch.zeros(2, 2, 3)
+    predicted = measured + torch.tensor([1.0, 0.0, 0.0])
+    predicted[1, 1] = 50.0
+    measured[1, 1] = torch.nan
+    weights = torch.ones(2, 3)
+    assert float(weighted_mse(predicted, measured, weights)) == pytest.approx(3.0 / 9.0)
+    predicted.requires_grad_(True)
+    weighted_mse(predicted, measured, weights).backward()
+    assert predicted.grad.isfinite().all()
+    assert not predicted.grad[1, 1].any()

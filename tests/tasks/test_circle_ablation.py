@@ -211,3 +211,95 @@ def test_impossible_lesions_are_one_line():
     vary = Randomisation(lesion_mm=400.0, lesions=3)
     with pytest.raises(InputError, match="up to 400 mm; expected at most"):
         CircleAblation(CircleAblationConfig(world=WorldConfig(randomisation=vary)))
+
+
+def test_the_gate_follows_what_is_measured_and_never_the_true_beam(quick, cut):
+    """Where cameras see the arm on its path the beam is released, however far it truly is away."""
+    states, _ = cut
+    on = next(state for state in states if quick.fires(state).all())
+    laser = on.world.arms["laser"]
+    tilted = laser.points_mm.clone()
+    tilted[:, -2] += torch.tensor([1.0, 0.0, 0.0])  # the tip then points past the target
+
+    def with_laser(part):
+        world = replace(on.world, arms={**on.world.arms, "laser": part})
+        return replace(on, world=world)
+
+    arm = quick.world.arms["laser"]
+    truly_off = with_laser(replace(arm.posed(laser, tilted), seen_mm=laser.points_mm))
+    assert (quick.beam_error_mm(truly_off) > 2.0).all()
+    assert quick.fires(truly_off).all()
+    seen_off = with_laser(replace(laser, seen_mm=tilted))
+    assert (quick.beam_error_mm(seen_off) < 0.5).all()
+    assert not quick.fires(seen_off).any()
+
+
+def test_the_pointing_error_is_measured_with_the_beam_off_too(quick, cut):
+    """No gate truncates it; it leaves out the approach alone."""
+    states, outcomes = cut
+    measured = torch.stack([o.measures["pointing_error_mm"] for o in outcomes])
+    true = torch.stack([quick.beam_error_mm(state) for state in states[1:]])
+    begins = round(quick.config.approach_s / quick.dt_s)
+    assert measured[: begins - 1].isnan().all()
+    torch.testing.assert_close(measured[begins + 1 :], true[begins + 1 :])
+
+
+def with_scene(state, **parts):
+    """The state with fields of its scene replaced."""
+    scene = replace(state.world.scene, **parts)
+    return replace(state, world=replace(state.world, scene=scene))
+
+
+def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
+    """The formulas of `LaserWeights` and `EndoscopeWeights`, term by term."""
+    state = cut[0][5]
+    on = torch.tensor([True, False])
+    reward = quick.rewards(replace(state, goal=replace(state.goal, fired=on)))
+    for agent in quick.agents:
+        assert reward[agent]["cut"].tolist() == [1.0, 0.0]
+    error = quick.beam_error_mm(state)
+    torch.testing.assert_close(reward["laser"]["far"], 10.0 / (10.0 + error))
+    torch.testing.assert_close(reward["laser"]["aim"], torch.exp(-error))
+    torch.testing.assert_close(reward["laser"]["fine"], torch.exp(-error / 0.1))
+    view = replace(
+        state.world.scene.view,
+        axis_error_mm=torch.tensor([0.0, 10.0]),
+        fraction=torch.tensor([0.25, 1.0]),
+    )
+    looks = quick.rewards(with_scene(state, view=view))["endoscope"]
+    assert looks["look"].tolist() == [1.0, 0.5]
+    assert looks["view"].tolist() == [0.25, 1.0]
+
+
+def test_contact_costs_from_the_scenes_clearance_on(quick, cut):
+    state, limit = cut[0][0], quick.spec.limits.clearance_mm
+    clearance = state.world.scene.clearance
+    near = torch.full_like(clearance.bodies_mm, limit - 0.01)
+    near[1] = limit + 0.01
+    far = torch.full_like(clearance.arms_mm, 50.0)
+    close = with_scene(state, clearance=replace(clearance, bodies_mm=near, arms_mm=far))
+    for terms in quick.rewards(close).values():
+        assert terms["contact"].tolist() == [-1.0, 0.0]
+
+
+def test_an_arm_in_front_of_the_camera_or_the_beam_hides_what_is_behind(quick, cut):
+    """The other arm lies straight across the line from the tool's tip to the lesion's centre."""
+    state = cut[0][40]
+    world, engine = state.world, quick.scene
+    assert (world.scene.view.fraction == 1.0).all()
+    assert world.scene.hit.on_organ.all()
+    for tool, other in (("endoscope", "laser"), ("laser", "endoscope")):
+        tip, target = world.arms[tool].tip_mm, quick.centre_mm(state)
+        if tool == "laser":
+            target = world.scene.hit.point_mm
+        towards = torch.nn.functional.normalize(target - tip, dim=1)
+        across = torch.linalg.cross(towards, torch.tensor([[0.0, 0.0, 1.0]]).expand_as(towards))
+        across = torch.nn.functional.normalize(across, dim=1)[:, None]
+        along = torch.linspace(-60.0, 60.0, world.arms[other].line_mm.shape[1])[None, :, None]
+        line = 0.5 * (tip + target)[:, None] + along * across
+        parts = {**world.arms, other: replace(world.arms[other], line_mm=line)}
+        seen = engine.step(world.scene, parts, 0.0, quick.dt_s)
+        if tool == "endoscope":
+            assert (seen.view.fraction < 0.7).all()
+        else:
+            assert not seen.hit.on_organ.any()

@@ -8,12 +8,14 @@ import torch
 
 from surgisoft.environments import ONE_AGENT
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.describe import describe, renewed
+from surgisoft.tasks.describe import describe, describe_agents, main, pages
 from surgisoft.tasks.numpy_adapter import NumpyAdapter
 from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
 from surgisoft.tasks.world.arm import Randomisation
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "tasks.md"
+PAGES = Path(__file__).resolve().parents[2] / "docs" / "environments"
+MOVED = ("direction", "reversal", "time")
+"""Blocks that go through most of their range in any episode."""
 every_task = pytest.mark.parametrize("name", TASKS)
 
 
@@ -73,10 +75,64 @@ def test_every_randomised_quantity_is_listed():
     assert told == dataclasses.asdict(Randomisation())
 
 
-def test_the_docs_hold_the_present_reference():
-    """Renew with `python -m surgisoft.tasks.describe docs/tasks.md`."""
-    text = PAGE.read_text(encoding="utf-8")
-    assert renewed(text, PAGE) == text
+def test_the_docs_hold_the_present_pages():
+    """Renew with `python -m surgisoft.tasks.describe docs/environments`."""
+    written = pages()
+    assert set(written) == {"index.md", *(f"{name}.md" for name in TASKS)}
+    for name, text in written.items():
+        assert (PAGES / name).read_text(encoding="utf-8") == text
+    nav = (PAGES.parents[1] / "mkdocs.yml").read_text(encoding="utf-8")
+    assert all(f"environments/{name}" in nav for name in written)
+
+
+def test_the_check_names_pages_that_differ(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("surgisoft.tasks.describe.TASKS", {"track_body": TASKS["track_body"]})
+    assert main([str(tmp_path)]) == 0
+    assert main([str(tmp_path), "--check"]) == 0
+    (tmp_path / "track_body.md").write_text("old")
+    (tmp_path / "removed_task.md").write_text("old")
+    assert main([str(tmp_path), "--check"]) == 1
+    told = capsys.readouterr().err
+    assert "removed_task.md, track_body.md: out of date" in told
+    assert (tmp_path / "track_body.md").read_text() == "old"
+
+
+@every_task
+def test_observations_lie_in_the_stated_ranges(name):
+    """Over random episodes from their start to their end, and steps of the scripted expert."""
+    task = make_task(name)
+    play, stated = Episodes(task), describe_agents(task)
+    torch.manual_seed(0)
+    seen = {agent: [] for agent in task.agents}
+    state = play.seeded(7, 8)
+    with torch.inference_mode():
+        for step in range(40):
+            for agent, value in play.observe(state).items():
+                seen[agent].append(value)
+            world = state.world
+            if step == 20:  # the last steps of the episodes
+                late = torch.full_like(world.steps, task.steps - 20)
+                state = dataclasses.replace(state, world=dataclasses.replace(world, steps=late))
+            if step % 3 == 0:
+                actions = task.script(state)
+            else:
+                actions = {
+                    agent: 3.0 * torch.randn(8, task.world.arms[agent].chambers)
+                    for agent in task.agents
+                }
+            state, outcome = play.step(state, actions)
+            state = play.reset(state, outcome.terminated)
+    for agent, facts in stated.items():
+        values = torch.cat(seen[agent])
+        assert values.shape[1] == facts.width
+        for block in facts.observation:
+            part = values[:, block.first : block.last + 1]
+            assert part.min() >= block.low - 1e-5, block.name
+            assert part.max() <= block.high + 1e-5, block.name
+            if block.name in MOVED:
+                margin = 0.2 * (block.high - block.low)
+                assert part.max() >= block.high - margin, block.name
+                assert part.min() <= block.low + margin, block.name
 
 
 def test_the_tasks_of_one_agent_follow_from_the_registry():

@@ -473,3 +473,14 @@ def test_objects_of_a_state_are_selected_and_replaced_with_its_rows():
     assert changed.plant.items == (a, d, c)
     assert part.plant.items == (a, b, c)
     assert tree_map(torch.clone, part).plant is part.plant
+
+
+def test_the_fine_term_has_its_own_scale():
+    """exp(-e) and exp(-e / fine_mm) of `FollowWeights`, for e from the state itself."""
+    task = make_task("track_circle")
+    state = Episodes(task).seeded(0, 4)
+    error, reward = task.error_mm(state), task.rewards(state)["arm"]
+    near = task.config.fine_mm
+    assert near != 1.0
+    torch.testing.assert_close(reward["track"], torch.exp(-error))
+    torch.testing.assert_close(reward["fine"], torch.exp(-error / near))

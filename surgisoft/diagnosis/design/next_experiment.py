@@ -9,7 +9,7 @@ every experimental setup that touches a competing effect.
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -61,12 +61,15 @@ from surgisoft.diagnosis.inputs import (
     identification_problem,
     open_inputs,
 )
+from surgisoft.diagnosis.other_models import is_predictions_file, open_model
 from surgisoft.diagnosis.residuals import Problem
 from surgisoft.diagnosis.weight import gravity_load
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import SIGNALS, Protocol
 from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.callables.arm import arm_by_itself
+from surgisoft.surrogate.callables.named import given_callable
 from surgisoft.surrogate.checkpoint import load_model
 from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects, make_effect
 from surgisoft.surrogate.model import ArmModel
@@ -610,11 +613,14 @@ def next_experiment(
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
     reference: Sequence[Recording] | TrainingResiduals | None = None,
+    predictions: Iterable[str | Path] | None = None,
+    error_mm: float | None = None,
 ) -> Recommendation:
     """The experiment that best distinguishes competing effects.
 
-    Model and recordings may be given by their paths. The recordings are looked at as `diagnose`
-    does: the training part, the direction of gravity, the residuals of the model's fit.
+    Model and recordings may be given by their paths; a model of other origin as for `compare`.
+    The recordings are looked at as `diagnose` does: the training part, the
+    direction of gravity, the residuals of the model's fit.
 
     between: the competing effects; without them those that explain the recordings best, and
     without recordings all known ones.
@@ -623,8 +629,15 @@ def next_experiment(
     """
     given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
     if not given:
+        if is_predictions_file(model) or predictions is not None:
+            raise InputError(
+                "predictions belong to recordings: expected the recordings that they were made for"
+            )
+        if callable(model) and not isinstance(model, ArmModel):
+            model = arm_by_itself(given_callable(model))
         return propose(load_model(model), between, minutes, settings)
-    arm, measured, notes = open_inputs(model, given)
+    arm, measured, _ = open_model(model, given, None, predictions, error_mm)
+    arm, measured, notes = open_inputs(arm, measured)
     problem = identification_problem(arm, measured, reference)
     found = recommend(problem, between or likely_competing(problem), minutes, settings)
     return replace(found, notes=notes)

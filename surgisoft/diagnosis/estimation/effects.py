@@ -3,7 +3,7 @@
 import copy
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,12 @@ import torch
 from surgisoft.diagnosis.candidates import Candidate, candidates, with_effect
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.cross_validation import cross_validation_of
-from surgisoft.diagnosis.estimation.intervals import Parameter, intervals
+from surgisoft.diagnosis.estimation.intervals import (
+    Parameter,
+    intervals,
+    p_value,
+    with_covariance,
+)
 from surgisoft.diagnosis.estimation.least_squares import (
     Fit,
     fit_all,
@@ -26,6 +31,8 @@ from surgisoft.surrogate.model import ArmModel
 
 LARGE = 24
 """Most free values of an effect that are all fitted; of more, the amplitudes alone are."""
+STARTS = 4
+"""Starts of the fit of a new effect: time constants that share a motion have several optima."""
 FIRST_ITERATIONS = 4
 """Steps from each start before the best of them goes on."""
 BISECTIONS = 20
@@ -48,20 +55,26 @@ class Fitted:
     """What was fitted, in physical units with intervals."""
     refitted: tuple[str, ...]
     """Effects among them that the model had before."""
+    p_value: float | None = None
+    """Probability of so large amplitudes of the new effects by noise and the network's own error
+    alone; None where no effect is new, or one has so many values that a ridge holds them."""
 
 
 def fit_effects(problem: Problem, names: list[str]) -> Fitted:
     """Fit the named effects in a problem's model; one that it lacks is added first."""
     model = copy.deepcopy(problem.model)
-    if model.remembers:
+    if not model.takes_effects:
         raise InputError(
             "effects are for models with a static network; the recurrent baseline takes none"
         )
     names = list(dict.fromkeys(names))
     refitted = tuple(name for name in names if name in model.effects)
+    others: list[Fit] = []
     for name in names:
         if name not in model.effects:
-            model = _added(problem.with_model(model), name)
+            model, *more = _added(problem.with_model(model), name)
+            if len(names) == 1 and more:
+                model, others = _best_end(problem, name, [model, *more])
     large = [name for name in names if is_large(model.effects[name])]
     small = [name for name in names if name not in large]
     fits: dict[tuple[str, ...], Fit] = {}
@@ -70,16 +83,51 @@ def fit_effects(problem: Problem, names: list[str]) -> Fitted:
             fits[name,] = fit_amplitudes(model, problem, name)
         if small:
             fits[tuple(small)] = fit_all(model, problem, small)
-    parameters = []
+    parameters, chance = [], None
     for keys, fit in fits.items():
         effects = {key: model.effects[key] for key in keys}
         free = free_parameters(model, keys)
         if len(keys) == 1 and keys[0] in large:
             free = {f"{keys[0]}.{k}": p for k, p in effects[keys[0]].amplitudes().items()}
-        parameters += intervals(effects, free, fit, problem.block)
+        known = with_covariance(fit, problem)
+        parameters += intervals(
+            effects, free, known, [with_covariance(each, problem) for each in others]
+        )
+        new = _are_new_amplitudes(model, keys, refitted)
+        if not large and new.any():
+            chance = p_value(known, new)
     order = {name: position for position, name in enumerate(names)}
     parameters.sort(key=lambda parameter: order[parameter.effect])
-    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted)
+    return Fitted(model.eval().requires_grad_(False), tuple(parameters), refitted, chance)
+
+
+def _best_end(problem: Problem, name: str, models: list[ArmModel]) -> tuple[ArmModel, list[Fit]]:
+    """The model in which a new effect fits best when fitted to the end, and the fits of the others.
+
+    models: from several starts. Fits whose values have another meaning (another form of the effect)
+    are left out of the others.
+    """
+    fits = [fit_all(model, problem, [name]) for model in models]
+    prices = [(1.0 + SEARCH.amplitude_price) ** _values(m.effects[name]) for m in models]
+    best = int(np.argmin([fit.misfit * price for fit, price in zip(fits, prices, strict=True)]))
+    form = models[best].effects[name].config()
+    alike = [i for i, each in enumerate(models) if each.effects[name].config() == form]
+    return models[best], [fits[i] for i in alike if i != best]
+
+
+def _are_new_amplitudes(
+    model: ArmModel, keys: tuple[str, ...], refitted: tuple[str, ...]
+) -> np.ndarray:
+    """(P,) bool: which free values are amplitudes of effects that the model lacked before."""
+    kinds: list[bool] = []
+    for key in keys:
+        effect = model.effects[key]
+        for new, values in (
+            (key not in refitted, effect.amplitudes()),
+            (False, effect.nonlinear_parameters()),
+        ):
+            kinds += [new] * sum(p.numel() for p in values.values())
+    return np.array(kinds, bool)
 
 
 def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str) -> Fitted | None:
@@ -101,11 +149,11 @@ def fit_plausible(problem: Problem, fitted: Fitted, names: list[str], name: str)
         return None
     effects = {key: model.effects[key] for key in small}
     free = free_parameters(model, small, held=name)
-    found = intervals(effects, free, fit, problem.block)
+    found = intervals(effects, free, with_covariance(fit, problem))
     rest = [p for p in fitted.parameters if p.effect not in small]
     order = {each: position for position, each in enumerate(names)}
     parameters = sorted([*found, *rest], key=lambda parameter: order[parameter.effect])
-    return Fitted(model.eval().requires_grad_(False), tuple(parameters), fitted.refitted)
+    return replace(fitted, model=model.eval().requires_grad_(False), parameters=tuple(parameters))
 
 
 @torch.no_grad()
@@ -133,13 +181,13 @@ def is_large(effect: Effect) -> bool:
     return _values(effect) > LARGE
 
 
-def _added(problem: Problem, name: str) -> ArmModel:
-    """The problem's model with one effect more, roughly fitted, from the best of a few starts.
+def _added(problem: Problem, name: str) -> list[ArmModel]:
+    """The problem's model with one effect more, roughly fitted from a few starts, the best first.
 
     Of two that come to nearly the same, the simpler one is the best.
     """
     tried = []
-    for model in starts(problem, name):
+    for model in starts(problem, name, STARTS):
         effect = model.effects[name]
         if is_large(effect):
             misfit = fit_amplitudes(model, problem, name).misfit
@@ -147,7 +195,8 @@ def _added(problem: Problem, name: str) -> ArmModel:
             misfit = fit_all(model, problem, [name], FIRST_ITERATIONS).misfit
         values = sum(p.numel() for p in effect.amplitudes().values())
         tried.append((misfit * (1.0 + SEARCH.amplitude_price) ** values, model))
-    return min(tried, key=lambda one: one[0])[1]
+    models = [model for _, model in sorted(tried, key=lambda one: one[0])]
+    return models[:1] if is_large(models[0].effects[name]) else models
 
 
 def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:

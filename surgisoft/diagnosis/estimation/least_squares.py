@@ -107,6 +107,14 @@ class Fit:
     """(P, P) what holds the values at their start, in the units of the misfit, mm^2."""
     misfit: float
     """Sum of squares that is left, the static error taken out, and what the hold costs, mm^2."""
+    prior_variance: np.ndarray
+    """(P,) variance of each value about its start, by which the hold was chosen; 0: not held."""
+
+    def likelihood(self, least: float) -> float:
+        """Likelihood of the fit beside one with the misfit `least`, mm^2: exp(-difference / 2 s^2)
+        with s^2 the misfit of one independent sample."""
+        sample = OPTIONS.rows_a_sample * least / len(self.residual)
+        return float(np.exp(min(0.0, 0.5 * (least - self.misfit) / max(sample, 1e-30))))
 
 
 def free_parameters(
@@ -238,9 +246,11 @@ def fit_all(
     spread = OPTIONS.prior_spread * np.maximum(1.0, np.abs(start))
     sample = OPTIONS.rows_a_sample * cost / len(residual)
     hold = np.diag(np.where(nonlinear, sample / spread**2, 0.0))
+    prior = np.where(nonlinear, spread**2, 0.0)
     damping = OPTIONS.first_damping
     for _ in range(iterations):
-        fit = Fit(values, predict.sensitivities(values, predicted), residual, nuisance, hold, cost)
+        slopes_now = predict.sensitivities(values, predicted)
+        fit = Fit(values, slopes_now, residual, nuisance, hold, cost, prior)
         grams, slopes = block_slopes(fit, np.zeros(len(residual)))
         gram, slope = grams[0] + hold, slopes[0] - hold @ (values - start)
         scale = np.maximum(np.diag(gram), 1e-9 * max(np.diag(gram).max(), 1e-30))
@@ -261,7 +271,8 @@ def fit_all(
         damping = max(damping / OPTIONS.damping_factor, OPTIONS.least_damping)
         if fall < OPTIONS.least_fall:
             break
-    return Fit(values, predict.sensitivities(values, predicted), residual, nuisance, hold, cost)
+    slopes_now = predict.sensitivities(values, predicted)
+    return Fit(values, slopes_now, residual, nuisance, hold, cost, prior)
 
 
 @torch.no_grad()
@@ -277,7 +288,7 @@ def amplitude_sensitivities(model: ArmModel, forward: RepeatedScan, key: str) ->
     slope = None
     if effect.stage in ("line", "material"):
         taps = model.chain.scan(forward.history, forward.first_pressure, model.chain.inner)
-        slope = model.chain.network_slope(rows(taps.behind["material"]), rows(taps.direction))
+        slope = model.chain.slope(forward.history, forward.first_pressure, taps, rows)
     changes = model.chain.sensitivities(effect, rows(signal.value), memory, slope)
     return changes.movedim(0, -1).numpy()
 
@@ -292,9 +303,10 @@ def fit_amplitudes(model: ArmModel, problem: Problem, key: str) -> Fit:
     nuisance = Nuisance.of(problem, residual)
     part = held_out_parts(problem)
     hold, cost = None, nuisance.misfit(residual)
+    unheld = np.zeros(len(values))
     for _ in range(AMPLITUDES.steps):
         jacobian = amplitude_sensitivities(model, forward, key)
-        fit = Fit(values, jacobian, residual, nuisance, hold, cost)
+        fit = Fit(values, jacobian, residual, nuisance, hold, cost, unheld)
         grams, slopes = block_slopes(fit, part)
         if hold is None:
             penalty = _penalty(start) * np.trace(grams.sum(0)) / len(start)
@@ -314,7 +326,7 @@ def fit_amplitudes(model: ArmModel, problem: Problem, key: str) -> Fit:
         if fall < AMPLITUDES.least_fall:
             break
     jacobian = amplitude_sensitivities(model, forward, key)
-    return Fit(values, jacobian, residual, nuisance, hold, cost)
+    return Fit(values, jacobian, residual, nuisance, hold, cost, unheld)
 
 
 def _penalty(start: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
-from surgisoft.report import Facts, Page, Section, Share, Table, Text, write_page
+from surgisoft.report import Command, Facts, Page, Section, Share, Table, Text, write_page
 
 HOW = (
     "Every effect is added to the model with each choice of its nonlinear parameters, to first "
@@ -75,7 +75,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
             parts.append(_probabilities(found.probabilities))
         if found.next_command:
             command = found.next_command.format(model="MODEL", data="RECORDINGS", before="")
-            parts.append(Section("What to do", [Text(f"`{command}`")]))
+            parts.append(Section("What to do", [Command(command)]))
     if found.change:
         parts.append(_change(found))
     if found.refit is not None:
@@ -185,19 +185,15 @@ def _setup(setup: SetupResult) -> Section:
     parts = [
         Table(["fault", "what was found", "numbers"], rows),
         Text(f"Recordings: {', '.join(setup.recordings)}."),
-        _lines("What mends it:", setup.mending),
+        Text("What mends it:"),
+        Command(setup.mending),
     ]
     for other, mending in zip(setup.alternatives, setup.alternative_mendings, strict=True):
         what = "; ".join(fault.sentence for fault in other)
-        parts.append(_lines(f"As likely: {what}. What mends that:", mending))
+        parts += [Text(f"As likely: {what}. What mends that:"), Command(mending)]
     if setup.how_to_tell:
         parts.append(Text(setup.how_to_tell[:1].upper() + setup.how_to_tell[1:] + "."))
     return Section("Set-up of the recordings", parts)
-
-
-def _lines(title: str, lines: str) -> Text:
-    """A title and lines, each a paragraph."""
-    return Text("\n\n".join([title, *lines.splitlines()]))
 
 
 def _numbers(fault: SetupFault) -> str:

@@ -191,7 +191,7 @@ def _rotation(rotation: np.ndarray) -> str | list[list[float]]:
 def _rows(recording: Recording, keep: np.ndarray) -> Recording:
     """The recording's rows that a mask (T,) keeps."""
     names = ("t_s", "measured", "commanded", "key_points_mm", "run", "temp_C", "payload_g")
-    values = {name: getattr(recording, name) for name in names}
+    values = {name: getattr(recording, name) for name in (*names, "predicted_mm")}
     return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None})
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from surgisoft.diagnosis.other_models import has_slope
 from surgisoft.diagnosis.residuals import EVERY_ROW, model_discrepancy, noise_of
 from surgisoft.diagnosis.setup.alignment import HANDED, Frame, angle, shifted
 from surgisoft.diagnosis.setup.arrangements import units
@@ -101,8 +102,11 @@ def find_setup_faults(model: ArmModel, recordings: Sequence[Recording]) -> Setup
     """The faults of the set-up that recordings of a model's arm show; None where none is proved.
 
     All recordings are tested together first. Where they share no fault, each is tested alone: one
-    of several may have been recorded after a camera was moved.
+    of several may have been recorded after a camera was moved. Nothing is proved by a model whose
+    change with the actuation is not known.
     """
+    if not has_slope(model):
+        return None
     measured = [r for r in recordings if np.isfinite(r.key_points_mm).any()]
     if not measured:
         return None

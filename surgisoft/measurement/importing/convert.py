@@ -23,7 +23,7 @@ from surgisoft.measurement.importing.points import (
     read_points,
 )
 from surgisoft.measurement.importing.raw import Column, RawTable
-from surgisoft.measurement.importing.readers import AUTO, open_raw, reader
+from surgisoft.measurement.importing.readers import AUTO, READERS, chosen, open_raw, reader
 from surgisoft.measurement.importing.rows import (
     Draft,
     point_numbers,
@@ -81,7 +81,8 @@ def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path
     """
     by_role: dict[str, list[Path]] = {name: [] for name in spec.file}
     for path in _files(paths, spec):
-        by_role[_role_of(path, spec)].append(path)
+        for name in _roles_served(path, spec):
+            by_role[name].append(path)
     main = by_role[spec.main]
     needed = {s.file for s in (spec.measured, spec.commanded, spec.key_points) if s}
     for name, role in spec.file.items():
@@ -131,12 +132,15 @@ def _roles_of(path: Path, spec: ImportMap) -> list[str]:
     ]
 
 
-def _role_of(path: Path, spec: ImportMap) -> str:
-    """The first role that fits."""
+def _roles_served(path: Path, spec: ImportMap) -> list[str]:
+    """The first role that fits, and for a file of topics every other role that names a topic."""
     roles = _roles_of(path, spec)
     if not roles:
         raise InputError(f"{path}: fits no file of the map, expected {_patterns(spec)}")
-    return roles[0]
+    if chosen(path, spec.file[roles[0]]) is not READERS["mcap"]:
+        return roles[:1]
+    topics = [name for name in roles[1:] if spec.file[name].topic or spec.file[name].topics]
+    return [roles[0], *topics]
 
 
 def _patterns(spec: ImportMap) -> str:

@@ -47,6 +47,10 @@ class FileRole:
     """Lines that start with this are passed over."""
     missing: tuple[str, ...] = ()
     """Texts that mean a missing value, in addition to the empty cell and NaN."""
+    topic: str = ""
+    """Topic of an MCAP file, such as "/pressures"; one file serves every role that names one."""
+    topics: tuple[str, ...] = ()
+    """Several topics whose messages belong together, such as a pose each."""
     join: Annotated[str, one_of(("rows", "time"))] = "rows"
     """"rows": row by row with the main file; "time": matched by time."""
     offset_rows: int = 0

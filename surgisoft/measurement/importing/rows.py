@@ -219,7 +219,7 @@ def without_frozen(recording: Recording) -> tuple[Recording, list[str]]:
             f"{recording.run[stretch.start]}: {stretch.stop - stretch.start - 1} rows left out"
         )
     names = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
-    values = {name: getattr(recording, name) for name in names}
+    values = {name: getattr(recording, name) for name in (*names, "predicted_mm")}
     return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None}), notes
 
 

@@ -10,6 +10,7 @@ from surgisoft.measurement.recordings.file import (
     save_recording,
     save_recordings,
 )
+from surgisoft.measurement.recordings.predictions import with_predictions
 from surgisoft.measurement.recordings.quality import QualityWarning, find_warnings, summary
 from surgisoft.measurement.recordings.recording import (
     KINDS,
@@ -33,4 +34,5 @@ __all__ = [
     "save_recording",
     "save_recordings",
     "summary",
+    "with_predictions",
 ]

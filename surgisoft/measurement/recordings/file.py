@@ -53,6 +53,16 @@ def load_recordings(
     return [load_recording(file, on_warning) for file in files]
 
 
+def recording_files(paths: Iterable[str | Path] | str | Path) -> list[Path]:
+    """The files that files and folders name, folders in the order of their files' names.
+
+    A file that is named twice counts twice.
+    """
+    given = [paths] if isinstance(paths, str | Path) else paths
+    each = (_in_folder(Path(p)) if Path(p).is_dir() else [Path(p)] for p in given)
+    return [file for part in each for file in part]
+
+
 def _warn(message: str) -> None:
     warnings.warn(message, stacklevel=2)
 
@@ -99,7 +109,7 @@ def _read(path: Path, warn: Warn) -> Recording:
         for found in find_warnings(recording):
             warn(f"{path}, sample {found.sample + 1}: {found.text}")
         return recording
-    table = _open(path)
+    table = open_table(path)
     header = f"{path}, line 1" if path.suffix == ".csv" else f"{path}"
     layout = parse_header(table.names, header)
     for name in layout.ignored:
@@ -116,7 +126,7 @@ def _read(path: Path, warn: Warn) -> Recording:
     return recording
 
 
-def _open(path: Path) -> DelimitedText | ParquetTable:
+def open_table(path: Path) -> DelimitedText | ParquetTable:
     """The table of a file; its columns are not read yet."""
     if path.suffix not in SUFFIXES and path.exists() and not path.is_dir():
         raise InputError(

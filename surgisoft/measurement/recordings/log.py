@@ -13,10 +13,11 @@ import threading
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Annotated, Any, TextIO
 
 import numpy as np
 
+from surgisoft.config import Where, at_least, describe, from_table
 from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.recordings.recording import ArmInfo, Recording
@@ -41,13 +42,13 @@ class LogHeader:
     """"continuous", or "settled" where the samples of a row are averaged."""
     unit: str
     """Unit of the actuation."""
-    chambers: int
+    chambers: Annotated[int, at_least(1)]
     """Number m of actuation channels."""
-    key_points: int
+    key_points: Annotated[int, at_least(1)]
     """Number n of key points."""
     arm: ArmInfo
     """Size of the arm."""
-    gravity: list[float] | None = None
+    gravity: tuple[float, float, float] | None = None
     """Unit vector along the weight, arm base frame."""
     payload_g: float | None = None
     """Known mass at the arm [g]."""
@@ -196,7 +197,7 @@ def _lines(path: Path) -> tuple[list[dict], bool]:
     torn = raw[-1] != b""
     raw.pop()
     if torn:  # whole but for the line's end, or torn inside
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, RecursionError):
             json.loads(text.rpartition(b"\n")[2])
             raw.append(text.rpartition(b"\n")[2])
             torn = False
@@ -205,7 +206,7 @@ def _lines(path: Path) -> tuple[list[dict], bool]:
     for number, line in enumerate(raw, 1):
         try:
             found.append(json.loads(line))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             if number == len(raw) and found:
                 return found, True
             raise InputError(
@@ -227,10 +228,7 @@ def _header(path: Path, first: dict) -> LogHeader:
             "surgisoft that wrote it"
         )
     fields = {name: value for name, value in first.items() if name not in ("format", "version")}
-    try:
-        return LogHeader(**{**fields, "arm": ArmInfo(**fields["arm"])})
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}, line 1: not a whole header ({error})") from error
+    return from_table(LogHeader, fields, Where(path))
 
 
 def _check_sample(path: Path, number: int, line: dict, header: LogHeader) -> None:
@@ -238,15 +236,19 @@ def _check_sample(path: Path, number: int, line: dict, header: LogHeader) -> Non
     shapes["k"] = (header.key_points, 3)
     if "c" in line:
         shapes["c"] = (header.chambers,)
+    if "temp_C" in line:
+        shapes["temp_C"] = ()
     for name, shape in shapes.items():
         try:
             good = np.shape(np.array(line[name], np.float64)) == shape
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             good = False
+        if name in ("row", "run"):
+            good = good and type(line[name]) is int and abs(line[name]) < 2**53
         if not good:
             raise InputError(
-                f"{path}, line {number}: '{name}' is {line.get(name)!r:.60}, expected numbers of "
-                f"shape {shape}"
+                f"{path}, line {number}: '{name}' is {describe(line.get(name))}, expected "
+                f"numbers of shape {shape}"
             )
 
 

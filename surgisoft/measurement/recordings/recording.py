@@ -69,13 +69,24 @@ class Recording:
     """Free text, for people."""
     source: Path | None = None
     """The file that it was read from."""
+    predicted_mm: np.ndarray | None = None
+    """(T, n, 3) float64, what a model in question predicts in these rows, arm base frame [mm]; not
+    saved with the recording."""
 
     def __post_init__(self) -> None:
         run = np.zeros(np.shape(self.t_s), np.int64) if self.run is None else self.run
         points = _with_whole_key_points(np.asarray(self.key_points_mm, np.float64))
         object.__setattr__(self, "run", np.asarray(run, np.int64))
         object.__setattr__(self, "key_points_mm", points)
-        for name in ("t_s", "measured", "commanded", "temp_C", "payload_g", "gravity"):
+        for name in (
+            "t_s",
+            "measured",
+            "commanded",
+            "temp_C",
+            "payload_g",
+            "gravity",
+            "predicted_mm",
+        ):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         if self.gravity is not None:
@@ -150,6 +161,7 @@ def _check_shapes(recording: Recording) -> None:
         "temp_C": (samples,),
         "payload_g": (samples,),
         "gravity": (3,),
+        "predicted_mm": (samples, recording.key_points, 3),
     }
     for name, wanted in expected.items():
         array = getattr(recording, name)
@@ -158,7 +170,7 @@ def _check_shapes(recording: Recording) -> None:
 
 
 def _check_values(recording: Recording) -> None:
-    for name in ("t_s", "measured", "commanded"):
+    for name in ("t_s", "measured", "commanded", "predicted_mm"):
         array = getattr(recording, name)
         if array is not None and not np.isfinite(array).all():
             row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])

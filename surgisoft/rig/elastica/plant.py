@@ -184,10 +184,8 @@ def rest(plant: Plant, state: State, seconds: float) -> None:
 
 
 @compiled
-def warmed(plant: Plant, time: float) -> float:
+def warmed(time: float) -> float:
     """Temperature of the room [degrees Celsius] at a time [s]: a hyperbolic approach to warmer."""
-    if plant.warmth == 0.0:
-        return ROOM_C
     return ROOM_C + 7.0 * time / (time + 600.0)
 
 
@@ -280,7 +278,7 @@ def load_wall(plant: Plant, state: State, loaded: np.ndarray, added: np.ndarray)
             bending[d, k] = (body.kappa[d, k] - plant.bow[d, k]) / plant.curvature
     for k in range(elements):
         stretch[0, k] = body.sigma[2, k] / axial_scale
-    warm = warmed(plant, state.time[0]) - ROOM_C
+    warm = warmed(state.time[0]) - ROOM_C
     lost = -math.expm1(-plant.warmth * warm)
     strain_wall(plant.wall, lost, plant.step, bending, state.bending, loaded)
     strain_wall(plant.wall, lost, plant.step, stretch, state.stretch, added)
@@ -381,7 +379,7 @@ def see(plant: Plant, state: State, tape: np.ndarray, seen: np.ndarray, clean: n
     for p in range(seen.shape[0]):
         circle_centre(tracking.seen[p], seen[p])
         circle_centre(tracking.clean[p], clean[p])
-    return math.floor(10.0 * warmed(plant, state.time[0]) + 0.5) / 10.0
+    return math.floor(10.0 * warmed(state.time[0]) + 0.5) / 10.0
 
 
 def pause_cameras(plant: Plant, state: State, seconds: float, tape: np.ndarray) -> None:

@@ -100,7 +100,6 @@ class ElasticaRig:
         self.arm = ArmInfo(1e3 * length, 2e3 * self._plant.radius)
         self.payload_g = float(config.payload_g) if config.payload_g else None
         self.gravity = self._plant.gravity / np.linalg.norm(self._plant.gravity)
-        self._thermometer = self._plant.warmth != 0.0
         self._rng = np.random.default_rng([seed, config.take, 0xE1A57])
         self._state.time[0] = -REST_S
         self.reset()
@@ -151,7 +150,7 @@ class ElasticaRig:
             measured=1e-3 * (state.air.line + noise * plant.high),
             commanded=1e-3 * state.air.target,
             key_points_mm=seen,
-            temp_C=temperature if self._thermometer else None,
+            temp_C=temperature,
         )
         chamber = 1e-3 * state.air.chamber
         return sample, Truth(state.centres[None].copy(), clean[None], chamber[None])

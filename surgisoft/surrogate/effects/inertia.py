@@ -90,8 +90,17 @@ class Inertia(Effect):
 
     def advance(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(B, m, 2) y and y' / w after the actuation (B, m)."""
-        keep, addend = self._drive(signal, context.dt_s)
-        return self._from_mode(keep * self._to_mode(memory) + addend)
+        # The recurrence of `scan` with real and imaginary parts apart, which every runtime has.
+        damping = self.damping_logit.sigmoid()
+        swing = (1 - damping.square()).sqrt()
+        turn = 2 * math.pi * self.log_frequency.exp() * context.dt_s.unsqueeze(-1)
+        decay = torch.exp(-damping * turn)
+        cosine, sine = decay * torch.cos(swing * turn), decay * torch.sin(swing * turn)
+        away = memory[..., 0] - signal
+        speed = memory[..., 1]
+        y = signal + cosine * away + sine / swing * (damping * away + speed)
+        rate = cosine * speed - sine / swing * (away + damping * speed)
+        return torch.stack([y, rate], dim=-1)
 
     def scan(self, memory: Tensor, signal: Tensor, context: Context) -> Tensor:
         """(R, T, m, 2) y and y' / w along the actuation (R, T, m)."""

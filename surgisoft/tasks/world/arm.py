@@ -18,6 +18,7 @@ from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_streams import Stream
 
 
@@ -138,7 +139,7 @@ class ArmPart:
     tip_direction: Tensor
     """(B, 3): unit tangent at the tip."""
     seen_mm: Tensor
-    """(B, n, 3) mm: key points as measured."""
+    """(B, n, 3) mm: key points as measured, or as an observer estimates them from that."""
     seen_kPa: Tensor
     """(B, m) kPa: chamber pressure as measured."""
     offset_mm: Tensor
@@ -146,6 +147,13 @@ class ArmPart:
     plant: Any = None
     """State of the plants where simulated rigs move the arm, a pytree with `ObjectBatch`es in it;
     None where the model moves it. Resets and row selections carry it like any tensor."""
+    belief: Belief | None = None
+    """Memory of the observer of a simulated arm; None where its estimate is the raw measurement."""
+
+    @property
+    def model_beside(self) -> ArmState:
+        """State of the model that runs beside the arm, fed with what is measured."""
+        return self.arm if self.belief is None else self.belief.arm
 
     @property
     def tip_mm(self) -> Tensor:
@@ -198,6 +206,9 @@ class Arm(Protocol):
     def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
         """One-step prediction: key points (B, n, 3) mm if the chambers had (B, m) kPa in dt_s."""
 
+    def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
+        """The state with its body moved to key points (B, n, 3) mm."""
+
     def settled(self, pressure: Tensor) -> Tensor:
         """Steady-state key points (B, n, 3) mm at pressures (B, m) kPa, nominal mount."""
 
@@ -219,6 +230,7 @@ class ModelArm:
         randomisation: Randomisation,
         samples: int,
         device: torch.device,
+        observer: AlphaBetaFilter | None = None,
     ):
         """`samples` is the number K of centreline points."""
         spec = mounted.model.spec
@@ -230,6 +242,7 @@ class ModelArm:
                 f"arm '{name}': {len(start)} pressures to start with, expected {spec.chambers}"
             )
         self.name, self.device, self.vary = name, device, randomisation
+        self.observer = observer or AlphaBetaFilter()
         self.chambers, self.key_points = spec.chambers, spec.key_points
         self.model = mounted.model.to(device)
         self.backbone = self.model.backbone(samples)
@@ -274,7 +287,14 @@ class ModelArm:
             seen_kPa=pressure,
             offset_mm=torch.zeros_like(points),
         )
-        return self._measured(stream, part)
+        stream, part = self._measured(stream, part)
+        if self.observer.raw:
+            return stream, part
+        nominal = self.model.initial_state(count)
+        for target in (*passed, pressure):
+            nominal, shape = self.model.step(nominal, target - nominal.pressure, 1.0)
+        offset = part.seen_mm - frames.apply(self.pose, shape)
+        return stream, replace(part, belief=Belief(nominal, offset, torch.zeros_like(offset)))
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
@@ -285,7 +305,8 @@ class ModelArm:
         pressure = self.pneumatics.follow(part.pressure, command, dt_s)
         state, points = self.bent(part, pressure, dt_s)
         part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
-        return self._measured(stream, self.posed(part, points))
+        stream, part = self._measured(stream, self.posed(part, points))
+        return stream, self._estimated(part, dt_s)
 
     def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
         """One-step prediction: key points (B, n, 3) mm, world frame, if the chambers had (B, m) kPa
@@ -305,7 +326,9 @@ class ModelArm:
         _, points = self.model.step(state, torch.zeros_like(pressure), 1.0)
         return frames.apply(self.pose, points)
 
-    def bent(self, part: ArmPart, pressure: Tensor, dt_s: float) -> tuple[ArmState, Tensor]:
+    def bent(
+        self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
+    ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
         state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
         return state, frames.apply(part.mount, points)
@@ -362,3 +385,17 @@ class ModelArm:
         seen_mm = part.points_mm + vary.noise_mm * points
         seen_kPa = part.pressure + vary.noise_kPa * pressure
         return stream, replace(part, seen_mm=seen_mm, seen_kPa=seen_kPa)
+
+    def _estimated(self, part: ArmPart, dt_s: float) -> ArmPart:
+        """The part with the observer's estimate in place of the raw measurement.
+
+        The nominal model knows neither the episode's gain nor its mount.
+        """
+        belief = part.belief
+        if belief is None:
+            return part
+        arm, points = self.model.step(belief.arm, part.seen_kPa - belief.arm.pressure, dt_s)
+        points = frames.apply(self.pose, points)
+        surprise = part.seen_mm - points - belief.offset_mm
+        now, offset, drift = self.observer.adopted(surprise, belief.offset_mm, belief.drift_mm)
+        return replace(part, seen_mm=points + now, belief=Belief(arm, offset, drift))

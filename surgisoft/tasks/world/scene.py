@@ -57,6 +57,19 @@ class SceneState:
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
 
 
+def measured_view(fraction: Tensor) -> SceneState:
+    """A scene of which only the share (B,) of the ring that the endoscope sees is known."""
+    unknown = torch.full_like(fraction, torch.nan)
+    points = unknown[:, None].isfinite()
+    return SceneState(view=View(points, points, fraction, unknown, unknown, unknown))
+
+
+def measured_clearance(least_mm: Tensor) -> SceneState:
+    """A scene of which only one arm's least clearance (B,) mm to the bodies is known."""
+    least = least_mm[:, None]
+    return SceneState(BatchClearance(least[:, None], least[:, :0], torch.full_like(least, 1.0)))
+
+
 @dataclass(frozen=True)
 class SceneEngineConfig:
     """Resolution of the scene's computations, and the collision engine."""
@@ -155,11 +168,15 @@ class SceneEngine:
         in_place = scene.donated and overwritable(dose.dose)
         return self.ablation.reset(dose, mask, *beam, in_place, scene.lesion)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
+    def aimed(self, parts: Mapping[str, ArmPart]) -> RayHit:
+        """Where the beam of the arms in `parts` ends, (B,)."""
         lines = {name: part.line_mm for name, part in parts.items()}
-        beam, eye = parts[LASER], parts[ENDOSCOPE]
-        clearance = self.collision.clearance(lines)
-        hit = self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+        beam = parts[LASER]
+        return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
+        lines, eye = {name: part.line_mm for name, part in parts.items()}, parts[ENDOSCOPE]
+        clearance, hit = self.collision.clearance(lines), self.aimed(parts)
         pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
         ring = (self.rings_mm[lesion], self.ring_normals[lesion])
         seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)

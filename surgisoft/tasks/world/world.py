@@ -29,6 +29,7 @@ from surgisoft.tasks.world.arm import (
     Pneumatics,
     Randomisation,
 )
+from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import (
@@ -55,6 +56,8 @@ class WorldConfig:
     """The pumps."""
     randomisation: Randomisation = field(default_factory=Randomisation)
     """Domain randomization: what differs between episodes."""
+    observer: AlphaBetaFilter = field(default_factory=AlphaBetaFilter)
+    """The state observer of every simulated arm; on a rig the rig's own takes its place."""
     scene_engine: SceneEngineConfig = field(default_factory=SceneEngineConfig)
     """Resolution of the scene and its collision engine."""
 
@@ -105,7 +108,9 @@ class World:
         self.scene = scene
         c = self.config
         self.arms: dict[str, Arm] = {
-            name: ModelArm(name, mounted, c.pneumatics, c.randomisation, c.samples, self.device)
+            name: ModelArm(
+                name, mounted, c.pneumatics, c.randomisation, c.samples, self.device, c.observer
+            )
             for name, mounted in arms.items()
         }
 

@@ -74,4 +74,5 @@ def late(recording: Recording, rows: int) -> Recording:
         measured=recording.measured[rest],
         commanded=recording.commanded[rest],
         key_points_mm=recording.key_points_mm[body],
+        temp_C=None,
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.importing.readers import motive, parquet, text
+from surgisoft.measurement.importing.readers import mcap, motive, parquet, text
 
 AUTO = "auto"
 """The format that stands for: by the name's ending, else text."""
@@ -21,14 +21,14 @@ READERS: dict[str, Reader] = {
     "text": text.READER,
     "parquet": parquet.READER,
     "motive": motive.READER,
+    "mcap": mcap.READER,
 }
 """The readers of this package."""
 
 NOT_READ = {
     "c3d": "a C3D file (motion capture)",
     "bag": "a ROS bag",
-    "db3": "a ROS 2 bag",
-    "mcap": "an MCAP file (ROS 2)",
+    "db3": "a ROS 2 bag in SQLite ('ros2 bag convert' makes MCAP of it)",
     "mat": "a MATLAB file",
     "h5": "an HDF5 file",
     "hdf5": "an HDF5 file",

@@ -1,0 +1,126 @@
+"""The observer: an estimate of an arm's body and of its pumps from what a rig measures.
+
+The arm's model runs beside the rig, driven by the measured pressures, and its output is corrected
+by a filtered output disturbance, as in offset-free model predictive control (Pannocchia & Rawlings
+2003). Tasks on a rig and exported controllers use the same observer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+from surgisoft.scene import frames
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
+from surgisoft.tasks.world.observer import AlphaBetaFilter
+
+
+@dataclass(frozen=True)
+class ObserverGains:
+    """How much of a measurement the estimate adopts in a step of a task."""
+
+    cameras: bool = True
+    """Whether cameras measure the key points; else the model alone estimates them."""
+    observer_gain: float = 0.3
+    """Share of the innovation (cameras minus estimate) that the estimate adopts in a step, 0..1:
+    the alpha of an alpha-beta filter."""
+    drift_gain: float = 0.01
+    """Share of the innovation that is added to the disturbance's rate, 0..1: the filter's beta."""
+    pump_gain: float = 0.3
+    """Share of the difference between measured and expected pressure that the estimated offset of
+    the pumps adopts in a step, 0..1."""
+
+    def __post_init__(self):
+        for name in ("observer_gain", "drift_gain", "pump_gain"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"rig: {name} is {getattr(self, name)}, expected 0 to 1")
+
+
+class Order(NamedTuple):
+    """What an action asks of the pumps for one step of a task."""
+
+    target_kPa: Tensor
+    """(B, m) kPa: pressures to command."""
+    shift_kPa: Tensor
+    """(B, m) kPa: estimated offset of the pumps when the action was chosen."""
+    expected_kPa: Tensor
+    """(B, m) kPa: pressures expected at the end of the step."""
+
+
+class Observer:
+    """Estimates one arm from measurements; a function of its arguments, batched, differentiable.
+
+    `ArmPart.plant` has to be a dataclass with `target_kPa` (B, m) kPa, the pressures that were
+    commanded last, and `drift_mm` (B, n, 3) mm, world frame, by how much the output disturbance
+    grows in a step. `part.command` is the command after which a pump of the simulated arm would
+    give what the rig's pump gives: the two differ by an offset, which is estimated here.
+    """
+
+    def __init__(
+        self, arm: ModelArm, gains: ObserverGains, dt_s: float, lowest: Tensor, highest: Tensor
+    ):
+        """dt_s: time of a step of the task, s; lowest, highest: (m,) kPa, limits of a command."""
+        self.arm, self.gains, self.dt_s = arm, gains, dt_s
+        self.lowest, self.highest = lowest, highest
+        self.filter = AlphaBetaFilter(gains.observer_gain, gains.drift_gain)
+
+    def followed(self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float) -> ArmPart:
+        """The model after pressures (B, m) kPa were measured dt_s after the sample before."""
+        model, points = self.arm.bent(part, pressure, dt_s)
+        return replace(part, arm=model, points_mm=points, pressure=pressure)
+
+    def order(
+        self,
+        part: ArmPart,
+        action: Tensor,
+        lowest: Tensor | None = None,
+        highest: Tensor | None = None,
+    ) -> Order:
+        """What to command for changes of pressure (B, m) kPa, and what should come of it.
+
+        lowest, highest: (B, m) kPa, other limits of a command than those of the observer.
+        """
+        pump, target = self.arm.pneumatics, part.plant.target_kPa.to(action)
+        shift = part.command - target
+        low = self.lowest if lowest is None else lowest
+        high = self.highest if highest is None else highest
+        target = pump.command(target, action, low, high)
+        return Order(target, shift, pump.follow(part.pressure, target + shift, self.dt_s))
+
+    def begun(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+        """The part at the begin of an episode, of which the last sample was measured just now.
+
+        pressure: (B, m) kPa; points_mm: (B, n, 3) mm, base frame, nan where one was lost. The whole
+        first innovation is taken over.
+        """
+        return self._seen(replace(part, command=pressure), pressure, points_mm, begins=True)
+
+    def stepped(self, part: ArmPart, order: Order, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+        """The part at the end of a step, whose last sample was measured just now.
+
+        order: what was asked for the step; the other arguments are those of `begun`.
+        """
+        surprise = (pressure - order.expected_kPa) / self.arm.pneumatics.share(self.dt_s)
+        shift = order.shift_kPa + self.gains.pump_gain * surprise
+        return self._seen(replace(part, command=order.target_kPa + shift), pressure, points_mm)
+
+    def _seen(
+        self, part: ArmPart, pressure: Tensor, points_mm: Tensor, begins: bool = False
+    ) -> ArmPart:
+        """The part as estimated; its key points so far are the model's.
+
+        An alpha-beta filter (Kalata 1984) estimates by how much the body lies off the model: it
+        follows a steady drift without lag.
+        """
+        seen, offset, plant = part.points_mm, part.offset_mm, part.plant
+        if self.gains.cameras:
+            measured = frames.apply(part.mount, points_mm)
+            surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
+            filtered = AlphaBetaFilter() if begins else self.filter
+            now, offset, drift = filtered.adopted(surprise, offset, plant.drift_mm)
+            seen, plant = seen + now, replace(plant, drift_mm=drift)
+        return replace(part, seen_mm=seen, seen_kPa=pressure, offset_mm=offset, plant=plant)

@@ -1,0 +1,79 @@
+"""`surgisoft export`: policies and arm models as files for other programs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from surgisoft.cli import app
+from surgisoft.cli.options import EffectFiles
+from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
+
+
+@app.command()
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN|MODEL",
+            help="Folder of a training run, or of an arm model; default: the arm of the package.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="New folder.")],
+    which: Annotated[
+        str | None, typer.Option(metavar="best|last", help="Checkpoint of a run; default: best.")
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Drive a virtual rig for one episode with the exported controller of a run, "
+            "beside the policy itself, and print the largest difference.",
+        ),
+    ] = False,
+    effect_files: EffectFiles = None,
+) -> None:
+    """Write a run's policies, or an arm model, as ONNX and TorchScript.
+
+    A run gives, for each agent, its network, and one controller with observer, memories and
+    predictions inside: measurements in, commands out. controller.py runs it without surgisoft,
+    and policy.json states every name, order, unit and range. A model gives start(pressure) and
+    step(state, pressure, dt) -> state, key points, and arm.json.
+    """
+    is_model = str(source) == "default" or (source / "weights.safetensors").is_file()
+    if is_model and (which is not None or check):
+        raise InputError(f"{source}: is an arm model; --which and --check are for training runs")
+    files = _model(source, output) if is_model else _run(source, output, which or "best", check)
+    for file in files:
+        print(f"wrote {file}")
+
+
+def _model(source: Path, output: Path) -> list[Path]:
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.export import export_arm
+
+    with progress(f"export {source}"):
+        return export_arm(load_model(source), output)
+
+
+def _run(source: Path, output: Path, which: str, check: bool) -> list[Path]:
+    from surgisoft.agents.controller_runner import Controller
+    from surgisoft.agents.export import export as export_policy
+    from surgisoft.agents.learned import LearnedPolicy
+    from surgisoft.agents.rig_check import check_on_rig
+
+    policy = LearnedPolicy(source, which=which)
+    task = policy.run.task()
+    with progress(f"export {source}"):
+        files = export_policy(policy, output, task)
+    if not (output / "controller.py").is_file():
+        print("controller: not exported, see `note` in policy.json")
+    elif check:
+        with progress("one episode on the virtual rig"):
+            found = check_on_rig(Controller(output), task, policy)
+        print(
+            f"on the virtual rig, {found.decisions} decisions: exported controller and policy "
+            f"differ by {found.points_mm:.2g} mm and {found.commands_kPa:.2g} kPa at most"
+        )
+    return files

@@ -1,0 +1,5 @@
+"""A demonstration in five steps: cut, measurement, error, its cause, and the mended model."""
+
+from surgisoft.demo.story import Demonstration, demo
+
+__all__ = ["Demonstration", "demo"]

@@ -1,0 +1,130 @@
+"""The clock of a closed loop: it keeps a fixed period, and measures how well it was kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+Pace = Literal["real", "simulated", "rig"]
+"""Who keeps the time: this computer's clock; nobody, as fast as possible; or the rig, whose `read`
+returns with the next sample."""
+SPIN_S = 5e-4
+"""Last part of a wait that is spent looking at the clock instead of sleeping [s]."""
+MISSED = 1.5
+"""An interval of more periods than this counts as an overrun where the rig keeps the time."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a loop kept its period."""
+
+    pace: Pace
+    """Who kept the time."""
+    period_s: float
+    """The wanted period [s]."""
+    ticks: int
+    """Number of periods."""
+    jitter_s: float
+    """Standard deviation of the interval from sample to sample [s]; nan where nobody kept time."""
+    interval_99_s: float
+    """99 % quantile of the interval's distance from the period [s]."""
+    interval_worst_s: float
+    """Largest distance of an interval from the period [s]."""
+    busy_s: float
+    """Mean time in a period that the loop worked [s]: policy, model, log, view, simulated rig."""
+    busy_99_s: float
+    """99 % quantile of that time [s]."""
+    busy_worst_s: float
+    """Largest time that the loop worked in a period [s]."""
+    overruns: int
+    """Periods whose work was not done in time; where the rig keeps the time, samples that came
+    more than half a period late."""
+
+    @property
+    def sentence(self) -> str:
+        """The timing in words."""
+        work = (
+            f"work in a period {1e3 * self.busy_s:.2f} ms (99 %: {1e3 * self.busy_99_s:.2f} ms, "
+            f"worst {1e3 * self.busy_worst_s:.2f} ms)"
+        )
+        if self.pace == "simulated":
+            return f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms, simulated clock; {work}"
+        return (
+            f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms; jitter "
+            f"{1e3 * self.jitter_s:.3f} ms (99 %: {1e3 * self.interval_99_s:.3f} ms, worst "
+            f"{1e3 * self.interval_worst_s:.3f} ms); {work}; {self.overruns} overruns"
+        )
+
+
+@dataclass(eq=False)
+class Clock:
+    """Keeps the period of a loop that calls `tick` once a period, after the sample has come."""
+
+    period_s: float
+    """The wanted period [s]."""
+    pace: Pace = "real"
+    """Who keeps the time."""
+    now: Callable[[], float] = time.perf_counter
+    """Reads the time [s]."""
+    sleep: Callable[[float], None] = time.sleep
+    """Waits for a time [s]."""
+    overruns: int = 0
+    """Periods that were not kept so far."""
+    _due: float | None = None
+    _last: float | None = None
+    _intervals: list[float] = field(default_factory=list)
+    _busy: list[float] = field(default_factory=list)
+
+    def pause(self) -> None:
+        """The loop rests: the next tick begins a new grid of periods."""
+        self._due = self._last = None
+
+    def tick(self) -> None:
+        """Wait until the period is over; the work of the period is done."""
+        came = self.now()
+        if self._due is None or self._last is None:
+            self._due = self._last = came
+            return
+        self._busy.append(came - self._last)
+        self._due += self.period_s
+        if self.pace == "real":
+            if came > self._due:
+                self.overruns += 1
+                # Later periods keep their grid where this one can be made up for.
+                self._due = max(self._due, came - self.period_s)
+            self._wait(self._due)
+        there = self.now()
+        interval = there - self._last
+        if self.pace == "rig" and interval > MISSED * self.period_s:
+            self.overruns += 1
+        self._intervals.append(interval)
+        self._last = there
+
+    def _wait(self, due: float) -> None:
+        left = due - self.now()
+        if left > SPIN_S:
+            self.sleep(left - SPIN_S)
+        while self.now() < due:
+            pass
+
+    def timing(self) -> Timing:
+        """The statistics so far."""
+        kept = self.pace != "simulated" and len(self._intervals) > 0
+        off = np.abs(np.array(self._intervals) - self.period_s) if kept else np.full(1, np.nan)
+        busy = np.array(self._busy) if self._busy else np.full(1, np.nan)
+        return Timing(
+            self.pace,
+            self.period_s,
+            len(self._busy),
+            float(np.std(self._intervals)) if kept else float("nan"),
+            float(np.quantile(off, 0.99)),
+            float(off.max()),
+            float(busy.mean()),
+            float(np.quantile(busy, 0.99)),
+            float(busy.max()),
+            self.overruns,
+        )

@@ -1,0 +1,260 @@
+"""A run while it lasts: measured and predicted body, pressures, residual and alarm level.
+
+The data go to the viewer sample by sample, to a file, or to both. Rerun sends them in threads of
+its own, so that the loop that logs them does not wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from surgisoft.errors import InputError
+from surgisoft.files import new_file
+from surgisoft.replay.colours import (
+    BACKGROUND,
+    LIMIT_COLOUR,
+    PLAN_COLOUR,
+    REAL_COLOUR,
+    SHAFT_COLOUR,
+    error_colours,
+    paler,
+    series_colour,
+)
+from surgisoft.replay.plots import Corner
+from surgisoft.replay.recording import SUFFIX, TIME
+from surgisoft.replay.shapes import finer
+from surgisoft.replay.viewer import (
+    LOCAL,
+    free_port,
+    running,
+    wait_for_port,
+    web_address,
+)
+
+LINE_MM = 2.0
+"""Spacing of the drawn centreline's points (mm)."""
+STRETCH = 10.0
+"""Factor by which the drawn residual is magnified."""
+LARGE_MM = 1.0
+"""Residual at which the colour scale of the key points ends (mm)."""
+WINDOW_S = 60.0
+"""Time that the plots show while the run lasts (s)."""
+EVENTS = "/events"
+"""Entity of the text log."""
+LEGEND = "/legend"
+"""Text that explains the colours of the 3D view."""
+LEGEND_TEXT = f"""- **grey**: measured body
+- **yellow**: body that the model predicts
+- **points**: measured key points, blue to red from 0 to {LARGE_MM:g} mm of residual
+- **arrows**: residual (measured less predicted), {STRETCH:g} times as long
+"""
+
+
+@dataclass(frozen=True)
+class LiveBench:
+    """What the view shows of a rig."""
+
+    chambers: int
+    """Number m of chambers."""
+    key_points: int
+    """Number n of key points."""
+    unit: str
+    """Unit of the actuation."""
+    length_mm: float
+    """Length of the arm (mm)."""
+    title: str
+    """What runs on which rig."""
+    tracks: bool
+    """Whether a policy does a task, whose error is shown."""
+
+
+class LiveView:
+    """Logs a run to a Rerun recording, sample by sample."""
+
+    def __init__(self, recording: rr.RecordingStream, bench: LiveBench):
+        self.recording, self.bench = recording, bench
+        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for entity, colour, radius in (
+            ("measured", SHAFT_COLOUR, 0.5),
+            ("predicted", PLAN_COLOUR, 0.3),
+        ):
+            style = rr.LineStrips3D.from_fields(colors=colour, radii=radius)
+            recording.log(f"/body/{entity}", style, static=True)
+        recording.log("/body/points", rr.Points3D.from_fields(radii=1.3), static=True)
+        recording.log("/body/residual", rr.Arrows3D.from_fields(radii=0.3), static=True)
+        chambers, points = range(bench.chambers), range(bench.key_points)
+        colours = [series_colour(i) for i in chambers]
+        names = [f"command {i + 1}" for i in chambers]
+        self._lines("pressure/command", names, [paler(colour) for colour in colours], 1.0)
+        self._lines("pressure/measured", [f"chamber {i + 1}" for i in chambers], colours)
+        colours = [series_colour(i) for i in points]
+        self._lines("residual/key_points", [f"k{i}" for i in points], colours)
+        self._lines("alarm/level", ["alarm level"], [REAL_COLOUR])
+        self._lines("alarm/threshold", ["alarm"], [LIMIT_COLOUR], 1.0)
+        self._lines("tracking/error", ["error"], [PLAN_COLOUR])
+        text = rr.TextDocument(LEGEND_TEXT, media_type="text/markdown")
+        recording.log(LEGEND, text, static=True)
+
+    def sample(
+        self,
+        t_s: float,
+        measured_mm: np.ndarray,
+        predicted_mm: np.ndarray,
+        pressure: np.ndarray,
+        command: np.ndarray,
+        statistic: float,
+    ) -> None:
+        """Show a sample: key points (n, 3) in the base frame, nan where missing; pressures (m,).
+
+        statistic: the detector's largest chart over its threshold, nan where there is none.
+        """
+        log = self.recording.log
+        self.recording.set_time(TIME, duration=t_s)
+        residual = measured_mm - predicted_mm
+        known = np.isfinite(residual).all(axis=1)
+        size = np.linalg.norm(residual, axis=1)
+        log("/body/predicted", rr.LineStrips3D([_curve(predicted_mm)]))
+        if known.sum() > 1:
+            log("/body/measured", rr.LineStrips3D([_curve(measured_mm[known])]))
+        if known.any():
+            colours = error_colours(size[known], LARGE_MM)
+            log("/body/points", rr.Points3D(measured_mm[known], colors=colours))
+            arrows = STRETCH * residual[known]
+            drawn = rr.Arrows3D(origins=measured_mm[known], vectors=arrows, colors=colours)
+            log("/body/residual", drawn)
+        log("/plots/pressure/measured", rr.Scalars(pressure))
+        log("/plots/pressure/command", rr.Scalars(command))
+        log("/plots/residual/key_points", rr.Scalars(size))
+        if not math.isnan(statistic):
+            log("/plots/alarm/level", rr.Scalars(statistic))
+            log("/plots/alarm/threshold", rr.Scalars(1.0))
+
+    def tracking(self, t_s: float, error_mm: float) -> None:
+        """Show the error of the policy's task (mm)."""
+        if not math.isnan(error_mm):
+            self.recording.set_time(TIME, duration=t_s)
+            self.recording.log("/plots/tracking/error", rr.Scalars(error_mm))
+
+    def event(self, t_s: float, text: str, serious: bool = False) -> None:
+        """Show what happened at a time (s)."""
+        self.recording.set_time(TIME, duration=t_s)
+        level = "ERROR" if serious else "INFO"
+        self.recording.log(EVENTS, rr.TextLog(f"{t_s:6.1f} s  {text}", level=level))
+
+    def _lines(self, place: str, names: list[str], colours: list, width: float = 1.6) -> None:
+        style = rr.SeriesLines(names=names, colors=colours, widths=[width] * len(names))
+        self.recording.log(f"/plots/{place}", style, static=True)
+
+
+def _curve(points_mm: np.ndarray) -> np.ndarray:
+    """The drawn line through key points (k, 3) (mm)."""
+    apart = np.linalg.norm(np.diff(points_mm, axis=0), axis=1) > 1e-6
+    kept = points_mm[np.concatenate([[True], apart])]
+    return finer(kept, LINE_MM).astype(np.float32) if len(kept) > 1 else kept.astype(np.float32)
+
+
+def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
+    """The layout: bodies, events and colours beside plots, of the last minute with `follow`."""
+    length = bench.length_mm
+    middle = np.array([0.0, 0.0, 0.5 * length])
+    eye = middle + 1.45 * length * np.array([0.3, -0.85, 0.35])
+    scene = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /body/**"],
+        name=f"{bench.title}: residuals x {STRETCH:g}",
+        background=rrb.Background(BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=True),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
+    )
+    span = None
+    if follow:
+        last = rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S)
+        now = rrb.TimeRangeBoundary.cursor_relative()
+        span = [rrb.VisibleTimeRange(TIME, start=last, end=now)]
+
+    def plot(place: str, title: str, corner: Corner | None) -> rrb.TimeSeriesView:
+        legend = rrb.PlotLegend(corner=corner) if corner else rrb.PlotLegend(visible=False)
+        return rrb.TimeSeriesView(
+            origin=f"/plots/{place}", name=title, plot_legend=legend, time_ranges=span
+        )
+
+    plots = [
+        plot("residual", "Residual of each key point (mm)", "lefttop"),
+        plot("alarm", "Alarm level; 1: the model stopped holding", None),
+        plot("pressure", f"Pressure ({bench.unit}); darker: command", "lefttop"),
+    ]
+    if bench.tracks:
+        plots.append(plot("tracking", "Error of the task (mm)", None))
+    right = rrb.Vertical(*plots, row_shares=[3, 2, 3, 2][: len(plots)])
+    hidden = rrb.encodings.TimelineColumn(TIME, visible=False)
+    shown = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
+    below = rrb.Horizontal(
+        rrb.TextLogView(origin=EVENTS, name="Events", columns=shown),
+        rrb.TextDocumentView(origin=LEGEND, name="Colours"),
+        column_shares=[3, 2],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(scene, below, row_shares=[4, 1]), right, column_shares=[1.1, 1.0]
+        ),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIME, play_state="following" if follow else "paused"
+        ),
+    )
+
+
+@contextlib.contextmanager
+def live_view(
+    bench: LiveBench,
+    *,
+    window: bool = False,
+    web: bool = False,
+    file: Path | None = None,
+    on_address: Callable[[str], None] = print,
+    stay: Callable[[], bool] = lambda: True,
+) -> Iterator[LiveView]:
+    """A view of a run in the native viewer (window), in a browser (web), in an .rrd file.
+
+    The file appears when the block ends without an exception. on_address: called with the address
+    for the browser. stay: asked at the end whether the viewer stays open until it is closed.
+    """
+    if window and web:
+        raise InputError("expected at most one of --show and --web")
+    if file is not None and Path(file).suffix != SUFFIX:
+        raise InputError(f"{file}: suffix '{Path(file).suffix}', expected {SUFFIX}")
+    recording = rr.RecordingStream("surgisoft_run", recording_id=bench.title, send_properties=False)
+    with contextlib.ExitStack() as stack:
+        targets: list = []
+        viewer = None
+        page, data = free_port(), free_port()
+        if window or web:
+            arguments = ["--bind", LOCAL, "--port", str(data)]
+            if web:
+                arguments += ["--serve-web", "--web-viewer-port", str(page)]
+            viewer = stack.enter_context(running(*arguments, quiet=web))
+            for port in (page, data) if web else (data,):
+                wait_for_port(viewer, port)
+            targets.append(rr.GrpcSink(f"rerun+http://{LOCAL}:{data}/proxy"))
+        if file is not None:
+            targets.append(rr.FileSink(stack.enter_context(new_file(file))))
+        recording.set_sinks(
+            *targets, default_blueprint=live_blueprint(bench, follow=viewer is not None)
+        )
+        stack.callback(recording.disconnect)
+        if web:
+            on_address(web_address(page, data))
+        yield LiveView(recording, bench)
+        recording.flush()
+        if viewer is not None and stay():
+            with contextlib.suppress(KeyboardInterrupt):
+                viewer.wait()

@@ -1,0 +1,1 @@
+"""Models of other origin in the place of the network: callables, and files of predictions."""

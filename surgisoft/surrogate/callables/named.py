@@ -1,0 +1,268 @@
+"""Callable models by name: `package.module:object`, `FILE.py:object`, or an entry point.
+
+A callable is code. It is imported only if the user named it, or if an installed package offers it
+in the entry point group `surgisoft.models`. A model folder that holds one states its name and is
+refused until the user has named it, too.
+"""
+
+import hashlib
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from surgisoft.errors import InputError
+
+GROUP = "surgisoft.models"
+"""Entry point group of callable models in installed packages."""
+SHOWN = 160
+"""Most characters of a foreign exception's text in a message."""
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """A callable model and where it comes from."""
+
+    name: str
+    """`package.module:object`, `FILE.py:object`, or the name of an entry point; for an object that
+    was given in Python and that no name leads to: its class."""
+    model: Any
+    """The object: it is called with times (T,) in s and actuation (T, m)."""
+    sha256: str | None = None
+    """Hash of the file's bytes, for `FILE.py:object`."""
+    found: bool = True
+    """Whether the name leads to the object, so that a saved model can be opened again."""
+
+
+NAMED: dict[str, Named] = {}
+"""Callables that the user has named, by name."""
+
+
+def offered() -> dict[str, Any]:
+    """Entry points of callable models in installed packages by name; none is loaded."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def is_callable_name(text: str) -> bool:
+    """Whether a text names a callable: `package.module:object`, `FILE.py:object`, entry point."""
+    if Path(text).exists():
+        return False
+    head, colon, attribute = text.rpartition(":")
+    dotted = all(part.isidentifier() for part in head.split("."))
+    if colon and attribute.replace(".", "").isidentifier() and (dotted or head.endswith(".py")):
+        return True
+    return text in offered()
+
+
+def named_callable(name: str) -> Named:
+    """Import the callable of a name, which runs its code, and remember it as named by the user.
+
+    Raises InputError where it cannot be imported, is not there or is no callable.
+    """
+    if name in NAMED:
+        return NAMED[name]
+    head, colon, attribute = name.rpartition(":")
+    sha256 = None
+    if not colon:
+        entry = offered().get(name)
+        if entry is None:
+            known = ", ".join(sorted(offered())) or "none"
+            raise InputError(
+                f"{name}: no callable model of that name; expected package.module:object, "
+                f"FILE.py:object or an entry point of the group {GROUP} (known: {known})"
+            )
+        value = _guarded(name, entry.load)
+    elif head.endswith(".py"):
+        path = Path(head)
+        if not path.is_file():
+            raise InputError(f"{head}: no such file; name a .py file and an object: FILE.py:object")
+        content = path.read_bytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        value = _attribute(name, _guarded(name, lambda: _run_file(path, content)), attribute)
+    else:
+        here = str(Path.cwd())
+        if here not in sys.path:
+            sys.path.append(here)
+        value = _attribute(name, _guarded(name, lambda: importlib.import_module(head)), attribute)
+    if isinstance(value, type):
+        kind = value
+        value = _guarded(name, lambda: kind())
+    _check(name, value)
+    NAMED[name] = Named(name, value, sha256)
+    return NAMED[name]
+
+
+def given_callable(model: Any) -> Named:
+    """A callable that Python code gives as an object, with the name that leads to it, if any."""
+    kind = model if hasattr(model, "__qualname__") else type(model)
+    _check(kind.__qualname__, model)
+    for named in NAMED.values():
+        if named.model is model:
+            return named
+    module = sys.modules.get(kind.__module__)
+    if module is not None and kind.__module__ != "__main__":
+        for attribute, value in vars(module).items():
+            if value is model:
+                named = Named(f"{kind.__module__}:{attribute}", model)
+                NAMED[named.name] = named
+                return named
+    return Named(f"{kind.__module__}:{kind.__qualname__}", model, None, found=False)
+
+
+def stored_callable(name: str, sha256: str | None, label: str) -> Named:
+    """The callable of a model folder, which the user must have named, or a package offers.
+
+    label: what a message calls the folder.
+    """
+    alike = [
+        named
+        for named in NAMED.values()
+        if named.name == name or (sha256 is not None and named.sha256 == sha256)
+    ]
+    wanted = name.rpartition(":")[2]
+    alike = [named for named in alike if named.name.rpartition(":")[2] == wanted]
+    if not alike and ":" not in name and name in offered():
+        alike = [named_callable(name)]
+    if not alike:
+        raise InputError(
+            f"{label}: its model is code, {name}, which opening a folder does not import; if you "
+            f"trust it, name it: --model-code {name} (in Python: "
+            f"load_model(folder, model_code=['{name}']))"
+        )
+    found = alike[0]
+    if sha256 is not None and found.sha256 != sha256:
+        raise InputError(
+            f"{label}: {found.name} is not the file that the model was made with (sha256 "
+            f"{(found.sha256 or 'unknown')[:12]}, expected {sha256[:12]}); name the same file, or "
+            "amend the model again"
+        )
+    return found
+
+
+def name_callables(names: Iterable[str]) -> None:
+    """Import callables of these names, as `named_callable` imports one."""
+    for name in names:
+        named_callable(str(name))
+
+
+def named_callables() -> list[str]:
+    """Names of the callables that were imported by name: a new process has to do the same."""
+    return list(NAMED)
+
+
+def raised_by(name: str, error: BaseException) -> InputError:
+    """The InputError for an exception in foreign code, with the line that raised it."""
+    where = traceback.extract_tb(error.__traceback__)
+    place = f" in {Path(where[-1].filename).name} line {where[-1].lineno}" if where else ""
+    return InputError(
+        f"{name}: raised {type(error).__name__}{place}: {str(error)[:SHOWN]}; correct the model"
+    )
+
+
+def checked_points(
+    name: str, points: Any, rows: tuple[int, ...], chambers: int, key_points: int | None
+) -> np.ndarray:
+    """Key points (*rows, n, 3) in mm that a callable returned, or InputError.
+
+    rows: leading shape; chambers: m of the actuation that it was given; key_points: n, if known.
+    """
+    try:
+        points = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{name}: returned {type(points).__name__}, expected key points as an array of numbers"
+        ) from None
+    wide = len(rows) + 2
+    fits = points.ndim == wide and points.shape[: len(rows)] == rows and points.shape[-1] == 3
+    fits = fits and points.shape[-2] > 0 and key_points in (None, points.shape[-2])
+    if not fits:
+        expected = (*rows, "n" if key_points is None else key_points, 3)
+        shown = ", ".join(map(str, expected))
+        raise InputError(
+            f"{name}: returned shape {points.shape}, expected ({shown}) for actuation "
+            f"{(*rows, chambers)}: rows, key points base to tip, x y z in mm"
+        )
+    bad = ~np.isfinite(points).reshape(*rows, -1).all(-1)
+    if bad.any():
+        row = np.argwhere(bad)[0].tolist()
+        raise InputError(
+            f"{name}: key points of row {row[-1]} are not finite, {int(bad.sum())} such rows of "
+            f"{bad.size}; correct the model"
+        )
+    return points
+
+
+def stated(named: Named, known: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes of a callable that say what it is a model of.
+
+    known: attribute -> function that checks and converts its value. Raises InputError for a value
+    that it refuses.
+    """
+    found = {}
+    for attribute, convert in known.items():
+        value = getattr(named.model, attribute, None)
+        if value is None:
+            continue
+        try:
+            found[attribute] = convert(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{named.name}: its attribute '{attribute}' is {value!r}: {error}; correct it"
+            ) from error
+    return found
+
+
+def _check(name: str, value: Any) -> None:
+    stepped = all(callable(getattr(value, part, None)) for part in ("initial_state", "step"))
+    if not (callable(value) or stepped):
+        raise InputError(
+            f"{name}: is a {type(value).__name__}, expected a callable (time_s, actuation) -> key "
+            "points, or an object with 'initial_state' and 'step' (docs/your_model.md)"
+        )
+
+
+def _attribute(name: str, module: ModuleType, attribute: str) -> Any:
+    value: Any = module
+    for part in attribute.split("."):
+        if not hasattr(value, part):
+            raise InputError(f"{name}: imported, but there is no '{attribute}'; correct the name")
+        value = getattr(value, part)
+    return value
+
+
+def _run_file(path: Path, content: bytes) -> ModuleType:
+    module_name = f"surgisoft_model_{path.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None:
+        raise ImportError("not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    sys.modules[module_name] = module
+    try:
+        exec(compile(content, str(path), "exec"), module.__dict__)
+    except BaseException:
+        del sys.modules[module_name]
+        raise
+    return module
+
+
+def _guarded(name: str, load: Any) -> Any:
+    try:
+        return load()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"{name}: cannot be imported ({type(error).__name__}: {str(error)[:SHOWN]}); expected "
+            "package.module:object or FILE.py:object, importable from here"
+        ) from error

@@ -1,0 +1,147 @@
+"""Many episodes of any task in one batch, all agents at once: tensors in, tensors out.
+
+For those who bring their own trainer. Nothing is copied to NumPy, and the number of agents and arms
+is that of the task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surgisoft.errors import InputError
+from surgisoft.tasks.base import Episodes, Task, TaskState
+from surgisoft.tasks.registry import make_with
+from surgisoft.tasks.world.random_streams import joined, streams
+
+SPREAD = 7919
+"""A prime: spread starts are this many steps apart, modulo the length of an episode."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchedStep:
+    """Results of a step of B environments; an environment whose episode ended has begun anew."""
+
+    observations: dict[str, Tensor]
+    """agent -> (B, D): of the new episode where one ended."""
+    rewards: dict[str, Tensor]
+    """agent -> (B,): sum of its weighted terms."""
+    terminated: Tensor
+    """(B,) bool: the task ended the episode, or an arm was no longer finite."""
+    truncated: Tensor
+    """(B,) bool: the time was out."""
+    final_observations: dict[str, Tensor]
+    """agent -> (B, D): before the reset, for the value of a truncated episode's last state."""
+    terms: dict[str, dict[str, Tensor]]
+    """agent -> weighted reward term -> (B,)."""
+    measures: dict[str, Tensor]
+    """name -> (B,), see `Task.measures`; nan where one does not apply."""
+
+    @property
+    def done(self) -> Tensor:
+        """(B,) bool: terminated or truncated."""
+        return self.terminated | self.truncated
+
+
+class BatchedEnv:
+    """B environments of a task; a finished one is reset in the same step.
+
+    Actions are changes of the commanded pressures, kPa, clipped to the pumps' largest step.
+    """
+
+    def __init__(self, task: Task, num_envs: int, seed: int = 0, spread: bool = False):
+        """seed: environment i begins with the episode of seed + i, as `parallel_env` of that seed;
+        spread: the first episodes begin at different steps, so that they do not all end at once.
+        """
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}, expected 1 or more")
+        self.task, self.num_envs, self.device = task, num_envs, task.world.device
+        self.agents = tuple(task.agents)
+        self._episodes = Episodes(task, donate=True)
+        self._spread = spread
+        self._state: TaskState | None = None
+        seen = self.reset(seed)
+        self.observation_sizes = {agent: value.shape[1] for agent, value in seen.items()}
+        arms = {agent: task.world.arms[agent] for agent in self.agents}
+        self.action_sizes = {agent: arm.chambers for agent, arm in arms.items()}
+        self.action_limits_kPa = {agent: arm.pneumatics.step_kPa for agent, arm in arms.items()}
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode is truncated."""
+        return self.task.steps
+
+    @property
+    def episode_steps(self) -> Tensor:
+        """(B,) int64: steps since each episode began."""
+        return self._now.world.steps
+
+    @torch.inference_mode()
+    def reset(self, seed: int = 0) -> dict[str, Tensor]:
+        """Begin all episodes; environment i has seed + i. Returns observations, agent -> (B, D)."""
+        each = [streams(seed + i, 1, 0, self.device) for i in range(self.num_envs)]
+        state = self._episodes.start(joined(each))
+        if self._spread:
+            steps = torch.arange(self.num_envs, device=self.device) * SPREAD % self.task.steps
+            state = replace(state, world=replace(state.world, steps=steps))
+        self._state = state
+        return self._episodes.observe(state)
+
+    @torch.inference_mode()
+    def step(self, actions: Mapping[str, Tensor]) -> BatchedStep:
+        """Advance all environments; actions: agent -> (B, m) kPa."""
+        held = {}
+        for agent in self.agents:
+            if agent not in actions:
+                raise InputError(f"no action for {agent}: expected {', '.join(self.agents)}")
+            expected = (self.num_envs, self.action_sizes[agent])
+            if tuple(actions[agent].shape) != expected:
+                raise InputError(
+                    f"action of '{agent}' has shape {tuple(actions[agent].shape)}, "
+                    f"expected {expected}"
+                )
+            held[agent] = actions[agent].to(self.device, torch.float32)
+        state, outcome = self._episodes.step(self._now, held)
+        final = self._episodes.observe(state)
+        self._state = self._episodes.reset(state, outcome.done)
+        ended = bool(outcome.done.any())
+        return BatchedStep(
+            observations=self._episodes.observe(self._state) if ended else final,
+            rewards=outcome.rewards,
+            terminated=outcome.terminated,
+            truncated=outcome.truncated,
+            final_observations=final,
+            terms=outcome.terms,
+            measures=outcome.measures,
+        )
+
+    @property
+    def _now(self) -> TaskState:
+        assert self._state is not None, "the constructor resets"
+        return self._state
+
+
+def batched_env(
+    task: str | Task,
+    num_envs: int,
+    seed: int = 0,
+    config: Any = None,
+    device: str | torch.device = "cpu",
+    scene: str | Path | None = None,
+    arm: str | Path | None = None,
+    geometry: str | None = None,
+    spread: bool = False,
+) -> BatchedEnv:
+    """Many episodes of a task in one batch, tensors in and out, for any number of agents.
+
+    task: name of the task, or a task; the other arguments are those of `parallel_env` and of
+    `BatchedEnv`.
+    """
+    if isinstance(task, str):
+        task = make_with(task, config, device, scene, arm, geometry)
+    return BatchedEnv(task, num_envs, seed, spread)

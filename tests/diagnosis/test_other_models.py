@@ -1,0 +1,204 @@
+"""Callables and files of predictions in a diagnosis: they agree with the arm behind them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.other_models import (
+    callable_arm,
+    notes_of,
+    open_model,
+    predicted_arm,
+)
+from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.diagnosis.setup import find_setup_faults
+from surgisoft.diagnosis.testability import testable as split_by_testability
+from surgisoft.errors import InputError
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings import Recording, with_predictions
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.callables.named import given_callable
+from surgisoft.surrogate.checkpoint import default_arm
+from surgisoft.surrogate.effects import make_effect
+from surgisoft.surrogate.history import pack
+
+ARM = default_arm()
+
+
+def whole_runs(time_s, actuation):
+    """The default arm as a callable of whole runs."""
+    run = [torch.tensor(x) for x in (time_s, actuation, np.zeros((len(time_s), 5, 3)))]
+    with torch.no_grad():
+        return ARM.predict(pack(*([x] for x in run)))[0].double().numpy()
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    """Two minutes on a rig with a payload that the default arm does not know."""
+    rig = VirtualRig(0, take=7, hidden=(("payload", 1.0),))
+    return rig.record(make_protocol("mixed", rig.limits, 800, seed=2))[0]
+
+
+@pytest.fixture(scope="module")
+def with_file(loaded):
+    """The recording with what the default arm predicts, as a file beside it gives it."""
+    history = history_of([loaded])
+    with torch.no_grad():
+        points = history.rows(ARM.predict(history)).double().numpy()
+    return replace(loaded, predicted_mm=points)
+
+
+def by_file(recording: Recording):
+    """The default arm, given by predictions alone, with the range and error that it states."""
+    model = predicted_arm("arm", [recording])
+    return model.replace(spec=ARM.spec, validation=ARM.validation).eval()
+
+
+def table_of(path, points, **columns):
+    names = [*columns, *(f"k{k}_{axis}_mm" for k in range(points.shape[1]) for axis in "xyz")]
+    rows = np.column_stack([*columns.values(), points.reshape(len(points), -1)])
+    np.savetxt(path, rows, delimiter=",", header=",".join(names), comments="")
+    return path
+
+
+def test_the_residuals_are_those_of_the_arm(loaded, with_file):
+    truth = residual_table(ARM, [loaded])
+    called = callable_arm(given_callable(whole_runs), [loaded])
+    for model, recording in ((called, loaded), (by_file(with_file), with_file)):
+        found = residual_table(model, [recording])
+        np.testing.assert_allclose(found.residual_mm, truth.residual_mm, atol=1e-4)
+        assert np.nanmax(np.abs(found.residual_mm)) > 1
+
+
+def test_sensitivities_from_predictions_are_those_of_the_arm(loaded, with_file):
+    """By correlation over all rows and key points; the arm's own come from its network."""
+    effects = ["payload", "creep", "line_lag", "rate_dependence"]
+    truth = candidates(residual_table(ARM, [loaded]).training(), effects)
+    called = callable_arm(given_callable(whole_runs), [loaded]).replace(spec=ARM.spec).eval()
+    for model, recording in ((by_file(with_file), with_file), (called, loaded)):
+        found = candidates(residual_table(model, [recording]).training(), effects)
+        for a, b in zip(truth, found, strict=True):
+            x, y = a.sensitivities.ravel(), b.sensitivities.ravel()
+            assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.9
+            assert np.sqrt((y @ y) / (x @ x)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_effect_in_front_of_predictions_moves_them_as_in_front_of_the_arm(loaded, with_file):
+    """A fifth more pressure in the chamber that moved most: the whole change, not its slope."""
+    most = int(np.ptp(loaded.measured, axis=0).argmax())
+    changes = []
+    for model, recording in ((ARM, loaded), (by_file(with_file), with_file)):
+        gain = make_effect("gain_mismatch", ARM.facts)
+        gain.gain.data[most] = 0.2
+        history = history_of([recording])
+        after = model.replace(effects={**model.effects, "gain_mismatch": gain})
+        with torch.no_grad():
+            change = after.predict(history) - model.predict(history)
+        changes.append(history.rows(change).flatten().double().numpy())
+    x, y = changes
+    assert np.abs(x).max() > 2
+    assert x @ y / np.sqrt((x @ x) * (y @ y)) > 0.97
+    assert np.sqrt((y @ y) / (x @ x)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_diagnosis_is_that_of_the_arm(loaded, with_file):
+    """The same effect comes first, and the same error is left, as from the arm without the
+    residuals of its fit, which no model of other origin has."""
+    bare = default_arm()
+    bare.training_residuals = None
+    truth = diagnose(bare, loaded, setup_tests=False)
+    found = diagnose(by_file(with_file), with_file)
+    assert found.setup is None
+    assert found.ranking[0].effect == truth.ranking[0].effect == "payload"
+    assert found.ranking[0].confidence > 0.4
+    assert found.error_mm.before == pytest.approx(truth.error_mm.before, abs=1e-4)
+    assert found.error_mm.ceiling == pytest.approx(truth.error_mm.ceiling, rel=0.15)
+
+
+def test_amend_puts_an_effect_behind_a_callable(loaded):
+    model = callable_arm(given_callable(whole_runs), [loaded], error_mm=0.1)
+    truth = amend(ARM, loaded, "payload", retune_network=False, refit="never")
+    found = amend(model, loaded, "payload", refit="never")
+    assert found.claimed
+    assert found.held_out.after == pytest.approx(truth.held_out.after, rel=0.15)
+    assert found.model.network.named.model is whole_runs
+    values = {each.name: each.value for each in truth.parameters}
+    for each in found.parameters:
+        assert each.value == pytest.approx(values[each.name], abs=0.3)
+    with pytest.raises(InputError, match="no network that could be trained"):
+        amend(model, loaded, "creep", refit="always")
+
+
+def test_predictions_that_are_no_function_of_the_actuation_are_not_judged(loaded):
+    """A model that wanders by itself: its slope with the actuation is unknown, and that is said."""
+    rng = np.random.default_rng(0)
+    wander = np.cumsum(rng.normal(size=(loaded.samples, 1, 3)), axis=0)
+    lost = replace(loaded, predicted_mm=np.nanmean(loaded.key_points_mm, 0) + wander)
+    model = predicted_arm("wander", [lost], error_mm=1.0)
+    problem = residual_table(model, [lost]).training()
+    names = ["creep", "payload", "gain_mismatch", "misalignment"]
+    kept, left_out = split_by_testability(problem, candidates(problem, names), names)
+    assert {each.effect for each in left_out if each.cause == "no_slope"} == {
+        "creep",
+        "gain_mismatch",
+    }
+    assert "payload" in {each.name for each in kept}
+    assert any("cannot be judged" in note for note in notes_of(model))
+    assert find_setup_faults(model, [lost]) is None
+
+
+def test_the_validated_error_comes_from_before(loaded):
+    """An error of known size on the recording before: 2 mm along x at every key point."""
+    truth = np.nan_to_num(loaded.key_points_mm)
+    before = replace(loaded, name="before", noise_mm=0.0)
+
+    def off(time_s, actuation):
+        """The measured key points of the times, 2 mm further along x."""
+        return truth[np.searchsorted(loaded.t_s, time_s - 1e-6)] + [2.0, 0.0, 0.0]
+
+    model = callable_arm(given_callable(off), [loaded], [before])
+    assert model.validation.per_key_point_mm == pytest.approx((2.0,) * 5, abs=1e-4)
+    assert callable_arm(given_callable(off), [loaded]).validation.rmse_mm is None
+    stated = callable_arm(given_callable(off), [loaded], [before], error_mm=0.5)
+    assert stated.validation.per_key_point_mm == (0.5,) * 5
+
+
+def test_rows_are_matched_by_their_times(loaded, with_file, tmp_path):
+    points, time = with_file.predicted_mm, loaded.t_s
+    more = np.concatenate([time[:1] - 0.05, time, time[-1:] + 0.05])
+    padded = np.concatenate([points[:1], points, points[-1:]])
+    for file in (
+        table_of(tmp_path / "plain.csv", points),
+        table_of(tmp_path / "timed.csv", points, t_s=time),
+        table_of(tmp_path / "more.csv", padded, t_s=more),
+    ):
+        found = with_predictions([loaded], [file])[0]
+        np.testing.assert_allclose(found.predicted_mm, points, atol=1e-9)
+    metres = table_of(tmp_path / "metres.csv", points / 1e3)
+    metres.write_text(metres.read_text().replace("_mm", "_m"))
+    np.testing.assert_allclose(with_predictions([loaded], [metres])[0].predicted_mm, points)
+
+
+def test_files_that_do_not_fit_are_one_line(loaded, with_file, tmp_path):
+    points, time = with_file.predicted_mm, loaded.t_s
+    bad = points.copy()
+    bad[7, 2, 0] = np.nan
+    cases = {
+        "799 rows": table_of(tmp_path / "short.csv", points[1:]),
+        "4 key points, expected 5": table_of(tmp_path / "few.csv", points[:, 1:]),
+        "no row for run 0, 0 s": table_of(tmp_path / "late.csv", points, t_s=time + 0.3),
+        "missing or not finite, in 1 of 800": table_of(tmp_path / "holes.csv", bad),
+        "no column 'k0_x_mm'": table_of(tmp_path / "none.csv", points[:, :0], t_s=time),
+    }
+    for said, file in cases.items():
+        with pytest.raises(InputError, match=said) as refused:
+            with_predictions([loaded], [file])
+        assert str(file) in str(refused.value)
+    with pytest.raises(InputError, match="1 files of predictions for 2 recordings"):
+        open_model("arm", [loaded, replace(loaded, name="b")], None, [tmp_path / "few.csv"])

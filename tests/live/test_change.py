@@ -1,0 +1,151 @@
+"""The change detector: its rate of false alarms, its delay, and what it may not be misled by."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from surgisoft.errors import InputError
+from surgisoft.live.change import AlarmDesign, Charts, Stretch, block_means
+from surgisoft.live.change import fit_detector as fit
+
+RATE_HZ = 20.0
+N = 3
+"""Key points of the made-up arm."""
+SPAN = np.array([50.0, 60.0])
+"""Range of its two chambers, kPa."""
+
+
+def waves(t_s):
+    """Actuation (T, 2) along which the arm moves, kPa."""
+    return 25.0 + 10.0 * np.stack([np.sin(t_s), np.cos(t_s)], axis=1)
+
+
+def fit_detector(reference, design=None):
+    """The detector of runs (t_s, residual) along the waves."""
+    return fit([Stretch(t_s, values, waves(t_s)) for t_s, values in reference], SPAN, design)
+
+
+def residual(seconds, seed, sd_mm=0.1, correlation_s=3.0, noise_mm=0.03):
+    """t_s and a residual (T, N, 3): an error with a correlation time, and camera noise."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds * RATE_HZ)
+    keep = np.exp(-1.0 / (RATE_HZ * correlation_s))
+    steps = sd_mm * np.sqrt(1 - keep**2) * rng.normal(size=(count, N, 3))
+    steps[0] = sd_mm * rng.normal(size=(N, 3))
+    slow = lfilter([1.0], [1.0, -keep], steps, axis=0)
+    return np.arange(count) / RATE_HZ, slow + noise_mm * rng.normal(size=slow.shape)
+
+
+def fed(detector, t_s, values):
+    charts = Charts(detector)
+    levels = []
+    for at_s, value in zip(t_s, values, strict=True):
+        charts.update(at_s, value, waves(np.array([at_s]))[0])
+        levels.append(charts.statistic)
+    return charts, np.array(levels)
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return fit_detector([residual(600, 1)])
+
+
+def test_the_threshold_follows_from_the_wanted_rate(detector):
+    """Lorden (1971): exp(h) blocks of each of two charts for each of nine components."""
+    assert detector.threshold == pytest.approx(np.log(10 * 3600 / 0.5 * 2 * 9))
+    other = fit_detector([residual(600, 1)], AlarmDesign(false_alarm_h=1.0))
+    assert detector.threshold - other.threshold == pytest.approx(np.log(10.0))
+
+
+def test_statistics_of_the_reference_are_found(detector):
+    """Block means of 0.5 s of an error with standard deviation 0.1 mm and 3 s of memory."""
+    blocks = block_means(*residual(3000, 2), 0.5)
+    truth = np.cov(blocks.T).diagonal().mean() ** 0.5
+    estimate = np.sqrt((detector.whitening.level_mm**2).mean())
+    assert truth < estimate < 1.5 * truth, "an upper bound, and not a loose one"
+    assert np.exp(-0.5 / 3.0) == pytest.approx(detector.whitening.phi.mean(), abs=0.1)
+
+
+def test_false_alarms_come_at_most_as_often_as_designed():
+    """Ninety minutes of clean error, designed for one false alarm in three minutes."""
+    design = AlarmDesign(false_alarm_h=0.05)
+    found = fit_detector([residual(300, 3)], design)
+    charts, _ = fed(found, *residual(5400, 4))
+    assert len(charts.alarms) <= 30
+
+
+@pytest.mark.parametrize(("shift_mm", "within_s"), [(1.0, 3.0), (0.5, 15.0)])
+def test_a_shift_is_found_in_seconds(detector, shift_mm, within_s):
+    t_s, values = residual(240, 5)
+    values[t_s >= 120.0, -1] += shift_mm / np.sqrt(3.0)
+    charts, _ = fed(detector, t_s, values)
+    alarm = charts.alarms[0]
+    assert 120.0 < alarm.at_s <= 120.0 + within_s
+    assert alarm.since_s == pytest.approx(120.0, abs=within_s)
+    assert alarm.before_mm == pytest.approx(np.sqrt(3 * (0.1**2 + 0.03**2)), rel=0.15)
+    assert alarm.after_mm > 1.3 * alarm.before_mm
+
+
+def test_a_glitch_and_a_lost_marker_raise_no_alarm(detector):
+    t_s, values = residual(120, 6)
+    values[1000, -1] += 5.0
+    values[1400:1440, 0] = np.nan
+    charts, levels = fed(detector, t_s, values)
+    assert not charts.alarms
+    assert levels[1020] > 0.3, "the glitch is seen"
+
+
+def test_the_alarm_ends_after_the_change_is_gone(detector):
+    t_s, values = residual(300, 7)
+    values[(t_s >= 60) & (t_s < 90), -1] += 1.0
+    values[t_s >= 250, -1] += 1.0
+    charts, levels = fed(detector, t_s, values)
+    assert len(charts.alarms) == 2
+    assert charts.alarms[1].at_s > 250.0
+    assert levels[t_s < 240][-1] < 1.0
+
+
+def test_sample_by_sample_is_the_cusum_of_the_block_means(detector):
+    """The charts of Page (1954), written out."""
+    t_s, values = residual(60, 8)
+    _, levels = fed(detector, t_s, values)
+    blocks = block_means(t_s, values, 0.5)
+    w, design, h = detector.whitening, detector.design, detector.threshold
+    y = (blocks - w.mean_mm) @ w.axes
+    charts, expected = np.zeros(18), []
+    for now, before in zip(y[1:], y[:-1], strict=True):
+        level = (now / w.level_mm / detector.enlargement) ** 2
+        fast = ((now - w.phi * before) / w.innovation_mm / detector.enlargement) ** 2
+        ratio = 0.5 * np.concatenate([level, fast]) * (1 - design.scale**-2) - np.log(design.scale)
+        ratio[:9] *= (1 - w.phi**2) / (1 + w.phi**2)
+        charts = np.maximum(0.0, charts + np.minimum(ratio, h / 4))
+        expected.append(charts.max() / h)
+    np.testing.assert_allclose(levels[20::10][: len(expected)], expected[: len(levels[20::10])])
+
+
+def test_heavy_tails_of_the_reference_enlarge_the_scale():
+    t_s, values = residual(600, 9)
+    jerky = values.copy()
+    for begin in range(200, len(t_s), 1500):
+        jerky[begin : begin + 100] *= 8.0
+    assert fit_detector([(t_s, jerky)]).enlargement > fit_detector([(t_s, values)]).enlargement
+
+
+def test_a_short_reference_is_refused():
+    with pytest.raises(InputError, match=r"has 19\.5 s, expected at least 30 s"):
+        fit_detector([residual(20, 1)])
+
+
+def test_motion_that_the_reference_lacks_is_not_judged(detector):
+    """An error outside the reference's range of actuation says nothing about a change."""
+    t_s, values = residual(120, 10)
+    away = (t_s >= 40.0) & (t_s < 80.0)
+    values[away, -1] += 1.0
+    actuation = waves(t_s)
+    actuation[away] += 0.7 * SPAN
+    for here, alarms in ((actuation, 0), (waves(t_s), 1)):
+        charts = Charts(detector)
+        for each in zip(t_s, values, here, strict=True):
+            charts.update(*each)
+        assert len(charts.alarms) == alarms
+        assert charts.left_out in ((80, 81) if alarms == 0 else (0,))

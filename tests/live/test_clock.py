@@ -1,0 +1,65 @@
+"""The clock of a loop, with a made-up time."""
+
+import pytest
+
+from surgisoft.live.clock import Clock
+
+
+class Time:
+    """A time that passes only where somebody works or sleeps."""
+
+    def __init__(self):
+        self.s = 100.0
+
+    def now(self):
+        self.s += 1e-6
+        return self.s
+
+    def sleep(self, seconds):
+        self.s += seconds
+
+
+def loop(pace, work_s, period_s=0.05):
+    time = Time()
+    clock = Clock(period_s, pace, time.now, time.sleep)
+    clock.tick()
+    ticks = [time.s]
+    for each in work_s:
+        time.s += each
+        clock.tick()
+        ticks.append(time.s)
+    return clock.timing(), ticks
+
+
+def test_the_period_is_kept_whatever_the_work_takes():
+    timing, ticks = loop("real", [0.01, 0.03, 0.049, 0.0] * 50)
+    assert ticks[-1] - ticks[0] == pytest.approx(200 * 0.05, abs=1e-4)
+    assert timing.overruns == 0
+    assert timing.jitter_s < 1e-5
+    assert timing.busy_s == pytest.approx(0.02225, abs=1e-4)
+    assert timing.busy_worst_s == pytest.approx(0.049, abs=1e-4)
+
+
+def test_an_overrun_is_counted_and_made_up_for():
+    timing, ticks = loop("real", [0.01, 0.07, 0.01, 0.01])
+    assert timing.overruns == 1
+    assert ticks[-1] - ticks[0] == pytest.approx(0.2, abs=1e-4)
+    assert timing.interval_worst_s == pytest.approx(0.02, abs=1e-3)
+
+
+def test_after_a_long_break_the_grid_begins_anew():
+    timing, ticks = loop("real", [1.0, 0.01, 0.01])
+    assert timing.overruns <= 2
+    assert ticks[-1] - ticks[1] == pytest.approx(0.05, abs=1e-3)
+
+
+def test_a_simulated_clock_never_waits_and_measures_the_work():
+    timing, ticks = loop("simulated", [0.001] * 100)
+    assert ticks[-1] - ticks[0] == pytest.approx(0.1, abs=1e-3)
+    assert timing.ticks == 100
+    assert "simulated clock" in timing.sentence
+
+
+def test_a_late_sample_of_a_rig_is_an_overrun():
+    timing, _ = loop("rig", [0.05, 0.05, 0.11, 0.05])
+    assert timing.overruns == 1

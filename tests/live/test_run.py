@@ -1,0 +1,294 @@
+"""Runs on the virtual rig and on one that knows no truth: what is recorded, found, and vented."""
+
+import json
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+import surgisoft
+from surgisoft.cli import run as command
+from surgisoft.errors import InputError
+from surgisoft.live.session import LEAD_IN_S, run
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.recordings import load_recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model
+from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.track import TrackConfig
+from tests.replay.reading import column
+
+SIMULATED = {"clock": "simulated", "on_warning": pytest.fail}
+
+
+class Kept(VirtualRig):
+    """A virtual rig that keeps its last command and whether it was closed."""
+
+    last = None
+
+    def command(self, pressures):
+        super().command(pressures)
+        self.last = np.array(pressures)
+
+
+class Real:
+    """The virtual rig without its truth, as a real rig is."""
+
+    def __init__(self, seed=0, fails_at=None, error=None):
+        self._rig = Kept(seed)
+        self.fails_at, self.error, self.reads, self.closed = fails_at, error, 0, False
+
+    def __getattr__(self, name):
+        if name in ("read_beside_truth", "vent", "record"):
+            raise AttributeError(name)
+        return getattr(self._rig, name)
+
+    def read(self):
+        self.reads += 1
+        if self.reads == self.fails_at:
+            raise self.error
+        return self._rig.read()
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture(scope="module")
+def schedule(tmp_path_factory):
+    """Sinusoids of three chambers, 70 s long."""
+    path = tmp_path_factory.mktemp("schedule") / "waves.csv"
+    t_s = np.arange(0.0, 70.5, 0.5)
+    waves = 20 + 15 * np.sin(2 * np.pi * t_s[:, None] / 12 + np.arange(3) * 2.1)
+    waves *= np.minimum(1.0, t_s / 5.0)[:, None]
+    rows = [f"{t},{a},{b},{c}" for t, (a, b, c) in zip(t_s, waves, strict=True)]
+    path.write_text("\n".join(["t_s,c1_kPa,c2_kPa,c3_kPa", *rows]) + "\n")
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def changed(schedule, tmp_path_factory):
+    """A run with a payload from 50 s on: result and the lines that it reported."""
+    lines = []
+    folder = tmp_path_factory.mktemp("changed")
+    found = run(
+        schedule,
+        "virtual:hidden=payload@50",
+        reference_s=35.0,
+        output=folder / "run.parquet",
+        replay=folder / "run.rrd",
+        on_event=lines.append,
+        **SIMULATED,
+    )
+    return found, lines
+
+
+def test_a_run_records_what_collect_records(schedule, changed):
+    """The same protocol on the same rig, and the model's prediction of the whole recording."""
+    found, _ = changed
+    other = surgisoft.collect(schedule, VirtualRig(0, hidden=[("payload", 1.0, 50.0)]))
+    saved = load_recording(found.written[0])
+    for recording in (found.recording, saved):
+        np.testing.assert_array_equal(recording.key_points_mm, other.key_points_mm)
+        np.testing.assert_array_equal(recording.measured, other.measured)
+        np.testing.assert_array_equal(recording.commanded, other.commanded)
+    history = history_of([saved])
+    with torch.inference_mode():
+        whole = history.rows(load_model("default").predict(history)).numpy()
+    np.testing.assert_allclose(found.predicted_mm, whole, atol=1e-4)
+    assert not found.written[0].with_name("run.log.jsonl").exists()
+
+
+def test_the_payload_is_found_in_seconds(changed):
+    found, lines = changed
+    (alarm,) = found.alarms
+    assert 50.0 < alarm.at_s < 60.0
+    assert alarm.since_s == pytest.approx(50.0, abs=6.0)
+    assert found.rms_mm(end_s=50.0) < 0.15 < 0.3 < found.rms_mm(begin_s=50.0)
+    assert lines[-1] == alarm.sentence
+    assert "reference: 34 s" in lines[0]
+    assert np.isnan(found.statistic[found.recording.t_s < 34.0]).all()
+    assert np.nanmax(found.statistic[found.recording.t_s < 49.5]) < 1.0
+
+
+def test_what_came_after_the_change_is_a_recording_of_its_own(changed):
+    found, _ = changed
+    after = load_recording(found.written[1], on_warning=lambda text: None)
+    begin_s = found.alarms[0].since_s
+    seen = np.isfinite(after.key_points_mm).any((1, 2))
+    assert after.t_s[seen].min() == pytest.approx(begin_s, abs=0.06)
+    assert after.t_s[0] == pytest.approx(max(0.0, begin_s - LEAD_IN_S), abs=0.06)
+    rows = found.recording.t_s >= begin_s
+    np.testing.assert_array_equal(after.key_points_mm[seen], found.recording.key_points_mm[rows])
+
+
+def test_the_view_holds_every_sample(changed, tmp_path):
+    found, _ = changed
+    file = found.written[0].with_suffix(".rrd")
+    drawn = column(file, "/plots/pressure/measured", "Scalars:scalars", "time")
+    values = [value for place, value in sorted(drawn.items()) if place >= 0]
+    np.testing.assert_allclose(values, found.recording.measured)
+    level = column(file, "/plots/alarm/level", "Scalars:scalars", "time")
+    assert len(level) == np.isfinite(found.statistic).sum()
+    texts = column(file, "/events", "TextLog:text", "time").values()
+    assert any(found.alarms[0].sentence in text[0] for text in texts)
+
+
+def test_a_recording_of_the_morning_is_the_reference(schedule):
+    morning = surgisoft.collect(schedule, VirtualRig(0, take=5))
+    found = run(
+        schedule, "virtual:hidden=payload@20", before=morning, stop_on_alarm=True, **SIMULATED
+    )
+    assert found.detector.reference_s == pytest.approx(69.5)
+    assert 20.0 < found.alarms[0].at_s < 30.0
+    assert found.recording.t_s[-1] == pytest.approx(found.alarms[0].at_s, abs=0.11)
+    clean = run(schedule, "virtual:noise_seed=6", before=morning, minutes=0.5, **SIMULATED)
+    assert not clean.alarms
+
+
+def test_a_policy_goes_on_to_new_goals(tmp_path):
+    short = TrackConfig(FollowConfig(loop_s=5.0, approach_s=2.0, size_mm=5.0))
+    fields = {"task": "track_circle", "config": short, "rate_hz": 10.0}
+    found = run("scripted", minutes=0.3, **fields, **SIMULATED)
+    assert found.recording.t_s[-1] == pytest.approx(18.0, abs=0.11)
+    assert found.recording.run.max() == 0, "the rig is not reset between goals"
+    t_s, error = found.tracking.T
+    assert np.isnan(error[(t_s > 11.2) & (t_s < 12.8)]).all(), "the second goal's approach"
+    assert np.nanmean(error[t_s > 13.2]) < 0.12
+    assert found.detector is None
+
+
+def test_the_rate_of_the_loop_may_differ_from_that_of_the_samples(schedule):
+    found = run(schedule, rate_hz=50.0, minutes=0.05, **SIMULATED)
+    assert np.diff(found.recording.t_s) == pytest.approx(0.02)
+    assert found.timing.period_s == pytest.approx(0.02)
+    slow = run("random", task="track_circle", rate_hz=10.0, minutes=0.12, **SIMULATED)
+    moves = np.diff(slow.recording.commanded, axis=0).any(axis=1)
+    assert not moves[82:-1:2].any() or not moves[83:-1:2].any(), "one command in two samples"
+
+
+def test_a_run_that_is_stopped_is_complete_and_vented(schedule, tmp_path):
+    rig, count = Kept(0), iter(range(10**6))
+    output = tmp_path / "stopped.parquet"
+    found = run(schedule, rig, output=output, stopped=lambda: next(count) > 100, **SIMULATED)
+    assert found.interrupted
+    assert 90 < load_recording(output).samples <= 102
+    np.testing.assert_array_equal(rig.last, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("error", "ended"), [(KeyboardInterrupt(), True), (InputError("the cable is cut"), False)]
+)
+def test_a_real_rig_is_vented_and_its_samples_are_kept(schedule, tmp_path, error, ended):
+    rig, output = Real(0, 200, error), tmp_path / "real.parquet"
+    warnings = []
+    if ended:
+        found = run(schedule, rig, output=output, on_warning=warnings.append)
+        assert found.ended_by is error
+        assert found.timing.pace == "rig"
+    else:
+        with pytest.raises(InputError, match="the cable is cut"):
+            run(schedule, rig, output=output, on_warning=warnings.append)
+        assert "199 samples" in warnings[0]
+    assert load_recording(output).samples in (198, 199)
+    np.testing.assert_array_equal(rig.last, 0.0)
+    assert rig.closed
+
+
+def test_the_log_of_a_run_that_never_ends_is_a_recording(schedule, tmp_path):
+    """What a power cut leaves: the growing file."""
+    output, seen = tmp_path / "cut.parquet", []
+
+    def cut():
+        file = tmp_path / "cut.log.jsonl"
+        if file.exists() and not seen and file.stat().st_size > 40_000:
+            seen.append(load_recording(file, on_warning=pytest.fail))
+        return bool(seen)
+
+    found = run(schedule, output=output, stopped=cut, **SIMULATED)
+    rows = seen[0].samples
+    assert rows > 50
+    np.testing.assert_array_equal(seen[0].key_points_mm, found.recording.key_points_mm[:rows])
+
+
+def test_the_log_of_an_interrupted_run_is_not_overwritten(schedule, tmp_path):
+    left = tmp_path / "run.log.jsonl"
+    left.write_text("what is left of an earlier run")
+    with pytest.raises(InputError, match="the log of an interrupted recording is there"):
+        run(schedule, output=tmp_path / "run.parquet", **SIMULATED)
+    assert left.read_text() == "what is left of an earlier run"
+
+
+def test_the_model_of_another_arm_is_refused(schedule, tmp_path):
+    with pytest.raises(InputError, match="it is the model of another arm"):
+        run(schedule, "virtual:seed=2", clock="simulated", on_warning=lambda text: None)
+    found = run(schedule, "virtual:seed=2", any_model=True, minutes=0.25, **SIMULATED)
+    assert found.rms_mm() > 1.0
+
+
+BAD = {
+    "rate": (["scripted", "--task", "track_circle", "--rate", "5"], "expected 10 to 50 Hz"),
+    "samples": (["mixed", "--rate", "15"], "expected a whole number of samples"),
+    "policy": (["nobody"], "unknown policy 'nobody'"),
+    "folder": (["runs/absent"], "runs/absent: no such"),
+    "task": (["scripted"], "--task is missing"),
+    "arms": (["scripted", "--task", "circle_ablation"], "expected a task of one arm"),
+    "kind": (["grid"], "expected a continuous one"),
+    "model": (["mixed", "--model", "absent"], "no arm model there"),
+    "minutes": (["mixed", "--minutes", "0"], "minutes is 0"),
+    "clean": (["mixed", "--clean", "3"], "expected at least 32 s"),
+    "rig": (["mixed", "--rig", "nowhere"], "unknown rig 'nowhere'"),
+    "before": (["mixed", "--before", "absent.parquet"], "no such file"),
+    "window": (["mixed", "--show", "--web"], "at most one"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line_and_nothing_is_written(
+    arguments, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert command(["run", *arguments, "-o", "run.parquet"]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rig_with_other_chambers_is_refused(schedule, tmp_path):
+    class Two(VirtualRig):
+        def __init__(self):
+            super().__init__(0)
+            self.chambers = 2
+
+    with pytest.raises(InputError, match="chambers: 2, but the model has 3"):
+        run(schedule, Two(), output=tmp_path / "two.parquet", **SIMULATED)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_and_function_give_the_same(schedule, changed, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given = ["--rig", "virtual:hidden=payload@50", "--clock", "simulated", "--clean", "35"]
+    assert command(["run", schedule, *given, "-o", "run.parquet", "--json", "run.json"]) == 0
+    found, lines = changed
+    printed = capsys.readouterr().out
+    assert all(line in printed for line in lines)
+    assert "next: surgisoft diagnose default run-after.parquet" in printed
+    numbers, expected = json.loads((tmp_path / "run.json").read_text()), found.to_json()
+    for name in ("alarms", "error_mm", "reference_mm", "threshold", "seconds"):
+        assert numbers[name] == json.loads(json.dumps(expected[name])), name
+
+
+def test_ctrl_c_leaves_a_complete_recording(schedule, tmp_path, capsys):
+    output = tmp_path / "run.parquet"
+    ends = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT))
+    ends.start()
+    assert command(["run", schedule, "-o", str(output)]) == 130
+    ends.join()
+    assert load_recording(output).samples > 5
+    shown = capsys.readouterr()
+    assert f"wrote {output}" in shown.out
+    assert "interrupted" in shown.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.parquet", "run.toml"]

@@ -1,0 +1,46 @@
+"""Units and their conversion, against values of NIST SP 811 (2008), appendix B.8, and of the SI."""
+
+import pytest
+
+from surgisoft.measurement.importing.units import SECONDS_PER, factor
+from surgisoft.measurement.recordings.columns import MM_PER
+
+VALUES = [
+    ("in", "mm", 25.4),
+    ("in", "m", 0.0254),
+    ("m", "cm", 100.0),
+    ("mbar", "Pa", 100.0),
+    ("mbar", "kPa", 0.1),
+    ("hPa", "mbar", 1.0),
+    ("bar", "kPa", 100.0),
+    ("psi", "Pa", 6894.757),
+    ("atm", "Pa", 101325.0),
+    ("mmHg", "Pa", 133.3224),
+    ("MPa", "bar", 10.0),
+    ("rev", "rad", 6.283185307),
+    ("rad", "deg", 57.29577951),
+    ("kN", "mN", 1e6),
+    ("V", "mV", 1000.0),
+]
+
+
+@pytest.mark.parametrize(("unit", "to", "value"), VALUES)
+def test_conversions_are_those_of_nist(unit, to, value):
+    assert factor(unit, to) == pytest.approx(value, rel=1e-6)
+    assert factor(to, unit) == pytest.approx(1.0 / value, rel=1e-6)
+
+
+def test_quantities_do_not_mix():
+    assert factor("psi", "mm") is None
+    assert factor("kPa", "deg") is None
+
+
+def test_lengths_and_times():
+    assert MM_PER == {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+    assert {unit: SECONDS_PER[unit] for unit in ("ms", "us", "ns", "min", "h")} == {
+        "ms": 1e-3,
+        "us": 1e-6,
+        "ns": 1e-9,
+        "min": 60.0,
+        "h": 3600.0,
+    }

@@ -1,0 +1,74 @@
+"""The rows of a fit are recognised in other recordings, and others are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surgisoft.diagnosis.amend import amend
+from surgisoft.diagnosis.compare import compare
+from surgisoft.measurement.fitting import fit
+from surgisoft.measurement.histories import history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.measurement.recordings import Recording
+from surgisoft.rig import VirtualRig
+from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.fitted_rows import SIZE, FittedRows
+
+
+def recorded(take: int, rows: int = 1500) -> Recording:
+    rig = VirtualRig(0, take=take)
+    return rig.record(make_protocol("mixed", rig.limits, rows, seed=take))[0]
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Recording, Recording]:
+    return recorded(1), recorded(2)
+
+
+@pytest.fixture(scope="module")
+def model(pair):
+    return fit(pair[0], effects=[], hidden=(8,), epochs=1).model
+
+
+def test_a_part_of_a_recording_is_recognised_under_any_name(pair, model):
+    known = model.fitted_rows
+    first, other = (history_of([each]) for each in pair)
+    assert known.share_of(first) == 1.0
+    assert known.share_of(other) == 0.0
+    half = np.arange(pair[0].samples) < 700
+    part = pair[0].key_points_mm.copy()
+    part[half] += 0.01
+    mixed = history_of([replace(pair[0], name="another", key_points_mm=part)])
+    assert known.share_of(mixed) == pytest.approx(1 - half.mean(), abs=0.08)
+    assert known.share_of(mixed, half) == 0.0
+    assert known.share_of(mixed, ~half) == 1.0
+
+
+def test_a_sketch_is_small_and_joins_as_the_rows_do(pair):
+    both, first, other = (
+        FittedRows.of([history_of([each]) for each in some]) for some in (pair, pair[:1], pair[1:])
+    )
+    assert len(first.hashes) == SIZE < first.count
+    assert first.joined(other) == other.joined(first) == both
+    assert FittedRows.from_json(both.to_json()) == both
+
+
+def test_a_model_keeps_what_it_was_fitted_to_and_compare_reports_it(pair, model, tmp_path):
+    save_model(model, tmp_path / "arm")
+    opened = load_model(tmp_path / "arm")
+    assert opened.fitted_rows == model.fitted_rows
+    assert "the model was fitted to 100 %" in " ".join(compare(opened, [pair[0]])[0].notes)
+    assert "fitted to" not in " ".join(compare(opened, [pair[1]])[0].notes)
+
+
+def test_amend_states_where_held_out_rows_were_in_the_fit(pair, model):
+    """The rows that `amend` itself holds out are none of those of the amended model."""
+    found = amend(model, [pair[0]], "gain_mismatch", False, refit="never")
+    assert found.held_out.in_fit == 1.0
+    assert "100% of which the model had been fitted to" in found.held_out.sentence
+    fresh = amend(model, [pair[1]], "gain_mismatch", False, refit="never")
+    assert fresh.held_out.in_fit == 0.0
+    again = amend(fresh.model, [pair[1]], "gain_mismatch", False, refit="never")
+    assert again.held_out.in_fit == 0.0
+    assert again.training.in_fit > 0.9

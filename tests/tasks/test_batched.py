@@ -1,0 +1,122 @@
+"""The batched environment for other trainers, and pictures of environments."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers import RenderCollection
+
+import surgisoft
+from surgisoft.errors import InputError
+from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.registry import config_of, with_fields
+
+
+def drawn(env, generator):
+    """Random actions, agent -> (B, m) kPa."""
+    return {
+        agent: env.action_limits_kPa[agent]
+        * (2.0 * torch.rand(env.num_envs, size, generator=generator) - 1.0)
+        for agent, size in env.action_sizes.items()
+    }
+
+
+def test_an_environment_of_the_batch_is_that_of_pettingzoo_with_its_seed():
+    """Two arms: observations, rewards and ends of every agent."""
+    task, generator = CircleAblation(), torch.Generator().manual_seed(0)
+    env = surgisoft.batched_env(task, 3, seed=11)
+    single = surgisoft.parallel_env("circle_ablation", geometry="batched")
+    alone, _ = single.reset(seed=13)
+    together = env.reset(seed=11)
+    assert env.agents == ("laser", "endoscope")
+    for _ in range(4):
+        for agent in env.agents:
+            np.testing.assert_allclose(together[agent][2], alone[agent], atol=1e-4)
+            assert env.observation_sizes[agent] == len(alone[agent])
+        actions = drawn(env, generator)
+        step = env.step(actions)
+        one = {agent: value[2].numpy() for agent, value in actions.items()}
+        alone, rewards, *_ = single.step(one)
+        together = step.observations
+        for agent in env.agents:
+            assert step.rewards[agent][2].item() == pytest.approx(rewards[agent], abs=1e-4)
+            total = torch.stack([*step.terms[agent].values()]).sum(0)
+            torch.testing.assert_close(total, step.rewards[agent])
+
+
+def test_a_thousand_episodes_end_and_begin_anew():
+    config = with_fields(config_of("track_circle"), loop_s=0.4, approach_s=0.2)
+    env = surgisoft.batched_env("track_circle", 1000, config=config)
+    generator = torch.Generator().manual_seed(1)
+    for number in range(1, env.max_episode_steps + 1):
+        step = env.step(drawn(env, generator))
+        assert bool(step.truncated.all()) == (number == env.max_episode_steps)
+    assert (env.episode_steps == 0).all()
+    time = {
+        name: value["arm"][:, -1]
+        for name, value in (("new", step.observations), ("old", step.final_observations))
+    }
+    assert (time["new"] == -1.0).all()
+    assert (time["old"] == 1.0).all()
+    assert step.measures["error_mm"].shape == (1000,)
+
+
+def test_spread_episodes_do_not_all_end_at_once():
+    env = surgisoft.batched_env("track_body", 16, spread=True)
+    assert len(set(env.episode_steps.tolist())) == 16
+
+
+def test_wrong_actions_are_one_line():
+    env = surgisoft.batched_env("track_body", 2)
+    with pytest.raises(InputError, match=r"shape \(1, 3\), expected \(2, 3\)"):
+        env.step({"arm": torch.zeros(1, 3)})
+    with pytest.raises(InputError, match="no action for arm"):
+        env.step({})
+    with pytest.raises(InputError, match="num_envs is 0"):
+        surgisoft.batched_env("track_body", 0)
+
+
+def test_a_config_may_be_a_file_and_any_other_one_is_refused(tmp_path):
+    (tmp_path / "c.toml").write_text("time_s = 1.5\napproach_s = 0.5\n")
+    assert (
+        surgisoft.batched_env("track_body", 1, config=tmp_path / "c.toml").max_episode_steps == 20
+    )
+    for make in (
+        lambda config: surgisoft.batched_env("track_body", 1, config=config),
+        lambda config: gymnasium.make("surgisoft/track_body-v0", config=config),
+        lambda config: gymnasium.make_vec("surgisoft/track_body-v0", num_envs=2, config=config),
+    ):
+        with pytest.raises(InputError, match="is of type dict, expected TrackBodyConfig"):
+            make({"time_s": 1.5})
+
+
+def test_pictures_show_the_arm_where_it_is():
+    """The bright pixels of the arm move to the side to which it bends."""
+    env = RenderCollection(gymnasium.make("surgisoft/track_body-v0", render_mode="rgb_array"))
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(np.array([3.0, -3.0, -3.0], np.float32))
+    pictures = env.render()
+    assert len(pictures) == 9
+    assert all(p.shape == (360, 360, 3) and p.dtype == np.uint8 for p in pictures)
+    assert env.metadata["render_fps"] == 10
+    arms = [np.argwhere(picture.min(2) > 150) for picture in (pictures[0], pictures[-1])]
+    assert all(500 < len(arm) < 20_000 for arm in arms)
+    tops = [arm[arm[:, 0] < arm[:, 0].min() + 15].mean(0) for arm in arms]
+    assert np.abs(tops[1] - tops[0]).max() > 10
+
+
+def test_two_arms_have_pictures_too_and_others_have_none():
+    env = surgisoft.make("circle_ablation", geometry="batched", render_mode="rgb_array")
+    with pytest.raises(InputError, match="render before reset"):
+        env.render()
+    env.reset(seed=0)
+    picture = env.render().astype(int)
+    red = (picture[..., 0] > picture[..., 1] + 40).mean()
+    assert red > 0.02, "the organ"
+    assert (picture.min(2) > 150).mean() > 0.02, "the arms"
+    plain = gymnasium.make("surgisoft/track_body-v0").unwrapped
+    plain.reset(seed=0)
+    assert plain.render() is None
+    with pytest.raises(InputError, match="unknown render_mode 'human'"):
+        surgisoft.parallel_env("track_body", render_mode="human")

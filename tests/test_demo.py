@@ -1,0 +1,39 @@
+"""The demonstration: five steps, each with its result on the page and its files."""
+
+import pytest
+
+from surgisoft.cli import run
+from surgisoft.demo import story
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import load_recordings
+from surgisoft.surrogate.checkpoint import load_model
+
+
+def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
+    """On a shorter recording; the packaged policies cut, the hidden effect is found and added."""
+    monkeypatch.setattr(story, "POINTS", 1600)
+    folder = tmp_path / "story"
+    assert run(["demo", "-o", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert [line[:2] for line in said.splitlines()[:5]] == ["1.", "2.", "3.", "4.", "5."]
+    assert "1. cut: the whole ring was cut in" in said
+    assert f"wrote {folder / 'index.html'}" in said
+    (recording,) = load_recordings(folder / "bench.parquet")
+    assert sum(len(run.t_s) for run in [recording]) == 1600
+    assert list(load_model(folder / "amended").effects)[-1] == "creep"
+    page = (folder / "index.html").read_text()
+    assert page.count("<section") == 5
+    assert "surgisoft diagnose default bench.parquet" in page
+    for name in ("cut.rrd", "compare/report.html", "diagnosis.html", "amendment.html"):
+        assert (folder / name).stat().st_size > 10_000
+    # pictures: dose and paths of the cut, bodies, loops and error, ranking, the fall
+    assert page.count("<img") >= 9
+    # a second call keeps the first one's files
+    assert run(["demo", "-o", str(folder)]) == 2
+    assert "already there" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="cannot be written"):
+        story.demo(tmp_path / "file" / "inside")

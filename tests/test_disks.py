@@ -1,0 +1,104 @@
+"""Full disks, folders that cannot be written, two writers: the old output or the new one."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+
+import pytest
+
+from surgisoft.errors import InputError
+from surgisoft.files import new_folder, write_atomically
+from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
+from tests.diagnosis.synthetic import recording, walk
+
+FULL = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from surgisoft.surrogate.checkpoint import default_arm, save_model
+from surgisoft.measurement.recordings import save_recording
+from tests.diagnosis.synthetic import recording, walk
+disk = Path(sys.argv[1])
+made = recording(np.zeros(4000), walk(4000))
+for call in (lambda: save_model(default_arm(), disk / "arm", force=True),
+             lambda: save_recording(made, disk / "a.csv", force=True)):
+    try:
+        call()
+        print("written")
+    except OSError as error:
+        print("full" if error.errno == 28 else error)
+    except ValueError as error:
+        print("full" if "No space left" in str(error) else error)
+"""
+
+
+def test_a_full_disk_leaves_the_old_output(tmp_path):
+    """A file system of 300 kB in memory, on which a model of 340 kB cannot be written."""
+    if os.geteuid() != 0:
+        pytest.skip("mounting needs root")
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = (
+        f"mount -t tmpfs -o size=300k none {disk} || exit 77; mkdir {disk}/arm;"
+        f"echo '{{}}' > {disk}/arm/config.json; echo old > {disk}/a.csv;"
+        f"{sys.executable} -c '{FULL}' {disk} && cat {disk}/arm/config.json {disk}/a.csv;"
+        f"ls -A {disk}"
+    )
+    done = subprocess.run(["unshare", "-m", "sh", "-c", script], capture_output=True, text=True)
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip("no mount namespaces here")
+    assert done.stdout.split() == ["full", "full", "{}", "old", "a.csv", "arm"], done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match="not a writable folder"):
+        save_model(default_arm(), tmp_path / "arm")
+    with pytest.raises(InputError, match="cannot be written"):
+        save_recording(recording([0.0] * 9, walk(9)), tmp_path / "a.csv")
+
+
+def _write(folder, number):
+    for _ in range(60):
+        write_atomically(folder / "file", bytes([number]) * 200_000)
+
+
+def test_of_two_writers_of_a_file_one_wins_whole(tmp_path):
+    context = multiprocessing.get_context("fork")
+    some = [context.Process(target=_write, args=(tmp_path, number)) for number in (1, 2)]
+    for one in some:
+        one.start()
+    seen = set()
+    while any(one.is_alive() for one in some):
+        if (tmp_path / "file").is_file():
+            content = (tmp_path / "file").read_bytes()
+            assert len(content) == 200_000
+            seen.add(content[0])
+            assert content == content[:1] * 200_000
+    assert [one.exitcode for one in some] == [0, 0]
+    assert seen <= {1, 2}
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_second_writer_of_a_folder_does_not_mix_with_the_first(tmp_path):
+    """The second one finishes while the first is writing; the first replaces it as a whole."""
+    target = tmp_path / "made"
+    with new_folder(target, own=("a", "b")) as first:
+        (first / "a").write_text("1")
+        with new_folder(target, own=("a", "b")) as second:
+            (second / "a").write_text("2")
+            (second / "b").write_text("2")
+        assert (target / "b").read_text() == "2"
+    assert {path.name: path.read_text() for path in target.iterdir()} == {"a": "1"}
+
+
+def test_a_clock_that_goes_back_changes_nothing_that_is_read(tmp_path):
+    save_model(default_arm(), tmp_path / "arm")
+    save_recording(recording([0.0] * 9, walk(9)), tmp_path / "a.csv")
+    for path in tmp_path.rglob("*"):
+        os.utime(path, (0, 0))
+    assert load_model(tmp_path / "arm").spec == default_arm().spec
+    assert load_recording(tmp_path / "a.csv").samples == 9

@@ -35,9 +35,9 @@ cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
 PRIORS = {"two": 0.3}
-"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated: how
-many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in one
-source and a quarter in another. The other models take the sources' shares, which are alike."""
+"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated:
+how many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in
+one source and a quarter in another. The other models take the sources' shares."""
 WHOLE_TRUTH = ("missing", "known", "network")
 """Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5

@@ -218,18 +218,11 @@ def diagnose(
     Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is
     looked for: `Diagnosis.setup` mends the recordings.
 
-<<<<<<< HEAD
-    Only the training rows are looked at: the view of the residual table that is worked on holds no
-    other key points. before: recordings from before a change in question. Where they were made with
-    the same actuation, the paired difference is explained (`pairs`), else the residuals of the
-    model less what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few common
-=======
     Only the training rows are looked at: the key points of all others are removed first (`Sealed`).
     before: recordings from before a change in question. Where they were made with the same
-    actuation, the paired difference is explained (`pairs`), else the residuals of the model, with
-    those of `before` as what was known; paired: `auto`, `always` (too few common
->>>>>>> main
-    motions are an error) or `never`. reference: recordings, as before; or residuals of the model
+    actuation, the paired difference is explained (`pairs`), else the residuals of the model less
+    what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few
+    common motions are an error) or `never`. reference: recordings, as before; or residuals of the model
     from before, default those that it keeps of its fit. without: effects that cannot act, such as a
     contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
     together with the network (`surgisoft.diagnosis.refit`), not where recordings from before are

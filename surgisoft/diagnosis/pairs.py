@@ -891,7 +891,7 @@ class BeforeAfter:
         share = float(self.pairs.paired[~self.table.held_out].mean())
         return (
             f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: compared through the model, less what of its error there can be learned; "
+            f"{self.names}: compared through the model, less what can be learned of its error; "
             "record the same protocol before and after",
         )
 

@@ -2,8 +2,9 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by leaving out one group of robots after another within
-the cases that it is fitted to, so nothing of a source that is judged enters.
+cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
+leaving out one group of robots after another within the cases that it is fitted to, so nothing of a
+source that is judged enters.
 """
 
 import datetime

@@ -224,11 +224,11 @@ def diagnose(
     what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few
     common motions are an error) or `never`. reference: recordings, as before; or residuals of the
     model from before, default those that it keeps of its fit. without: effects that cannot act,
-    such as a contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
-    together with the network (`surgisoft.diagnosis.refit`), not where recordings from before are
-    given; refit_progress: called while that goes on; processes: how many trainings then run at
-    once, with the same result. More than one starts new Python processes, so a script has to guard
-    its start by `if __name__ == "__main__"`.
+    such as a contact on a bench without anything to touch. refit: `auto`, `never` or `always`
+    fit candidates together with the network (`surgisoft.diagnosis.refit`), not where recordings
+    from before are given; refit_progress: called while that goes on; processes: how many trainings
+    then run at once, with the same result. More than one starts new Python processes, so a script
+    has to guard its start by `if __name__ == "__main__"`.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)

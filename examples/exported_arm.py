@@ -35,7 +35,8 @@ rows = list(csv.DictReader(Path(sys.argv[2]).read_text().splitlines()))
 pressure = np.array([[float(row[name]) for name in about["recording_columns"]] for row in rows])
 time = np.array([float(row["t_s"]) for row in rows])
 (state,) = start(pressure[:1])
-for now, dt in zip(pressure, np.diff(time, prepend=time[0]), strict=True):
-    warmth = [np.array([np.nan])] * ("temperature_C" in about["step"]["inputs"])
+warm = np.array([float(row.get("temp_C") or "nan") for row in rows])
+for now, dt, temperature in zip(pressure, np.diff(time, prepend=time[0]), warm, strict=True):
+    warmth = [np.array([temperature])] * ("temperature_C" in about["step"]["inputs"])
     state, points = step(state, now[None], np.array([dt]), *warmth)
     print(",".join(f"{value:.9f}" for value in np.asarray(points).ravel()))

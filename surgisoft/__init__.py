@@ -36,7 +36,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from surgisoft.agents.session import evaluate
     from surgisoft.agents.training_request import train
-    from surgisoft.demo.story import demo
+    from surgisoft.demonstration.story import demo
     from surgisoft.diagnosis.amend import amend
     from surgisoft.diagnosis.compare import compare
     from surgisoft.diagnosis.design.next_experiment import next_experiment
@@ -64,7 +64,7 @@ _PLACES = {
     "batched_env": "tasks.batched",
     "collect": "rig.trial",
     "compare": "diagnosis.compare",
-    "demo": "demo.story",
+    "demo": "demonstration.story",
     "diagnose": "diagnosis.diagnose",
     "evaluate": "agents.session",
     "fit": "measurement.fitting",

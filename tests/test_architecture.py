@@ -30,10 +30,10 @@ MAY_IMPORT = {
     "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
-    "demo": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
+    "demonstration": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
     "cli": {
         "agents",
-        "demo",
+        "demonstration",
         "experiments",
         "live",
         "tasks",

@@ -3,7 +3,7 @@
 import pytest
 
 from surgisoft.cli import run
-from surgisoft.demo import story
+from surgisoft.demonstration import story
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import load_recordings
 from surgisoft.surrogate.checkpoint import load_model

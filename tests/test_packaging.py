@@ -13,7 +13,15 @@ ROOT = Path(__file__).resolve().parents[1]
 WANTED = {
     f"surgisoft/scenes/phantom_liver/{name}"
     for name in ("scene.toml", "liver.ply", "gallbladder.ply", "tray.ply", "SOURCE.md")
-} | {"surgisoft/assets/default_arm/weights.safetensors", "surgisoft/assets/default_arm/config.json"}
+} | {
+    "surgisoft/assets/default_arm/weights.safetensors",
+    "surgisoft/assets/default_arm/config.json",
+    "surgisoft/assets/policies/ring/config.json",
+    "surgisoft/assets/policies/ring/checkpoints/best.pt",
+    "surgisoft/assets/policies/ring/arms/laser/weights.safetensors",
+    "surgisoft/assets/policies/ring/scene/scene.toml",
+    "surgisoft/assets/policies/ring/scene/liver.ply",
+}
 
 
 def test_the_phantom_is_found():

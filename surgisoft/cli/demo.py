@@ -19,7 +19,7 @@ def demo(
 
     Takes about a minute and needs no data. The first run compiles for half a minute more.
     """
-    from surgisoft.demo import demo as run_demo
+    from surgisoft.demonstration import demo as run_demo
 
     with progress("demo") as report:
         result = run_demo(output, progress=report)

@@ -20,7 +20,7 @@ import torch
 
 from surgisoft.agents.on_rig import RigConfig, on_rig
 from surgisoft.agents.policies import POLICIES, Policy, check_policy, open_policy
-from surgisoft.agents.run_folder import RunFolder
+from surgisoft.agents.run_folder import RunFolder, run_path
 from surgisoft.agents.session import task_config
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import json_safe
@@ -442,7 +442,7 @@ class _Session:
             if request.task is not None or request.config is not None:
                 raise InputError("a schedule has no task: leave --task and --config out")
             return None, None
-        if request.policy not in POLICIES and not Path(request.policy).exists():
+        if request.policy not in POLICIES and not run_path(request.policy).exists():
             known = [*POLICIES, "the folder of a training run", "SCHEDULE.csv", *PROTOCOLS]
             if Path(request.policy).name == request.policy:
                 raise unknown_name("policy", request.policy, known)

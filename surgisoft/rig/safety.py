@@ -23,10 +23,8 @@ import os
 import select
 import signal
 import sys
-import termios
 import threading
 import time
-import tty
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -305,6 +303,11 @@ class SafeRig:
     def _listen(self) -> None:
         """Let the stop keys work, where the program has a terminal."""
         try:
+            import termios
+            import tty
+        except ImportError:  # Windows: Ctrl-C stops, single keys do not
+            return
+        try:
             if not sys.stdin.isatty() or os.tcgetpgrp(0) != os.getpgrp():
                 return
             self._terminal = termios.tcgetattr(0)
@@ -315,6 +318,8 @@ class SafeRig:
 
     def _unlisten(self) -> None:
         if self._terminal is not None:
+            import termios
+
             termios.tcsetattr(0, termios.TCSANOW, self._terminal)
             self._terminal = None
 

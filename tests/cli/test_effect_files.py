@@ -42,6 +42,7 @@ policy = "scripted"
 """
 
 NO_MODEL = {
+    "demo": "shows the default arm",
     "collect": "makes a recording of the virtual rig",
     "import": "reads raw files",
     "recording": "reads recordings",
@@ -57,6 +58,7 @@ COMMANDS = {
     "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
     "improve": "improve arm bench.parquet --max-effects 1 -o improved",
     "next-experiment": "next-experiment arm --between creep line_lag --minutes 6",
+    "run": "run mixed --model arm --any-model --minutes 1 --clean 40 --clock simulated -o r.csv",
     "rig check": "rig check virtual --model arm",
     "train": "train --task track_circle --arm arm --envs 8 --steps 64 -o run",
     "export": "export arm -o exported",

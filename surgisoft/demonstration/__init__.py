@@ -1,5 +1,5 @@
 """A demonstration in five steps: cut, measurement, error, its cause, and the mended model."""
 
-from surgisoft.demo.story import Demonstration, demo
+from surgisoft.demonstration.story import Demonstration, demo
 
 __all__ = ["Demonstration", "demo"]

@@ -78,9 +78,9 @@ MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
     "network": "a function of the actuation alone explains most of the error, more than the "
-    "model's validated error allows: the network does not describe this arm as it is, fit it anew",
+    "model's validated error allows: the model does not describe this arm as it is, fit it anew",
     "learned": "the error is no larger than the model's validated error, and a black box with "
-    "memory explains part of it that no static function does: the network was fitted to what is "
+    "memory explains part of it that no static function does: the model was fitted to what is "
     "missing and has learned part of it, fit it together with effects",
     "few_data": "the recordings show too few different motions",
     "schedule": "several causes explain these recordings about as well, and none well enough",
@@ -523,7 +523,7 @@ def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
         )
     if kind == "surrogate_undertrained":
         return (
-            f"the network itself is off (its validated error says so too): fit it longer or to "
+            f"the model itself is off (its validated error says so too): fit it longer or to "
             f"more data before looking for effects; {error}"
         )
     if kind == "cannot_tell":

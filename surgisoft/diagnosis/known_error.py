@@ -13,16 +13,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from surgisoft.diagnosis.history_features import Memory
 from surgisoft.diagnosis.residuals import (
     FOLDS,
+    MOTION_ALIKE,
     ROWS,
     Problem,
     Reference,
     ResidualTable,
     half_range,
     model_discrepancy,
+    motion_states,
 )
 from surgisoft.diagnosis.statistics import cross_validated_ridge
 from surgisoft.surrogate.arm import ArmSpec
@@ -73,8 +76,7 @@ def known_error(after: ResidualTable, before: ResidualTable) -> KnownError:
     known = known[rows]
     # Beyond what BEFORE has shown nothing was learned.
     asked = np.clip(asked, known.min(axis=0), known.max(axis=0))
-    part = before.run[rows] * 1e6 + before.t_s[rows] // KNOWN_BLOCK_S
-    block = np.unique(part, return_inverse=True)[1]
+    block = _first_blocks(before, rows)
     fold = np.random.default_rng(0).permutation(int(block.max()) + 1)[block] % FOLDS
     target = before.residual_mm[rows].reshape(len(rows), -1)
     nothing = np.full((len(asked), target.shape[1]), np.nan)
@@ -97,6 +99,20 @@ def known_error(after: ResidualTable, before: ResidualTable) -> KnownError:
             residual=(left if ratio < 1.0 else target)[some].reshape(-1, *shape),
         ),
     )
+
+
+def _first_blocks(before: ResidualTable, rows: np.ndarray) -> np.ndarray:
+    """(R,) block of time of BEFORE in which the motion of each of R rows came for the first time.
+
+    Where BEFORE repeats a motion, what is learned of the motion from its own repeats would be no
+    test of what is known of the motions of AFTER. Rows with the same actuation and the same past
+    (`residuals.MOTION_ALIKE`) are held out together.
+    """
+    state = motion_states(before.history, half_range(before.spec))[rows]
+    near = cKDTree(state).query_ball_point(state, MOTION_ALIKE, p=np.inf)
+    first = rows[[min(some) for some in near]]
+    part = before.run[first] * 1e6 + before.t_s[first] // KNOWN_BLOCK_S
+    return np.unique(part, return_inverse=True)[1]
 
 
 def _inputs(memory: Memory, spec: ArmSpec) -> np.ndarray:

@@ -11,6 +11,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
@@ -267,6 +268,19 @@ def test_what_was_wrong_before_is_no_change_without_pairs(model, changed):
     assert plain > 3.0 * NOISE_MM * np.sqrt(3)
     assert problem.rmse_mm == pytest.approx(left, rel=0.3)
     assert np.all(problem.discrepancy_mm < 0.5 * np.array(model.validation.per_key_point_mm))
+
+
+def test_repeats_of_one_motion_teach_nothing_of_another(model):
+    """What is wrong at each instant of a motion comes again with its repeats, and not elsewhere."""
+    cycle, repeats = 600, 4
+    once = smooth_walk(18)(PERIOD_S * np.arange(cycle))
+    wrong = smooth_walk(20)(PERIOD_S * np.arange(cycle))[:, 0]
+    old = recording(np.tile(wrong - wrong.mean(), repeats), np.tile(once, (repeats, 1)), seed=2)
+    pressure = smooth_walk(16)(PERIOD_S * np.arange(ROWS))
+    new = recording(np.zeros(ROWS), pressure, seed=3)
+    found = known_error(residual_table(model, [new]), residual_table(model, [old]))
+    assert found.ratio == 1.0
+    assert not found.correction_mm.any()
 
 
 def test_a_nearly_idle_chamber_is_no_common_range(model):

@@ -67,6 +67,20 @@ def read_recordings(sample: Path) -> None:
     load_recordings([sample])
 
 
+def make_lerobot(folder: Path) -> None:
+    """A LeRobotDataset of two episodes."""
+    from surgisoft.measurement.recordings.lerobot import save_lerobot
+
+    save_lerobot([recording()], folder / "set")
+
+
+def read_lerobot(sample: Path) -> None:
+    """The recording in a LeRobotDataset."""
+    from surgisoft.measurement.recordings.lerobot import load_lerobot
+
+    load_lerobot(sample)
+
+
 def make_logs(folder: Path) -> None:
     """The log of a short recording."""
     from surgisoft.measurement.recordings.log import LogHeader, recording_log
@@ -459,6 +473,9 @@ def read_decision(sample: Path) -> None:
 
 TARGETS: dict[str, Target] = {
     "recording": Target(make_recordings, read_recordings, weight=3),
+    "lerobot": Target(
+        make_lerobot, read_lerobot, ("meta/info.json", "meta/*.toml", "data/*/*.parquet")
+    ),
     "log": Target(make_logs, read_logged, weight=2),
     "schedule": Target(make_schedule, read_schedule, weight=2),
     "import": Target(make_raw, read_raw, weight=3),

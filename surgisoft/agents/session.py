@@ -20,13 +20,13 @@ from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
 from surgisoft.tasks.base import Episodes, Task
-from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
     TASKS,
     config_of,
     make_task,
     read_config,
+    spec_of,
     with_fields,
 )
 
@@ -220,5 +220,5 @@ def _evaluated(
         tuple(results),
         {name: each.log(0) for name, each in logs.items()},
         measured,
-        success_rule(config) if isinstance(config, CircleAblationConfig) else "",
+        rule(config) if (rule := spec_of(plain.name).success_rule) else "",
     )

@@ -162,12 +162,14 @@ def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str
     if config:
         raise InputError("--config and --rules both set the task's fields; give one of the two")
     from surgisoft.experiments.session import open_experiment
-    from surgisoft.experiments.spec import TASK
 
-    if task not in (None, TASK):
-        raise InputError(f"--rules {experiment}: is an experiment of {TASK}, not of {task}")
     spec = open_experiment(experiment)
-    return TASK, replace(spec.task, scene=spec.scene)
+    if task not in (None, spec.scenario):
+        raise InputError(
+            f"--rules {experiment}: is an experiment of {spec.scenario}, not of {task}"
+        )
+    place = {"scene": spec.scene} if spec.in_scene else {}
+    return spec.scenario, replace(spec.task, **place)
 
 
 def _rig_config(

@@ -81,13 +81,13 @@ def check(
     check_playable(spec)
     episodes = counted(len(found) * spec.repeats, "episode")
     print(
-        f"{spec.name}: {counted(len(found), 'setting')}, {episodes} of at most "
+        f"{spec.name} ({spec.scenario}): {counted(len(found), 'setting')}, {episodes} of at most "
         f"{spec.limits.time_s:g} s"
     )
     for phase in spec.phases:
         beam = ", beam" if phase.beam else ""
         print(
-            f"  phase {phase.name}: laser {phase.laser}, endoscope {phase.endoscope}{beam}; "
+            f"  phase {phase.name}: {', '.join(map(' '.join, phase.arms))}{beam}; "
             f"until {phase.until}, at most {phase.timeout_s:g} s, then {phase.on_timeout}"
         )
     for setting in found:

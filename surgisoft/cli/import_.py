@@ -32,7 +32,7 @@ def import_(
             "--map",
             metavar="MAP.toml",
             help="Map file, or the ready map motive. The log of an interrupted recording (.jsonl) "
-            "needs none.",
+            "and a LeRobotDataset with a recording's names need none.",
         ),
     ] = None,
     force: Force = False,
@@ -52,13 +52,19 @@ def import_(
     Notes tell what cannot be right: lengths, reversed key points, clocks that are apart. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
-    from surgisoft.measurement.importing import import_files, import_log, load_map
+    from surgisoft.measurement.importing import (
+        import_files,
+        import_lerobot,
+        import_log,
+        load_map,
+    )
     from surgisoft.measurement.recordings import (
         check_writable,
         find_warnings,
         save_recording,
         summary,
     )
+    from surgisoft.measurement.recordings.lerobot import is_dataset
     from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 
     if model:
@@ -69,6 +75,8 @@ def import_(
     name = output.stem if to_file else None
     if map_name is None and all(path.suffix == LOG_SUFFIX for path in raw):
         parts = [import_log(path, name or path.stem) for path in raw]
+    elif map_name is None and all(is_dataset(path) for path in raw):
+        parts = [import_lerobot(path, name or path.name) for path in raw]
     elif map_name is None:
         raise InputError("--map is missing: a map file states columns, units and frames")
     else:
@@ -113,9 +121,38 @@ def _test_setup(model: Path, recordings: list) -> None:
 @app.command("recording")
 def recording_(
     recordings: Recordings,
+    lerobot: Annotated[
+        Path | None,
+        typer.Option(
+            "--lerobot",
+            metavar="DIR",
+            help="Write the recordings to a new folder as a LeRobotDataset (v3.0), a run an "
+            "episode.",
+        ),
+    ] = None,
+    task: Annotated[
+        str, typer.Option(metavar="TEXT", help="With --lerobot: what the robot does, in words.")
+    ] = "Drive the soft arm.",
+    fps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="With --lerobot: frames a second; default: the recordings' own rate.",
+        ),
+    ] = None,
 ) -> None:
-    """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings."""
-    from surgisoft.measurement.recordings import summary
+    """Show what recordings hold: rows, runs, rates, ranges, missing values, warnings.
 
-    for recording in read_recordings(recordings):
+    With --lerobot they are written as a LeRobotDataset, too, which LeRobot trains policies on.
+    """
+    from surgisoft.measurement.recordings import summary
+    from surgisoft.measurement.recordings.lerobot import save_lerobot
+
+    opened = read_recordings(recordings)
+    for recording in opened:
         print(*summary(recording), sep="\n")
+    if lerobot:
+        for note in save_lerobot(opened, lerobot, task, fps):
+            print(f"note: {note}")
+        print(f"wrote {lerobot}: a LeRobotDataset v3.0")

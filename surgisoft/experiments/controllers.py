@@ -90,7 +90,7 @@ class PhaseControllers:
         self.defined: dict[tuple[str, str], Controller] = {}
         for agent in task.agents:
             chambers = task.world.arms[agent].chambers
-            used = {getattr(phase, agent) for phase in spec.phases}
+            used = {phase.controller(agent) for phase in spec.phases}
             for driver in spec.drivers:
                 if driver.name in used:
                     self.defined[agent, driver.name] = _defined(driver, chambers)
@@ -104,8 +104,8 @@ class PhaseControllers:
         actions = {}
         for agent in task.agents:
             chosen = hold(task, agent, state)
-            for name in sorted({getattr(phase, agent) for phase in task.phases} - {"hold"}):
-                phases = [k for k, p in enumerate(task.phases) if getattr(p, agent) == name]
+            for name in sorted({phase.controller(agent) for phase in task.phases} - {"hold"}):
+                phases = [k for k, p in enumerate(task.phases) if p.controller(agent) == name]
                 here = torch.isin(state.goal.phase, torch.tensor(phases, device=chosen.device))
                 if here.any():
                     wanted = self._asked(name, agent, task, state, observations, known)

@@ -9,25 +9,21 @@ from surgisoft.agents.evaluate import RATES
 from surgisoft.agents.report import cell, episode_parts
 from surgisoft.agents.report_charts import path_chart, spread_chart, sweep_chart
 from surgisoft.experiments.results import Results, SettingResult
-from surgisoft.experiments.spec import EXPERIMENT_TASK
 from surgisoft.report import Facts, Gallery, Page, Picture, Section, Share, Table, Text
-from surgisoft.tasks.circle_ablation import success_rule
+from surgisoft.tasks.supervision import Row
 
-NUMBERS, CONDITIONS = EXPERIMENT_TASK.numbers, EXPERIMENT_TASK.conditions
 SHOWN = 4
 """Most settings of which the first episode is shown."""
 HOW = (
     "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
-    "for all else. The beam's error is the distance of its axis from its target while it is on. "
-    "Clearance, contact and success come from exact collision checks (FCL) of the true bodies.\n\n"
-    "Interlock: the beam is off in every step that begins with the lesion out of sight, with a "
-    "clearance below the limit, or after an abort. A step that becomes unsafe while it runs is "
-    "stopped at its end; the last number of the table is the longest time of such steps in a row."
+    "for all else. Clearance, contact and success come from exact collision checks (FCL) of the "
+    "true bodies."
 )
 
 
 def experiment_page(results: Results, films: dict[tuple[str, int], Picture], about: str) -> Page:
     """HTML report of an experiment; films: (setting's label, episode) -> film strip to show."""
+    how = results.experiment.of.experiment.how
     sections = [_table(results), _outcomes(results)]
     if len(results.settings) > 1 or results.experiment.repeats > 1:
         sections.append(Section("Every episode", [Gallery(_spreads(results))]))
@@ -50,7 +46,7 @@ def experiment_page(results: Results, films: dict[tuple[str, int], Picture], abo
             Facts(_facts(results)),
             *sections,
             _design(results),
-            Section("How to read this", [Text(f"{rules(results)}\n\n{HOW}")]),
+            Section("How to read this", [Text(f"{rules(results)}\n\n{HOW} {how}".rstrip())]),
         ],
     )
 
@@ -66,7 +62,7 @@ def verdict(results: Results) -> str:
     """One or two sentences that state the main result."""
     settings, faults = results.settings, results.experiment.faults
     unsafe = max(row["beam_unsafe_longest_s"] for row in results.rows)
-    hits = sum(row["collided"] > 0.0 for row in results.rows)
+    hits = sum(row.get("collided", 0.0) > 0.0 for row in results.rows)
     if faults:
         ended = [row for row in results.rows if row["outcome"].startswith("aborted")]
         first = (
@@ -85,20 +81,28 @@ def verdict(results: Results) -> str:
             first = f"Success {low:.0%} in each of {len(settings)} settings"
     last = f"{hits} of {len(results.rows)} episodes had contact."
     safe = f"was on for at most {unsafe:.2g} s" if unsafe else "was never on"
-    safe = "" if faults else f" The beam {safe} while it was unsafe."
-    return f"{first}. {last}{safe}"
+    safe = "" if faults or not _beams(results) else f" The beam {safe} while it was unsafe."
+    last = f" {last}" if "collided" in results.rows[0] else ""
+    return f"{first}.{last}{safe}"
+
+
+def _beams(results: Results) -> bool:
+    """Whether a phase of the experiment permits a beam."""
+    return any(phase.beam for phase in results.experiment.phases)
 
 
 def _one(setting: SettingResult) -> str:
-    success, error = setting.overall["success"], setting.overall.get("beam_error_mean_mm")
+    success = setting.overall["success"]
     text = f"success {round(success.mean * success.episodes)} of {success.episodes}"
-    if error is not None and error.episodes:
-        text += f", mean beam error {error.mean:.2g} mm"
+    for name, title in (("beam_error_mean_mm", "beam error"), ("error_mean_mm", "error")):
+        error = setting.overall.get(name)
+        if error is not None and error.episodes:
+            return f"{text}, mean {title} {error.mean:.2g} mm"
     return text
 
 
 def _tone(results: Results) -> str:
-    if any(row["collided"] > 0.0 for row in results.rows):
+    if any(row.get("collided", 0.0) > 0.0 for row in results.rows):
         return "bad"
     if results.experiment.faults:
         return "good" if max(row["beam_unsafe_longest_s"] for row in results.rows) < 0.15 else "bad"
@@ -112,17 +116,32 @@ def _facts(results: Results) -> list[tuple[str, str]]:
         ("episodes", f"{len(rows)}"),
         ("settings", f"{len(results.settings)}"),
         ("success", f"{sum(row['success'] for row in rows):.0f} of {len(rows)}"),
-        ("contact", f"{sum(row['collided'] for row in rows):.0f} of {len(rows)}"),
-        ("least clearance", f"{min(row['clearance_mm'] for row in rows):.1f} mm"),
+        *_safety(rows),
         ("seed", f"{spec.seed}"),
     ]
+
+
+def _safety(rows: list[Row]) -> list[tuple[str, str]]:
+    """Contact and least clearance, where there is something to touch."""
+    if "collided" not in rows[0] or "clearance_mm" not in rows[0]:
+        return []
+    return [
+        ("contact", f"{sum(row['collided'] for row in rows):.0f} of {len(rows)}"),
+        ("least clearance", f"{min(row['clearance_mm'] for row in rows):.1f} mm"),
+    ]
+
+
+def _known(results: Results) -> dict[str, str]:
+    """The task's numbers that these results have -> their titles."""
+    numbers, found = results.experiment.of.experiment.numbers, results.settings[0].overall
+    return {name: title for name, title in numbers.items() if name in found}
 
 
 def _table(results: Results) -> Section:
     if len(results.settings) <= SHOWN:
         return Section("Results", [Table(*turned_table(results))])
-    known = [name for name in NUMBERS if name in results.settings[0].overall]
-    header = ["setting", "episodes", *(NUMBERS[name] for name in known)]
+    known = _known(results)
+    header = ["setting", "episodes", *known.values()]
     rows = [
         (
             setting.label,
@@ -136,13 +155,9 @@ def _table(results: Results) -> Section:
 
 def turned_table(results: Results) -> tuple[list[str], list[tuple[str, ...]]]:
     """Header and rows of the main table, a column for each setting."""
-    known = [name for name in NUMBERS if name in results.settings[0].overall]
     rows = [
-        (
-            NUMBERS[name],
-            *(cell(s.overall[name], name in RATES) for s in results.settings),
-        )
-        for name in known
+        (title, *(cell(s.overall[name], name in RATES) for s in results.settings))
+        for name, title in _known(results).items()
     ]
     return ["mean [95 % interval]", *(setting.label for setting in results.settings)], rows
 
@@ -157,7 +172,9 @@ def markdown(results: Results) -> str:
 
 def rules(results: Results) -> str:
     """What counts as a success, in one sentence; the rule of the task beneath, and no abort."""
-    return f"Success: {success_rule(results.experiment.task)}; nothing is aborted."
+    spec = results.experiment
+    rule = spec.of.success_rule
+    return f"Success: {f'{rule(spec.task)}; ' if rule else ''}nothing is aborted."
 
 
 def _outcomes(results: Results) -> Section:
@@ -178,27 +195,30 @@ def _side_by_side(results: Results) -> Section:
 
 def _spreads(results: Results) -> list[Picture]:
     drawn = []
-    for name in EXPERIMENT_TASK.per_episode:
+    known = _known(results)
+    for name in results.experiment.of.experiment.per_episode:
+        if name not in known:
+            continue
         groups = [
             (setting.label, [row[name] for row in setting.rows])
             for setting in results.settings
             if name in setting.overall
         ]
-        picture = spread_chart(NUMBERS[name], groups, NUMBERS[name])
+        picture = spread_chart(known[name], groups, known[name])
         drawn += [] if picture is None else [picture]
     return drawn
 
 
 def _sweeps(results: Results) -> list[Section]:
     """A section for each number that varies: success and error over it."""
-    sections = []
+    sections, known = [], _known(results)
     for vary in results.experiment.vary:
         if any(isinstance(value, str) for value in vary.values) or len(vary.values) < 2:
             continue
         charts = [
-            sweep_chart(vary.field, NUMBERS[name], _lines(results, vary.field, name))
-            for name in EXPERIMENT_TASK.swept
-            if name in results.settings[0].overall
+            sweep_chart(vary.field, known[name], _lines(results, vary.field, name))
+            for name in results.experiment.of.experiment.swept
+            if name in known
         ]
         sections.append(Section(f"Over {vary.field}", [Gallery(charts)]))
     return sections
@@ -217,18 +237,19 @@ def _lines(results: Results, field: str, name: str) -> dict[str, list[tuple]]:
 
 def _design(results: Results) -> Section:
     spec = results.experiment
+    beams, conditions = _beams(results), spec.of.experiment.conditions
     rows = [
         (
             phase.name,
-            phase.laser,
-            phase.endoscope,
-            "may be on" if phase.beam else "off",
-            CONDITIONS[phase.until].about if phase.until != "never" else "its time is out",
+            *(phase.controller(arm) for arm in spec.of.agents),
+            *(["may be on" if phase.beam else "off"] if beams else []),
+            conditions[phase.until].about if phase.until != "never" else "its time is out",
             f"{phase.timeout_s:g} s, then {phase.on_timeout}",
         )
         for phase in spec.phases
     ]
-    header = ["phase", "laser arm", "endoscope arm", "beam", "next phase when", "longest"]
+    arms = [name if name == "arm" else f"{name} arm" for name in spec.of.agents]
+    header = ["phase", *arms, *(["beam"] if beams else []), "next phase when", "longest"]
     faults = [
         f"{fault.arm}: chamber {fault.chamber} goes to 0 kPa from {fault.at_s:g} s on"
         for fault in spec.faults

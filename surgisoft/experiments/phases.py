@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.experiments.spec import EXPERIMENT_TASK, Experiment
-from surgisoft.experiments.task import Supervision
+from surgisoft.experiments.spec import Experiment
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import Event
+from surgisoft.tasks.supervision import Supervision
 from surgisoft.tasks.world.random_streams import Stream
 
 RUNNING, CLOSE, LOST, LATE = range(4)
@@ -58,7 +58,7 @@ class PhasedTask:
         self.dt_s, self.steps = dt_s, round(limits.time_s / dt_s)
         self.clear_mm = max(limits.clearance_mm, supervision.clearance_limit_mm)
         self.lost_steps = round(limits.view_lost_s / dt_s)
-        self.phases = spec.phases
+        self.phases, self.conditions = spec.phases, spec.of.experiment.conditions
         names = [phase.name for phase in spec.phases]
         self.retreat = names.index(limits.retreat) if limits.retreat else len(names)
 
@@ -128,7 +128,7 @@ class PhasedTask:
         for number, spec in enumerate(self.phases):
             here = old.phase == number
             if here.any():
-                known = EXPERIMENT_TASK.conditions[spec.until]
+                known = self.conditions[spec.until]
                 within = known.within if spec.within < 0.0 else spec.within
                 holds = holds | (here & known.holds(self.base, after, within))
         since, held = old.since + 1, (old.held + 1) * holds
@@ -177,7 +177,7 @@ class PhasedTask:
         values = self.base.measures(plain)
         fired = self.supervision.fired(plain)
         return values | {
-            "success": values["success"] * (goal.reason == RUNNING),
+            "success": values.get("success", 1.0) * (goal.reason == RUNNING).float(),
             "phase": goal.phase.float(),
             "reason": goal.reason.float(),
             "reason_phase": goal.where.float(),

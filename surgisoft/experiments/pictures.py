@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +43,15 @@ def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
     return Picture(buffer.getvalue(), caption, caption, "image/png", 620)
 
 
-def write_pictures(results: Results, films: dict[tuple[str, int], Picture]) -> list[Path]:
+def write_pictures(
+    results: Results, shown: Sequence[tuple[str, int]], films: dict[tuple[str, int], Picture]
+) -> list[Path]:
     """`pictures/SETTING-EPISODE-WHAT.svg` (charts) and `.png` (endoscope) of episodes shown."""
     folder, files = results.folder / "pictures", []
     folder.mkdir(exist_ok=True)
-    for (label, episode), film in films.items():
-        named = [("endoscope.png", film)]
+    for label, episode in shown:
+        strip = films.get((label, episode))
+        named = [] if strip is None else [("endoscope.png", strip)]
         for picture in episode_charts(results.log(label, episode)):
             named.append((f"{picture.alt.replace(' ', '-')}.svg", picture))
         for name, picture in named:

@@ -7,6 +7,7 @@ import itertools
 import math
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from surgisoft.config import Where, merged, to_table
 from surgisoft.errors import InputError
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.spec import (
-    EXPERIMENT_TASK,
     Case,
     Experiment,
     Lesion,
@@ -26,15 +26,11 @@ from surgisoft.experiments.spec import (
 from surgisoft.rig.hidden import HIDDEN
 from surgisoft.rig.registry import SIMULATED, hidden_of, parse_rig
 from surgisoft.scene.folder import Scene, open_scene
-from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import with_present_names
+from surgisoft.tasks.registry import with_fields, with_present_names
 
 Value = int | float | str
 MOST_SETTINGS = 100_000
 """Most settings of an experiment."""
-
-ARMS = ("laser", "endoscope")
-"""The arms of an experiment."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ def settings(spec: Experiment, where: Where | None = None) -> list[Setting]:
     every = itertools.product(spec.cases, spec.lesions or (None,), itertools.product(*grid))
     found = [Setting(number, *parts) for number, parts in enumerate(every)]
     for setting in found:
-        rig_config(setting, place)
+        rig_config(setting, place, spec.of.agents)
     labels = [setting.label for setting in found]
     if twice := [label for label, number in Counter(labels).items() if number > 1]:
         raise (place / "vary").error(f"'{min(twice)}' comes twice", "values that differ")
@@ -123,7 +119,7 @@ def _check_vary(spec: Experiment, vary: Vary, place: Where) -> None:
         )
 
 
-def _configured(spec: Experiment, values) -> CircleAblationConfig:
+def _configured(spec: Experiment, values) -> Any:
     """The task's configuration with what varies; the scene is still a folder's name."""
     table = to_table(spec.task)
     for field, value in values:
@@ -134,13 +130,13 @@ def _configured(spec: Experiment, values) -> CircleAblationConfig:
                 change = {part: change}
             table = merged(table, with_present_names(spec.task, change))
     try:
-        return task_config(table, Where(Path(spec.name)))
+        return task_config(spec.of, table, Where(Path(spec.name)))
     except InputError as error:
         raise InputError(str(error).removeprefix(f"{spec.name}: ")) from None
 
 
-def rig_config(setting: Setting, place: Where) -> RigConfig | None:
-    """The rig of a setting; None in simulation."""
+def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig | None:
+    """The rig of a setting for these arms; None in simulation."""
     varied = dict(setting.values)
     if setting.case.plant != "rig":
         return None
@@ -154,7 +150,7 @@ def rig_config(setting: Setting, place: Where) -> RigConfig | None:
     for field, value in varied.items():
         if field.startswith("hidden."):
             hidden[field.removeprefix("hidden.")] = float(value)
-    rigs = {parse_rig(rig).name for rig in rigs_by_arm(setting.case.rigs, ARMS).values()}
+    rigs = {parse_rig(rig).name for rig in rigs_by_arm(setting.case.rigs, arms).values()}
     for name in hidden:
         for rig in rigs.intersection(SIMULATED):
             if name not in hidden_of(rig):
@@ -188,17 +184,23 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
 def build_task(spec: Experiment, setting: Setting) -> PhasedTask:
     """The phased task of a setting, with its arms on the rig where the case has that plant."""
     config = _configured(spec, setting.values)
-    arm = setting.case.arm or config.arm
-    config = dataclasses.replace(config, arm=arm, scene=spec.scene)
-    base = EXPERIMENT_TASK.build(config, scene_of(spec, setting))
-    rig = rig_config(setting, Where(Path(spec.name)))
+    if setting.case.arm:
+        config = with_fields(config, arm=setting.case.arm)
+    if spec.in_scene:
+        config = dataclasses.replace(config, scene=spec.scene)
+        opened = dataclasses.replace(config, scene=scene_of(spec, setting))
+        base = spec.of.build(opened, "cpu")
+        base.config = config
+    else:
+        base = spec.of.build(config, "cpu")
+    rig = rig_config(setting, Where(Path(spec.name)), base.agents)
     varied: dict[str, Any] = {
         f.removeprefix("fault."): v for f, v in setting.values if f.startswith("fault.")
     }
     faults = tuple(dataclasses.replace(fault, **varied) for fault in spec.faults)
     spec = dataclasses.replace(spec, faults=faults)
     return PhasedTask(
-        EXPERIMENT_TASK.supervise(
+        spec.of.experiment.supervise(
             base if rig is None else on_rig(base, rig, on_warning=warnings.warn)
         ),
         spec,

@@ -11,11 +11,11 @@ import numpy as np
 
 from surgisoft.agents.evaluate import RATES, Summary, summary
 from surgisoft.experiments.run import log_file
-from surgisoft.experiments.spec import EXPERIMENT_TASK, Experiment
-from surgisoft.experiments.task import Row
+from surgisoft.experiments.spec import Experiment
 from surgisoft.files import write_atomically, write_json
 from surgisoft.tasks.episodes.file import load_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.supervision import Row
 
 TEXTS = ("setting", "case", "lesion", "outcome")
 """Columns of a row that hold text."""
@@ -37,11 +37,8 @@ class SettingResult:
     """Name of a number of the episodes -> its summary over all of them."""
     outcomes: dict[str, int]
     """How episodes ended -> number of episodes, the most frequent first."""
-
-    @property
-    def worst(self) -> int:
-        """Number of the worst episode."""
-        return max(self.rows, key=EXPERIMENT_TASK.badness)["episode"]
+    worst: int
+    """Number of the worst episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +60,7 @@ class Results:
     @property
     def worst(self) -> tuple[str, int]:
         """Label and number of the worst episode of all."""
-        row = max(self.rows, key=EXPERIMENT_TASK.badness)
+        row = max(self.rows, key=self.experiment.of.experiment.badness)
         return row["setting"], row["episode"]
 
     def log(self, label: str, episode: int) -> EpisodeLog:
@@ -84,7 +81,10 @@ def sum_up(spec: Experiment, folder: Path, rows: list[Row]) -> Results:
         }
         values = {name: episodes[0][name] for name in varied if name in episodes[0]}
         outcomes = dict(Counter(row["outcome"] for row in episodes).most_common())
-        found.append(SettingResult(label, episodes[0]["case"], values, episodes, overall, outcomes))
+        worst = max(episodes, key=spec.of.experiment.badness)["episode"]
+        found.append(
+            SettingResult(label, episodes[0]["case"], values, episodes, overall, outcomes, worst)
+        )
     return Results(spec, folder, found)
 
 

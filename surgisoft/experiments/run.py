@@ -18,7 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from surgisoft.agents.evaluate import episode_table
-from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks
+from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacles
 from surgisoft.agents.on_rig import at_benches, real_benches
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
@@ -27,19 +27,18 @@ from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.phases import REASONS, PhasedTask, with_phase_events
 from surgisoft.experiments.plan import Setting, build_task, scene_of, settings
 from surgisoft.experiments.spec import (
-    EXPERIMENT_TASK,
     FILE,
     Case,
     Experiment,
     load_experiment,
     save_experiment,
 )
-from surgisoft.experiments.task import Row
 from surgisoft.files import json_safe, read_json, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
+from surgisoft.tasks.supervision import Row
 from surgisoft.workers import torch_threads, workers
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
@@ -109,8 +108,9 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
     if force and there:
         shutil.rmtree(folder)
     (folder / "rows").mkdir(parents=True, exist_ok=True)
-    scene = scene_of(spec, settings(spec)[0])
-    about = {"versions": versions(), "scene_hash": scene.content_hash}
+    about: dict[str, object] = {"versions": versions()}
+    if spec.in_scene:
+        about["scene_hash"] = scene_of(spec, settings(spec)[0]).content_hash
     write_json(folder / "versions.json", about)
     save_experiment(spec, folder / FILE)
 
@@ -121,8 +121,9 @@ def check_playable(spec: Experiment) -> None:
     Checked in simulation for every case: observations and actions are the same on the rig.
     """
     found, seen = settings(spec), set()
-    for setting in {setting.lesion: setting for setting in found}.values():
-        scene_of(spec, setting)
+    if spec.in_scene:
+        for setting in {setting.lesion: setting for setting in found}.values():
+            scene_of(spec, setting)
     for setting in found:
         case = setting.case
         if (case.policy, case.arm) not in seen:
@@ -228,11 +229,12 @@ def roll_out_block(
 ) -> Block:
     """Roll out episodes `first` to `first + count - 1` of a setting."""
     task, controllers = opened(spec, setting)
-    checks = ExactChecks(task)
+    checks = ExactChecks(task) if has_obstacles(task) else None
     recorders = EpisodeRecorders(task, setting.case.policy, spec.seed, setting.case.plant)
 
     def watch(now: Instant) -> None:
-        checks(now)
+        if checks is not None:
+            checks(now)
         recorders(now)
 
     try:
@@ -241,15 +243,19 @@ def roll_out_block(
     finally:
         if real_benches(task):  # they are closed now: the next block opens them anew
             opened.cache_clear()
-    rows = _rows(task, setting, first, result, checks.checks())
-    worst = max(rows, key=EXPERIMENT_TASK.badness)["episode"]
+    rows = _rows(task, setting, first, result, None if checks is None else checks.checks())
+    worst = max(rows, key=spec.of.experiment.badness)["episode"]
     kept = {0, worst} & {row["episode"] for row in rows}
     logs = {n: with_phase_events(task.experiment, recorders.log(n)) for n in sorted(kept)}
     return Block(rows, logs)
 
 
 def _rows(
-    task: PhasedTask, setting: Setting, first: int, result: Rollout, checks: list[EpisodeCheck]
+    task: PhasedTask,
+    setting: Setting,
+    first: int,
+    result: Rollout,
+    checks: list[EpisodeCheck] | None,
 ) -> list[Row]:
     table = episode_table(task, result, checks)
     for name in DROPPED:
@@ -289,13 +295,14 @@ def _longest(on: Tensor) -> Tensor:
     return best
 
 
-def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck]) -> list[str]:
+def _outcomes(task: PhasedTask, result: Rollout, checks: list[EpisodeCheck] | None) -> list[str]:
     """How each episode ended, in words."""
     reason, where = result.end("reason").tolist(), result.end("reason_phase").tolist()
     names, found = [phase.name for phase in task.phases], []
-    for i, check in enumerate(checks):
-        if check.contact is not None:
-            found.append(f"contact of {check.contact.between[0]}, {check.contact.between[1]}")
+    for i in range(result.episodes):
+        contact = None if checks is None else checks[i].contact
+        if contact is not None:
+            found.append(f"contact of {contact.between[0]}, {contact.between[1]}")
         elif result.failed[i]:
             found.append("an arm is no longer finite")
         elif reason[i]:

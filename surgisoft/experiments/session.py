@@ -12,10 +12,10 @@ from surgisoft.config import read_toml
 from surgisoft.errors import InputError
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
 from surgisoft.experiments.pictures import film, write_pictures
-from surgisoft.experiments.plan import ARMS, settings
+from surgisoft.experiments.plan import settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
 from surgisoft.experiments.run import open_results, run_experiment
-from surgisoft.experiments.spec import SCRIPTED, TASK, Experiment, load_experiment
+from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
 from surgisoft.files import write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
@@ -59,8 +59,8 @@ def open_experiment(name: str | Path) -> Experiment:
 def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     """The experiment with one more case for each scripted one: the policy of a training run."""
     trained = RunFolder(folder).config["task"]
-    if trained != TASK:
-        raise InputError(f"{folder}: was trained on {trained}; expected a run of {TASK}")
+    if trained != spec.scenario:
+        raise InputError(f"{folder}: was trained on {trained}; expected a run of {spec.scenario}")
     path = Path(folder).resolve()
     twins = tuple(
         replace(case, name=f"{case.name}-{path.name}", policy=str(path))
@@ -83,7 +83,7 @@ def with_rigs(spec: Experiment, rigs: Iterable[str]) -> Experiment:
     if not any(case.plant == "rig" for case in spec.cases):
         raise InputError(f"--rig: {spec.name} has no case with plant = 'rig' that could use it")
     cases = tuple(replace(case, rigs=rigs) if case.plant == "rig" else case for case in spec.cases)
-    names = {parse_rig(text).name for text in rigs_by_arm(rigs, ARMS).values()}
+    names = {parse_rig(text).name for text in rigs_by_arm(rigs, spec.of.agents).values()}
     together = spec.together if names <= set(SIMULATED) else 1
     return replace(spec, cases=cases, together=together)
 
@@ -134,11 +134,9 @@ def finish_experiment(
     rows = run_experiment(spec, folder, processes, progress)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
-    films = {
-        (label, episode): film(results.log(label, episode))
-        for label, episode in shown_episodes(results)
-    }
-    files += write_pictures(results, films)
+    logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}
+    films = {place: film(log) for place, log in logs.items() if log.camera is not None}
+    files += write_pictures(results, list(logs), films)
     files.append(write_page(experiment_page(results, films, about), folder / "report.html"))
     drop_logs(results)
     if replays:

@@ -10,21 +10,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from surgisoft.config import Rule, Where, from_table, merged, read_toml, to_table, write_toml
+from surgisoft.config import (
+    Rule,
+    Where,
+    describe,
+    from_table,
+    merged,
+    read_toml,
+    to_table,
+    write_toml,
+)
 from surgisoft.errors import InputError
-from surgisoft.experiments.ablation import ABLATION
 from surgisoft.scene.spec import Length, Point
-from surgisoft.tasks.circle_ablation import CircleAblationConfig
-from surgisoft.tasks.registry import with_present_names
+from surgisoft.tasks.base import TaskSpec
+from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
 
 FORMAT = 1
 """Version of the file's format."""
 FILE = "experiment.toml"
 """Name of the exact configuration in a folder of results."""
-EXPERIMENT_TASK = ABLATION
-"""The task that experiments are made with."""
-TASK = EXPERIMENT_TASK.name
-"""Name of that task in the registry."""
+FIRST_TASK = "circle_ablation"
+"""The task of files that name none: the only one of the first experiments."""
 CONTROLLERS = ("hold", "rest", "scripted", "policy")
 """Built-in controllers of an arm; a file may define more."""
 PLANTS = ("simulation", "rig")
@@ -60,20 +66,23 @@ class Phase:
     """Its name, unique in the experiment."""
     timeout_s: Positive
     """Longest time in this phase, s."""
-    laser: Name = "hold"
-    """Controller of the laser arm: hold, rest, scripted, policy, or one of `drivers`."""
-    endoscope: Name = "hold"
-    """Controller of the endoscope arm."""
+    arms: tuple[tuple[Name, Name], ...] = ()
+    """(arm, controller) for each arm of the task, in the file as `ARM = "CONTROLLER"`: hold (the
+    default), rest, scripted, policy, or one of `drivers`."""
     beam: bool = False
     """Whether the phase permits the beam; the interlock must permit it, too."""
-    until: Annotated[str, _one_of(EXPERIMENT_TASK.conditions)] = "never"
-    """The condition to go on to the next phase."""
+    until: str = "never"
+    """The condition to go on to the next phase, one of those that the task offers."""
     within: Annotated[float, Rule("a number from -1 to 1000", lambda v: -1.0 <= v <= 1e3)] = -1.0
     """Threshold of the condition, in the condition's unit; -1: its default."""
     hold_s: Duration = 0.0
     """Time for which the condition has to hold without interruption, s."""
     on_timeout: Annotated[str, _one_of(("abort", "go on"))] = "abort"
     """What happens when the time of this phase is out."""
+
+    def controller(self, arm: str) -> str:
+        """Name of what controls an arm in this phase."""
+        return dict(self.arms)[arm]
 
 
 @dataclass(frozen=True)
@@ -105,9 +114,9 @@ class Case:
     specimen: Seed = 0
     """On a simulated rig: seed of the robot."""
     rigs: tuple[str, ...] = ("virtual",)
-    """On the rig: `NAME[:option=value,...]` for both arms, or `ARM=NAME[:...]` for one of them."""
+    """On the rig: `NAME[:option=value,...]` for all arms, or `ARM=NAME[:...]` for one of them."""
     arm: str = ""
-    """Arm model of both arms: default or a folder; without it the scene's."""
+    """Arm model of all arms: default or a folder; without it the scene's."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +148,7 @@ class Vary:
 class Fault:
     """A failure of a chamber in every episode."""
 
-    arm: Annotated[str, _one_of(("laser", "endoscope"))]
+    arm: Name
     """Arm of the chamber."""
     at_s: Duration
     """Time of the failure, s from the episode's begin."""
@@ -170,10 +179,12 @@ class Experiment:
 
     name: Name
     """Name of the experiment."""
-    scene: str
-    """Folder of the scene, relative to the file."""
     phases: tuple[Phase, ...]
     """Phases of an episode, in order."""
+    scenario: Annotated[str, _one_of(TASKS)] = FIRST_TASK
+    """Name of the task, as in `surgisoft evaluate --task`."""
+    scene: str = ""
+    """Folder of the scene, relative to the file; empty for a task without a scene."""
     repeats: Count = 1
     """Episodes of each condition."""
     seed: Seed = 0
@@ -192,18 +203,32 @@ class Experiment:
     """Failures that are injected."""
     limits: Limits = field(default_factory=Limits)
     """Limits that switch the beam off or abort an episode."""
-    task: CircleAblationConfig = field(default_factory=CircleAblationConfig)
-    """Fields of the task `circle_ablation`, without `scene` and `arm`."""
+    task: Any = None
+    """Fields of the task's configuration, without `scene` and `arm`."""
     note: str = ""
     """Free text, for people."""
     format: Format = FORMAT
     """Version of this file format."""
+
+    @property
+    def of(self) -> TaskSpec:
+        """The task's entry in the registry."""
+        return spec_of(self.scenario)
+
+    @property
+    def in_scene(self) -> bool:
+        """Whether the task takes place in a scene."""
+        return any(each.name == "scene" for each in dataclasses.fields(self.of.config))
 
 
 def load_experiment(path: str | Path) -> Experiment:
     """Read an experiment's file; an InputError names file, line and field of what is wrong."""
     path = Path(path)
     table, where = read_toml(path)
+    name = table.get("scenario", FIRST_TASK)
+    if name not in TASKS:
+        raise (where / "scenario").error(f"got {describe(name)}", f"one of {', '.join(TASKS)}")
+    of = spec_of(name)
     given = table.pop("task", {})
     if not isinstance(given, dict):
         raise (where / "task").error(f"got '{given}'", "a table")
@@ -212,17 +237,32 @@ def load_experiment(path: str | Path) -> Experiment:
             raise (where / "task" / name).error(
                 "does not belong here", "the scene at the top, the arm in a case"
             )
-    plain = to_table(CircleAblationConfig()) | {"scene": ""}
-    task = task_config(merged(plain, with_present_names(CircleAblationConfig(), given)), where)
+    plain = to_table(of.config)
+    plain |= {"scene": ""} if "scene" in plain else {}
+    task = task_config(of, merged(plain, with_present_names(of.config, given)), where)
+    table["phases"] = _with_arms(table.get("phases"), of.agents)
     spec = dataclasses.replace(from_table(Experiment, table, where), task=task)
     _check_whole(spec, where)
     return _absolute(spec, where)
 
 
-def task_config(table: dict, where: Where) -> CircleAblationConfig:
-    """The task's configuration from a whole table; errors name the file and the field."""
+def _with_arms(phases: Any, agents: tuple[str, ...]) -> Any:
+    """The tables of phases with the controllers of all arms, in their order, under `arms`."""
+    if not isinstance(phases, list):
+        return [] if phases is None else phases
+    return [
+        {name: value for name, value in phase.items() if name not in agents}
+        | {"arms": [[agent, phase.get(agent, "hold")] for agent in agents]}
+        if isinstance(phase, dict)
+        else phase
+        for phase in phases
+    ]
+
+
+def task_config(of: TaskSpec, table: dict, where: Where) -> Any:
+    """A task's configuration from a whole table; errors name the file and the field."""
     try:
-        return from_table(CircleAblationConfig, table, where / "task")
+        return from_table(type(of.config), table, where / "task")
     except InputError as error:
         text = str(error)
         raise InputError(
@@ -236,7 +276,11 @@ def save_experiment(spec: Experiment, path: Path) -> None:
     for name in ("scene", "arm"):
         table["task"].pop(name, None)
     folder = path.parent.resolve()
-    table["scene"] = os.path.relpath(spec.scene, folder)
+    table["scene"] = os.path.relpath(spec.scene, folder) if spec.scene else ""
+    table["phases"] = [
+        {name: value for name, value in phase.items() if name != "arms"} | dict(phase["arms"])
+        for phase in table["phases"]
+    ]
     for driver in table["drivers"]:
         if driver["schedule"]:
             driver["schedule"] = os.path.relpath(driver["schedule"], folder)
@@ -280,7 +324,7 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
 
     return dataclasses.replace(
         spec,
-        scene=there(spec.scene, where / "scene", "a scene's folder"),
+        scene=there(spec.scene, where / "scene", "a scene's folder") if spec.in_scene else "",
         cases=tuple(of_case(i, case) for i, case in enumerate(spec.cases)),
         drivers=tuple(of_driver(i, driver) for i, driver in enumerate(spec.drivers)),
     )
@@ -293,6 +337,12 @@ def _check_whole(spec: Experiment, where: Where) -> None:
     for name in ("phases", "cases"):
         if not getattr(spec, name):
             raise (where / name).error("none is given", "at least one")
+    if bool(spec.scene) != spec.in_scene:
+        came = "missing" if spec.in_scene else f"got '{spec.scene}'"
+        expected = "a scene's folder" if spec.in_scene else f"none: {spec.scenario} has no scene"
+        raise (where / "scene").error(came, expected)
+    if spec.lesions and not spec.in_scene:
+        raise (where / "lesions").error("got lesions", f"none: {spec.scenario} has no scene")
     defined = [driver.name for driver in spec.drivers]
     for i, driver in enumerate(spec.drivers):
         place = where / "drivers" / i
@@ -305,12 +355,22 @@ def _check_whole(spec: Experiment, where: Where) -> None:
         times = [row[0] for row in driver.waypoints]
         if times and (times[0] < 0.0 or sorted(set(times)) != times):
             raise (place / "waypoints").error(f"times {times}", "times that rise from 0 s")
+    conditions = spec.of.experiment.conditions
     for i, phase in enumerate(spec.phases):
-        for arm in ("laser", "endoscope"):
-            if getattr(phase, arm) not in (*CONTROLLERS, *defined):
+        if phase.until not in conditions:
+            raise (where / "phases" / i / "until").error(
+                f"got '{phase.until}'", f"one of {', '.join(conditions)}"
+            )
+        for arm, controller in phase.arms:
+            if controller not in (*CONTROLLERS, *defined):
                 raise (where / "phases" / i / arm).error(
-                    f"got '{getattr(phase, arm)}'", f"one of {', '.join((*CONTROLLERS, *defined))}"
+                    f"got '{controller}'", f"one of {', '.join((*CONTROLLERS, *defined))}"
                 )
+    for i, fault in enumerate(spec.faults):
+        if fault.arm not in spec.of.agents:
+            raise (where / "faults" / i / "arm").error(
+                f"got '{fault.arm}'", f"one of {', '.join(spec.of.agents)}"
+            )
     known = [phase.name for phase in spec.phases]
     if spec.limits.retreat not in ("", *known):
         raise (where / "limits" / "retreat").error(

@@ -808,7 +808,7 @@ def since(recording: Recording, begin_s: float, name: str) -> Recording:
         measured=recording.measured[rows],
         key_points_mm=points[rows],
         commanded=of(recording.commanded),
-        run=of(recording.run),
+        run=recording.run[rows],
         temp_C=of(recording.temp_C),
         payload_g=of(recording.payload_g),
         note=f"{recording.note}, from {begin_s:.1f} s on",

@@ -68,10 +68,9 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
                 else torch.from_numpy(room[run].copy())
             )
     noise = np.max([actuation_noise(recording, actuation) for recording in recordings], axis=0)
-    if all(room.isnan().all() for room in warmth):
-        warmth = None
+    rooms = None if all(room.isnan().all() for room in warmth) else warmth
     known = predicted if len(predicted) == len(times) else None
-    packed = pack(times, pressures, points, tuple(float(x) for x in noise), warmth, stood, known)
+    packed = pack(times, pressures, points, tuple(float(x) for x in noise), rooms, stood, known)
     return replace(packed, noise_mm=known_noise(recordings))
 
 
@@ -128,8 +127,8 @@ def arm_spec(recordings: list[Recording], actuation: str = "measured") -> ArmSpe
 
 def _mean_temperature(recordings: list[Recording]) -> float | None:
     """Mean temperature of the room, degrees Celsius; None where no recording knows it."""
-    room = [r.temp_C for r in recordings if r.temp_C is not None]
-    room = np.concatenate(room) if room else np.zeros(0)
+    known = [r.temp_C for r in recordings if r.temp_C is not None]
+    room = np.concatenate(known) if known else np.zeros(0)
     room = room[np.isfinite(room)]
     return float(room.mean()) if len(room) else None
 
@@ -143,9 +142,10 @@ def outside_range(spec: ArmSpec, recordings: list[Recording]) -> list[str]:
         room = OUTSIDE_SHARE * spec.span[chamber]
         low, high = spec.low[chamber] - room, spec.high[chamber] + room
         what = f"range {spec.low[chamber]:.4g} to {spec.high[chamber]:.4g}"
-        if spec.idle[chamber] is not None:
-            low, high = spec.idle[chamber] - room, spec.idle[chamber] + room
-            what = f"place, where it stood still at {spec.idle[chamber]:.4g}"
+        idle = spec.idle[chamber]
+        if idle is not None:
+            low, high = idle - room, idle + room
+            what = f"place, where it stood still at {idle:.4g}"
         if came[0] < low or came[1] > high:
             notes.append(
                 f"chamber {chamber + 1} goes from {came[0]:.4g} to {came[1]:.4g} {spec.unit}, "

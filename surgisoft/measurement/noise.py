@@ -23,9 +23,11 @@ def known_noise(recordings: list[Recording]) -> float | None:
 
 def stated_noise(recordings: list[Recording]) -> float | None:
     """Standard deviation of one coordinate of a key point, mm; None where one does not state it."""
-    if any(recording.noise_mm is None for recording in recordings):
+    stated = [recording.noise_mm for recording in recordings]
+    known = [noise_mm for noise_mm in stated if noise_mm is not None]
+    if len(known) < len(stated):
         return None
-    square = [recording.noise_mm**2 for recording in recordings]
+    square = [noise_mm**2 for noise_mm in known]
     return float(np.sqrt(np.average(square, weights=[r.samples for r in recordings])))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
+from surgisoft.tasks.supervision import BEAMLESS, ExperimentTask
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
 from surgisoft.tasks.world.scene import SceneState
@@ -135,6 +136,11 @@ class TaskSpec:
     """Fields of `agents.presets.Preset` in which the task's `fast` preset differs."""
     training_steps: int | None = None
     """Environment steps of a training run with the `fast` preset; None: the paper's 20 million."""
+    experiment: ExperimentTask = BEAMLESS
+    """What experiments need to know of it."""
+    success_rule: Callable[[Any], str] | None = None
+    """(config) -> what an episode needs to be a success, in words; None: the task has no success.
+    """
 
 
 def weighted(terms: Mapping[str, Tensor], weights: Any) -> dict[str, Tensor]:

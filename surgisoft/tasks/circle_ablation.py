@@ -16,6 +16,7 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.observations import (
     TIME,
     Block,
@@ -344,4 +345,6 @@ CIRCLE_ABLATION = TaskSpec(
         "evaluation_episodes": 16,
     },
     training_steps=1_000_000,
+    experiment=LASER_EXPERIMENT,
+    success_rule=success_rule,
 )

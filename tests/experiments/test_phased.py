@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from surgisoft.errors import InputError
-from surgisoft.experiments.ablation import AblationSupervision
 from surgisoft.experiments.controllers import (
     Schedule,
     Waypoints,
@@ -20,6 +19,7 @@ from surgisoft.experiments.run import roll_out_block
 from surgisoft.experiments.spec import Fault, load_experiment
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation
+from surgisoft.tasks.laser_supervision import LaserSupervision
 from tests.experiments.tiny import FAULT, TINY, write
 
 
@@ -37,7 +37,7 @@ def base(spec):
 @pytest.fixture(scope="module")
 def cutting(spec, base):
     """The phased task, and two of its episodes in the phase with the beam, all well."""
-    task = PhasedTask(AblationSupervision(base), spec)
+    task = PhasedTask(LaserSupervision(base), spec)
     state = Episodes(task).seeded(0, 2)
     state = replace(state, goal=replace(state.goal, phase=state.goal.phase + 1))
     return task, _with(state, fraction=1.0, clearance=20.0)
@@ -68,13 +68,11 @@ def test_the_interlock_lets_the_beam_on_only_when_all_is_well(cutting):
 
 def test_an_experiment_cannot_loosen_the_scene_s_clearance(cutting, spec, base):
     loose = replace(spec, limits=replace(spec.limits, clearance_mm=-5.0))
-    assert PhasedTask(AblationSupervision(base), loose).clear_mm == base.spec.limits.clearance_mm
+    assert PhasedTask(LaserSupervision(base), loose).clear_mm == base.spec.limits.clearance_mm
     strict = replace(spec, limits=replace(spec.limits, clearance_mm=7.0))
     _, state = cutting
     assert (
-        not PhasedTask(AblationSupervision(base), strict)
-        .released(_with(state, clearance=6.9))
-        .any()
+        not PhasedTask(LaserSupervision(base), strict).released(_with(state, clearance=6.9)).any()
     )
 
 
@@ -107,7 +105,7 @@ def test_an_abort_retreats_and_then_ends(cutting, base, spec):
     third = replace(spec.phases[0], name="out", until="never", timeout_s=0.2)
     limits = replace(spec.limits, retreat="out")
     task = PhasedTask(
-        AblationSupervision(base), replace(spec, phases=(*spec.phases, third), limits=limits)
+        LaserSupervision(base), replace(spec, phases=(*spec.phases, third), limits=limits)
     )
     goal = _walk(task, cutting[1], 5, fraction=0.0, clearance=20.0)
     assert goal.phase.tolist() == [2, 2]
@@ -120,7 +118,7 @@ def test_an_abort_retreats_and_then_ends(cutting, base, spec):
 
 def test_a_condition_has_to_hold_without_a_break(cutting, base, spec):
     look = replace(spec.phases[0], until="centred", within=1000.0, hold_s=0.2, timeout_s=9.0)
-    task = PhasedTask(AblationSupervision(base), replace(spec, phases=(look, spec.phases[1])))
+    task = PhasedTask(LaserSupervision(base), replace(spec, phases=(look, spec.phases[1])))
     state = replace(cutting[1], goal=replace(cutting[1].goal, phase=cutting[1].goal.phase * 0))
     good, bad = {"fraction": 1.0, "clearance": 20.0}, {"fraction": 0.5, "clearance": 20.0}
     goal = _walk(task, state, 1, **good)
@@ -159,7 +157,7 @@ def test_a_lost_chamber_stops_the_beam_within_one_step(tmp_path):
 def test_a_fault_needs_a_chamber_that_is_there(spec, base):
     wrong = replace(spec, faults=(Fault("laser", 1.0, 4),))
     with pytest.raises(InputError, match="chamber 4 of arm 'laser', expected 1 to 3"):
-        PhasedTask(AblationSupervision(base), wrong)
+        PhasedTask(LaserSupervision(base), wrong)
 
 
 def test_values_between_rows_are_linear():
@@ -172,7 +170,7 @@ def test_values_between_rows_are_linear():
 
 def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, tmp_path):
     long = replace(spec.phases[0], until="never", timeout_s=9.0)
-    task, state = PhasedTask(AblationSupervision(base), replace(spec, phases=(long,))), cutting[1]
+    task, state = PhasedTask(LaserSupervision(base), replace(spec, phases=(long,))), cutting[1]
     state = replace(state, goal=replace(state.goal, phase=state.goal.phase * 0))
     file = tmp_path / "press.csv"
     file.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1.0,5,0,0\n")

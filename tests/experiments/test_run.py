@@ -15,6 +15,7 @@ from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import load_experiment
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
+from surgisoft.tasks.registry import spec_of
 from tests.experiments.tiny import TINY, write
 from tests.report.browser import chromium, look
 
@@ -155,3 +156,27 @@ def test_evaluate_states_the_rule_of_success(monkeypatch):
     found = session.evaluate("random", "circle_ablation", config=fast)
     assert found.to_json()["success_rule"] == success_rule(fast)
     assert "within 0.7 mm of its target" in found.success_rule
+
+
+@pytest.mark.parametrize("name", ["track_circle", "keyhole"])
+def test_a_task_without_a_scene_makes_an_experiment(name, tmp_path, capsys):
+    """From a file to its report: phases, the arm's controllers, a fault, numbers of the task."""
+    agents = "".join(f'{agent} = "policy"\n' for agent in spec_of(name).agents)
+    file = tmp_path / "short.toml"
+    file.write_text(
+        f'name = "short"\nscenario = "{name}"\n[limits]\ntime_s = 0.6\n'
+        f'[[phases]]\nname = "go"\ntimeout_s = 0.3\non_timeout = "go on"\n{agents}'
+        '[[phases]]\nname = "wait"\ntimeout_s = 9.0\n'
+        f'[[faults]]\narm = "{spec_of(name).agents[0]}"\nchamber = 1\nat_s = 0.4\n'
+    )
+    assert run(["experiment", "run", str(file), "-o", str(tmp_path / "r"), "--no-replays"]) == 0
+    (row,) = _rows(tmp_path / "r")
+    assert row["outcome"] == "time out"
+    assert row["go_s"] + row["wait_s"] == pytest.approx(0.6)
+    assert row["beam_s"] == 0.0
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "chamber 1 goes to 0 kPa from 0.4 s on" in page
+    file.write_text(f'scene = "."\n{file.read_text()}')
+    capsys.readouterr()
+    assert run(["experiment", "check", str(file)]) == 2
+    assert f":1: scene: got '.'; expected none: {name} has no scene" in capsys.readouterr().err

@@ -118,7 +118,7 @@ def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
     assert [case.rigs for case in changed.cases] == [("virtual",), ("virtual:seed=3",)]
     assert (spec.together, changed.together) == (3, 3)
     found = settings(changed)
-    assert rig_config(found[1], Where(tmp_path)).rigs == ("virtual:seed=3",)
+    assert rig_config(found[1], Where(tmp_path), spec.of.agents).rigs == ("virtual:seed=3",)
     real = with_rigs(spec, ("laser=tests.rig.own_rig:OwnRig:port=x",))
     assert real.together == 1, "one bench runs one episode after the other"
     save_experiment(real, tmp_path / "saved.toml")

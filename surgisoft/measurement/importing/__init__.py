@@ -1,6 +1,11 @@
 """Import of a laboratory's files as recordings, by a map file (docs/recordings.md)."""
 
-from surgisoft.measurement.importing.convert import Imported, import_files, import_log
+from surgisoft.measurement.importing.convert import (
+    Imported,
+    import_files,
+    import_lerobot,
+    import_log,
+)
 from surgisoft.measurement.importing.raw import RawTable, Reader
 from surgisoft.measurement.importing.readers import READERS
 from surgisoft.measurement.importing.ready_maps import READY_MAPS
@@ -14,6 +19,7 @@ __all__ = [
     "RawTable",
     "Reader",
     "import_files",
+    "import_lerobot",
     "import_log",
     "load_map",
 ]

@@ -68,8 +68,8 @@ def renewal_s(parts: list[tuple[np.ndarray, np.ndarray]]) -> float:
 
     0 where no run has two readings.
     """
-    steps = [np.diff(t_s[renewed_rows(values)]) for t_s, values in parts]
-    steps = np.concatenate([np.empty(0), *steps])
+    by_run = [np.diff(t_s[renewed_rows(values)]) for t_s, values in parts]
+    steps = np.concatenate([np.empty(0), *by_run])
     return float(np.median(steps)) if len(steps) else 0.0
 
 
@@ -277,4 +277,5 @@ def main_times(main: RawTable, spec: ImportMap, count: int | None) -> np.ndarray
         return times(main, spec.time.column, spec.time.unit)
     if count is None:
         count = len(main.numbers([1]))
+    assert spec.time.rate_hz is not None, "a [time] table without a column has a rate"
     return np.arange(count) / spec.time.rate_hz

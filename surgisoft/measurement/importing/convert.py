@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +41,7 @@ from surgisoft.measurement.importing.spec import (
 from surgisoft.measurement.importing.timing import timing_notes
 from surgisoft.measurement.importing.units import factor
 from surgisoft.measurement.recordings import Recording
+from surgisoft.measurement.recordings.lerobot import load_lerobot
 from surgisoft.measurement.recordings.log import read_log
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
@@ -72,6 +74,11 @@ def import_log(path: Path, name: str) -> Imported:
     """The recording in a log of a recording, such as one that was interrupted; it needs no map."""
     recording, lacking = read_log(path)
     return Imported(replace(recording, name=name), [lacking] if lacking else [])
+
+
+def import_lerobot(folder: Path, name: str) -> Imported:
+    """The recording in a LeRobotDataset whose values have a recording's names; it needs no map."""
+    return Imported(load_lerobot(folder, name), [])
 
 
 def sets_of_files(paths: Sequence[Path], spec: ImportMap) -> list[dict[str, Path]]:
@@ -108,7 +115,12 @@ def _files(paths: Sequence[Path], spec: ImportMap) -> list[Path]:
     """The files given, and those of folders that have a role."""
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
+        if path.is_dir() and any(
+            role.format != AUTO and (known := reader(role.format)).is_folder and known.fits(path)
+            for role in spec.file.values()
+        ):
+            found.append(path)
+        elif path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.is_file() and _roles_of(p, spec))
             if not inside:
                 raise InputError(f"{path}: no file here fits the map, expected {_patterns(spec)}")
@@ -270,11 +282,12 @@ def _context_value(
         return spec
     if spec.column is not None:
         return joined.columns[main, spec.column]
+    assert spec.from_name is not None, "a source is a value, a column or a part of the file's name"
     match = re.search(spec.from_name, joined.main.path.name)
     if match is None and spec.otherwise is not None:
         return spec.otherwise
     try:
-        return float(match[1])
+        return float(match[1] if match else "")
     except (TypeError, ValueError) as error:
         raise InputError(
             f"{joined.main.path}: no number for {name} in the file's name by {spec.from_name!r}, "
@@ -357,17 +370,18 @@ def _as_runs(parts: list[Imported], spec: ImportMap, name: str) -> Imported:
         if all(getattr(r, field) is not None for r in placed)
     }
     run = np.concatenate([r.run + b for r, b in zip(recordings, before, strict=False)])
-    gravity = _common_gravity(recordings)
-    whole = replace(first, name=name, run=run, gravity=gravity, **({"commanded": None} | stacked))
+    changed: dict[str, Any] = {"commanded": None, "gravity": _common_gravity(recordings)}
+    whole = replace(first, name=name, run=run, **(changed | stacked))
     notes = [f"{p.recording.name}: {n}" if len(parts) > 1 else n for p in parts for n in p.notes]
     return Imported(whole, notes)
 
 
 def _common_gravity(recordings: list[Recording]) -> np.ndarray | None:
     """(3,) mean of the files' directions, which differ because each file has another rest frame."""
-    if recordings[0].gravity is None:
+    known = [recording.gravity for recording in recordings if recording.gravity is not None]
+    if not known:
         return None
-    mean = np.mean([recording.gravity for recording in recordings], axis=0)
+    mean = np.mean(known, axis=0)
     return mean / np.linalg.norm(mean)
 
 

@@ -253,7 +253,7 @@ def _raw_point(
         position = cells[0] * scale
     else:
         position = _circle(joined, np.stack(cells, axis=1) * scale, spec, j, notes)
-    if any(point.offset):
+    if any(point.offset) and point.quaternion is not None:
         q = joined.take(role, columns_of(point.quaternion, "xyzw"))
         arm = np.array(point.offset) * scale
         position = position + matrices(q, spec.quaternion_order) @ arm

@@ -158,5 +158,7 @@ class Reader:
     """Endings by which format = "auto" chooses this reader."""
     fits: Callable[[Path], bool] = _any_file
     """Whether a file looks as if it had this format; others do not get a role of this format."""
+    is_folder: bool = False
+    """Whether one input of this format is a folder as a whole."""
     states_unit: bool = False
     """Whether its files state the unit of positions, so that the map need not."""

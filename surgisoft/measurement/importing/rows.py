@@ -163,7 +163,7 @@ def _in_time(draft: Draft, spec: ImportMap, notes: list[str], place: Callable[[i
         at = Between.of(t_s, t_s + late)
         measured[rows] = at.linear(draft.measured[rows])
         keep[rows] &= at.inside & (at.gap_s <= LARGEST_GAP_S)
-        if commanded is not None:
+        if commanded is not None and draft.commanded is not None:
             at = Between.of(t_s, t_s + command_late)
             commanded[rows] = at.held(draft.commanded[rows])
             keep[rows] &= at.inside
@@ -218,8 +218,8 @@ def without_frozen(recording: Recording) -> tuple[Recording, list[str]]:
             f"{names} frozen at {recording.t_s[stretch.start]:.3f} s of run "
             f"{recording.run[stretch.start]}: {stretch.stop - stretch.start - 1} rows left out"
         )
-    names = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
-    values = {name: getattr(recording, name) for name in (*names, "predicted_mm")}
+    by_row = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
+    values = {name: getattr(recording, name) for name in (*by_row, "predicted_mm")}
     return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None}), notes
 
 

@@ -76,7 +76,7 @@ PERMUTATION = Rule(
 )
 NUMBERS = Rule("numbers >= 0", lambda some: min(some, default=0) >= 0)
 UNIT_VECTOR = Rule(
-    "three numbers, a unit vector", lambda vector: abs(np.linalg.norm(vector) - 1) <= 0.01
+    "three numbers, a unit vector", lambda vector: bool(abs(np.linalg.norm(vector) - 1) <= 0.01)
 )
 
 
@@ -382,21 +382,29 @@ class ImportMap:
                 f"got {describe(self.commanded.repeated)}",
                 '"keep": a command is held until the next one',
             )
-        filled = {}
-        for name in ("measured", "commanded", "key_points"):
-            part = getattr(self, name)
+        for part, name in (
+            (self.measured, "measured"),
+            (self.commanded, "commanded"),
+            (self.key_points, "key_points"),
+        ):
             if part and part.file and part.file not in self.file:
                 raise (where / name / "file").error(
                     f"got {describe(part.file)}", f"one of {', '.join(self.file)}"
                 )
-            filled[name] = replace(part, file=part.file or self.main) if part else None
-        found = self.file[filled["key_points"].file]
+        key_points = replace(self.key_points, file=self.key_points.file or self.main)
+        found = self.file[key_points.file or self.main]
         states_unit = found.format != AUTO and reader(found.format).states_unit
         if self.key_points.unit is None and not states_unit:
             raise (where / "key_points" / "unit").error(
                 "missing", f"the positions' unit, one of {', '.join(MM_PER)}"
             )
-        return replace(self, **filled)
+        return replace(
+            self,
+            measured=replace(self.measured, file=self.measured.file or self.main),
+            commanded=self.commanded
+            and replace(self.commanded, file=self.commanded.file or self.main),
+            key_points=key_points,
+        )
 
 
 def _check_format(name: str, where: Where) -> None:

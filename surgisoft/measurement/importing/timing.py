@@ -96,7 +96,7 @@ class Moves:
         back, ahead = round(BACK_S / self.step_s), self._ahead(length)
         coarse = max(1, -(-back // STEPS))
         near = np.arange(-back, min(back, ahead) + 1, coarse)
-        far = np.geomspace(back, ahead, 12).round().astype(int) if ahead > back else []
+        far = np.geomspace(back, ahead, 12).round().astype(int) if ahead > back else near[:0]
         shifts = np.union1d(np.union1d(near, far), [0]).astype(int)
         errors = {s: self._errors(rows, moved, length, s) for s in shifts.tolist()}
         best = min(errors, key=lambda s: errors[s].sum())
@@ -245,7 +245,10 @@ def held_period_s(recording: Recording) -> float | None:
 
 def _staircase(recording: Recording, usual: float) -> bool:
     """Whether the command is renewed as seldom as the measurement."""
-    steps = [np.diff(renewed_rows(recording.commanded[run])) for run in recording.runs]
+    command = recording.commanded
+    if command is None:
+        return False
+    steps = [np.diff(renewed_rows(command[run])) for run in recording.runs]
     return bool(np.median(np.concatenate(steps)) >= 0.8 * usual)
 
 
@@ -322,7 +325,7 @@ def _jackknife(shifts: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     total = error.sum(axis=1)
     blocks = error.shape[1]
     without = [_lowest(shifts, total - error[:, k]) for k in range(blocks)]
-    spread = np.sqrt((blocks - 1) / blocks * np.square(without - np.mean(without)).sum())
+    spread = np.sqrt((blocks - 1) / blocks * np.square(np.array(without) - np.mean(without)).sum())
     return _lowest(shifts, total), float(spread)
 
 

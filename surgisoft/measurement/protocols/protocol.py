@@ -56,12 +56,18 @@ class Protocol:
         if self.t_s is None or np.shape(self.t_s) != self.run.shape:
             self._fail("a continuous protocol needs a time for every row")
         object.__setattr__(self, "t_s", np.asarray(self.t_s, np.float64))
-        bad = (np.diff(self.t_s) <= 0) & (np.diff(self.run) == 0)
-        if bad.any() or not np.isfinite(self.t_s).all():
+        bad = (np.diff(self._times_s) <= 0) & (np.diff(self.run) == 0)
+        if bad.any() or not np.isfinite(self._times_s).all():
             row = int(np.flatnonzero(bad)[0]) + 2 if bad.any() else 1
             self._fail(f"time does not increase at row {row}; each run needs rising times")
         if min(np.count_nonzero(self.run == run) for run in set(self.run.tolist())) < 2:
             self._fail("a run has one row; a continuous run needs at least two")
+
+    @property
+    def _times_s(self) -> np.ndarray:
+        """(T,) s, times of a continuous protocol, which always has them."""
+        assert self.t_s is not None
+        return self.t_s
 
     def _fail(self, message: str) -> None:
         raise InputError(f"protocol '{self.name}': {message}")
@@ -82,7 +88,7 @@ class Protocol:
         points, its rows."""
         if self.kind == "settled":
             return self.commands[rows]
-        knots = self.t_s[rows] - self.t_s[rows.start]
+        knots = self._times_s[rows] - self._times_s[rows.start]
         times = period_s * np.arange(round(knots[-1] / period_s))
         columns = self.commands[rows].T
         return np.stack([np.interp(times, knots, column) for column in columns], axis=1)

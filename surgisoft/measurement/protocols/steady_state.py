@@ -38,7 +38,10 @@ def _in_runs(count: int, runs: int) -> np.ndarray:
 
 
 def back_and_forth(
-    lows: np.ndarray, highs: np.ndarray, order: Sequence[int], signs: np.ndarray
+    lows: Sequence[int] | np.ndarray,
+    highs: Sequence[int] | np.ndarray,
+    order: Sequence[int],
+    signs: Sequence[int],
 ) -> np.ndarray:
     """Every lattice point of a box once (T, m): neighbours in a row, the last axis of `order` fast.
 
@@ -82,7 +85,8 @@ def grid(points: int, limits: np.ndarray, rng: np.random.Generator):
     for k, (lows, highs) in enumerate(boxes):
         if k % len(deck) == 0:
             rng.shuffle(deck)
-        parts.append(back_and_forth(lows, highs, *deck[k % len(deck)]))
+        order, directions = deck[k % len(deck)]
+        parts.append(back_and_forth(lows, highs, order, directions))
     rng.shuffle(parts)
     path = np.concatenate(parts)
     if len(path) > points:
@@ -126,7 +130,8 @@ def walk(points: int, limits: np.ndarray, rng: np.random.Generator):
 def validation(points: int, limits: np.ndarray, rng: np.random.Generator):
     """Straight legs between uniformly drawn corners, each leg in one to nine steps; off lattice."""
     low, high = limits.T
-    rows, at = [], np.clip(0.0, low, high)
+    rows: list[np.ndarray] = []
+    at = np.clip(0.0, low, high)
     while len(rows) < points:
         corner = rng.uniform(low, high)
         steps = int(rng.integers(1, 10))

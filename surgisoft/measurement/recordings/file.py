@@ -49,7 +49,8 @@ def load_recordings(
     if any(isinstance(item, Recording) for item in given):
         read = ([i] if isinstance(i, Recording) else load_recordings(i, on_warning) for i in given)
         return [recording for part in read for recording in part]
-    files = _find([Path(p) for p in given], on_warning or _warn)
+    paths_only = [Path(item) for item in given if not isinstance(item, Recording)]
+    files = _find(paths_only, on_warning or _warn)
     return [load_recording(file, on_warning) for file in files]
 
 
@@ -199,15 +200,18 @@ def _assemble(
 ) -> Recording:
     """The recording from its cells (T, columns) and the rows (T,) that they stand in."""
 
+    def required(position: int) -> np.ndarray:
+        return np.ascontiguousarray(cells[:, at[position]])
+
     def column(position: int | None) -> np.ndarray | None:
-        return None if position is None else np.ascontiguousarray(cells[:, at[position]])
+        return None if position is None else required(position)
 
     def columns(positions: tuple[int, ...]) -> np.ndarray:
         return np.ascontiguousarray(cells[:, [at[i] for i in positions]])
 
     points = columns(layout.key_points)
     points = points if layout.mm_per_unit == 1 else points * layout.mm_per_unit
-    t_s = column(layout.time)
+    t_s = required(layout.time)
     run = _run_ids(table, column(layout.run), rows)
     _check_order(table, t_s, run, rows)
     path = table.path
@@ -315,6 +319,7 @@ def _to_arrow(recording: Recording) -> pa.Table:
     columns: dict[str, np.ndarray] = {"t_s": recording.t_s}
     for letter, values in (("p", recording.measured), ("c", recording.commanded)):
         for i in range(recording.chambers if values is not None else 0):
+            assert values is not None
             columns[f"{letter}{i + 1}_{recording.unit}"] = values[:, i]
     for j in range(recording.key_points):
         for a, axis in enumerate("xyz"):

@@ -49,8 +49,8 @@ class Recording:
     """(T, n, 3) float64, key points base to tip, arm base frame [mm]; NaN where missing."""
     commanded: np.ndarray | None = None
     """(T, m) float64, commanded actuation [`unit`]."""
-    run: np.ndarray | None = None
-    """(T,) int64 id of each sample's run, equal ids in one block; None becomes one run, id 0."""
+    run: np.ndarray = None  # type: ignore[assignment]  # always an array once constructed
+    """(T,) int64 id of each sample's run, equal ids in one block; left out, one run with id 0."""
     unit: str = "kPa"
     """Unit of the actuation: the suffix of the table's columns."""
     temp_C: np.ndarray | None = None

@@ -18,7 +18,7 @@ from surgisoft.measurement.recordings.recording import (
 
 UNIT_VECTOR = Rule(
     "three numbers, a unit vector (length 1)",
-    lambda vector: abs(np.linalg.norm(vector) - 1) <= UNIT_TOLERANCE,
+    lambda vector: bool(abs(np.linalg.norm(vector) - 1) <= UNIT_TOLERANCE),
 )
 """A direction, whose length may be off by what rounding explains."""
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.importing.readers import mcap, motive, parquet, text
+from surgisoft.measurement.importing.readers import lerobot, mcap, motive, parquet, text
 
 AUTO = "auto"
 """The format that stands for: by the name's ending, else text."""
@@ -22,6 +22,7 @@ READERS: dict[str, Reader] = {
     "parquet": parquet.READER,
     "motive": motive.READER,
     "mcap": mcap.READER,
+    "lerobot": lerobot.READER,
 }
 """The readers of this package."""
 

@@ -13,7 +13,7 @@ within half the usual step.
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ class Messages:
     def __init__(self, path: Path, topic: str, values: np.ndarray) -> None:
         self.path, self.topic, self.values = path, topic, values
 
-    def numbers(self, positions: list[int]) -> np.ndarray:
+    def numbers(self, positions: Sequence[int]) -> np.ndarray:
         """Cells (T, len(positions)) of columns counted from 0, NaN where missing."""
         return self.values[:, list(positions)]
 

@@ -1,0 +1,166 @@
+"""What a task with a laser and an endoscope offers to experiments: interlock and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks.supervision import NEVER, Condition, ExperimentTask, Row
+
+
+class LaserTask(Task, Protocol):
+    """A task in a scene whose laser burns towards a target while the endoscope sees it."""
+
+    config: Any
+    """Its configuration."""
+    spec: Any
+    """The scene's file."""
+    pointing: dict[str, Pointing]
+    """Inverse kinematics of each arm's axis, by the arm's name."""
+
+    def fires(self, state: TaskState) -> Tensor:
+        """(B,) bool: the beam is near its target and meets the organ, and the endoscope sees."""
+
+    def advance(
+        self, state: TaskState, actions: Mapping[str, Tensor], fired: Tensor | None = None
+    ) -> TaskState:
+        """Advance one step with the beam on where `fired` (B,) is set; None: where `fires`."""
+
+    def measured_error_mm(self, state: TaskState) -> Tensor:
+        """(B,) mm: distance of the measured beam from its target."""
+
+
+def _view(state: TaskState) -> Any:
+    view = state.world.scene.view
+    assert view is not None, "a task with a laser has an endoscope"
+    return view
+
+
+def _clearance(state: TaskState) -> Any:
+    clearance = state.world.scene.clearance
+    assert clearance is not None, "a task with a laser has bodies"
+    return clearance
+
+
+class LaserSupervision:
+    """`Supervision` of a task with a laser and an endoscope, in simulation or on rigs."""
+
+    def __init__(self, task: LaserTask):
+        self.task, self.clearance_limit_mm = task, task.spec.limits.clearance_mm
+
+    def in_sight(self, state: TaskState) -> Tensor:
+        """(B,) bool: the endoscope sees as much of the target as the scene requires."""
+        return _view(state).fraction >= self.task.spec.limits.view_fraction
+
+    def clearance_mm(self, state: TaskState) -> Tensor:
+        """(B,) mm: least clearance to bodies and between arms."""
+        return _clearance(state).least_mm
+
+    def collides(self, state: TaskState) -> Tensor:
+        """(B,) bool: an arm touches a body, the other arm or itself."""
+        return _clearance(state).collides
+
+    def fires(self, state: TaskState) -> Tensor:
+        """(B,) bool: the task would switch its beam on, see `LaserTask.fires`."""
+        return self.task.fires(state)
+
+    def fired(self, state: TaskState) -> Tensor:
+        """(B,) bool: the beam was on in the step that led here."""
+        return state.goal.fired
+
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor], fired: Tensor) -> TaskState:
+        """Advance one step; the beam burns where `fired` (B,) bool is set."""
+        return self.task.advance(state, actions, fired)
+
+    def action_through(self, agent: str, state: TaskState, target_mm: Tensor) -> Tensor:
+        """(B, m) kPa: inverse kinematics of the arm's axis through targets (B, 3) mm."""
+        return self.task.pointing[agent].action(state.world.arms[agent], target_mm)
+
+
+def _centred(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    view = _view(state)
+    return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
+
+
+def _aimed(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    return task.measured_error_mm(state) <= within
+
+
+def _cut(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    return task.measures(state)["completion"] >= within
+
+
+def _retracted(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    """Every arm but the endoscope's is near the pressures of its start."""
+    off = [
+        (part.seen_kPa - task.world.arms[name].first).abs().amax(1)
+        for name, part in state.world.arms.items()
+        if not name.startswith("endoscope")
+    ]
+    return torch.stack(off).amax(0) <= within
+
+
+def _incomplete(row: Row) -> tuple:
+    """Success first, then the share that was completed, then the beam's error."""
+    error = row.get("beam_error_mean_mm")
+    return (1.0 - row["success"], 1.0 - row["completion"], error or 0.0)
+
+
+HOW = (
+    "The beam's error is the distance of its axis from its target while it is on.\n\n"
+    "Interlock: the beam is off in every step that begins with the target out of sight, with a "
+    "clearance below the limit, or after an abort. A step that becomes unsafe while it runs is "
+    "stopped at its end; the last number of the table is the longest time of such steps in a row."
+)
+"""How to read a report of a task with a laser."""
+
+LASER_EXPERIMENT = ExperimentTask(
+    conditions={
+        "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
+        "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
+        "cut": Condition("this share of the ring is cut (0..1)", 1.0, _cut),
+        "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),
+        "never": NEVER,
+    },
+    supervise=LaserSupervision,
+    numbers={
+        "success": "success",
+        "completion": "share cut",
+        "beam_error_mean_mm": "beam error, mean [mm]",
+        "beam_error_p95_mm": "beam error, 95 % [mm]",
+        "healthy_mm2": "healthy tissue [mm2]",
+        "in_view": "time in sight",
+        "clearance_mm": "least clearance [mm]",
+        "time_s": "time [s]",
+        "beam_s": "beam on [s]",
+        "beam_unsafe_longest_s": "beam on while unsafe, longest [s]",
+    },
+    per_episode=("completion", "beam_error_mean_mm", "clearance_mm", "time_s"),
+    swept=("success", "completion", "beam_error_mean_mm", "in_view"),
+    badness=_incomplete,
+    how=HOW,
+)
+"""Experiments of a cut along a ring or another path."""
+
+
+def laser_experiment(
+    completion: str, conditions: Mapping[str, Condition], numbers: Mapping[str, str]
+) -> ExperimentTask:
+    """Experiments of a task with a laser that has more to offer than those of a cut.
+
+    completion: title of the measure `completion`. conditions: further ones by name. numbers:
+    further numbers of the main table -> their titles, after the completion.
+    """
+    plain = LASER_EXPERIMENT
+    first = {"success": "success", "completion": completion, **numbers}
+    return replace(
+        plain,
+        conditions={**conditions, **plain.conditions},
+        numbers=first | {k: v for k, v in plain.numbers.items() if k not in first},
+    )

@@ -4,9 +4,9 @@ Where recordings from before a change were made with another actuation, no paire
 taken. What the model lacked before the change (damping, a swing, loops of its own) is still in the
 residuals afterwards and resembles the effects of the list. It is learned from BEFORE, by a ridge
 regression without physics on the actuation, its past, and products of the past with the present,
-and is subtracted from the residuals of AFTER. Its held-out error on blocks of BEFORE replaces, in
-proportion, the model's validated error. Where nothing can be learned, the penalty is large and
-nothing is subtracted.
+and is subtracted from the residuals of AFTER. Its error on motions of BEFORE that were left out of
+its fit replaces, in proportion, the model's validated error. Where nothing can be learned, the
+penalty is large and nothing is subtracted.
 """
 
 from dataclasses import dataclass, replace

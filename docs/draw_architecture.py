@@ -19,6 +19,7 @@ PICTURE = ROOT / "docs" / "images" / "architecture.svg"
 ABOUT = {
     "cli": "commands",
     "experiments": "scripted experiments",
+    "credibility": "comparison for a stated use",
     "live": "closed loop, change detector",
     "agents": "PPO, policies, evaluation",
     "diagnosis": "system identification",

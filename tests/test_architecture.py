@@ -30,9 +30,19 @@ MAY_IMPORT = {
     "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
     "replay": {"scene", "tasks"},
     "report": set(),
+    "credibility": {
+        "diagnosis",
+        "experiments",
+        "measurement",
+        "report",
+        "scene",
+        "surrogate",
+        "tasks",
+    },
     "demonstration": {"agents", "diagnosis", "measurement", "replay", "report", "rig", "surrogate"},
     "cli": {
         "agents",
+        "credibility",
         "demonstration",
         "experiments",
         "live",
@@ -69,6 +79,13 @@ FLOORS = {
         ("compare", "amend"),
         ("improve",),
         ("pages",),
+    ),
+    "credibility": (
+        ("context", "metrics"),
+        ("uncertainty", "retest", "domain"),
+        ("scenario",),
+        ("assessment",),
+        ("of_experiment", "page"),
     ),
     "scene": (
         ("frames",),

@@ -262,7 +262,7 @@ def _samples(graph: ControllerGraph) -> Iterator[list[Tensor]]:
             step = arm.pneumatics.step_kPa * torch.randn(arm.chambers, generator=random)
             pressure[name] = (pressure[name] + step).clamp(arm.low, arm.high)
             noise = torch.randn(1, arm.key_points, 3, generator=random)
-            points = cast(Tensor, arm.model.rest_mm) + noise
+            points = arm.model.rest_mm + noise
             commanded = pressure[name] + 0.1 * torch.rand(arm.chambers, generator=random)
             given += [pressure[name][None].clone(), points, commanded[None]]
         for signal in graph.signals:

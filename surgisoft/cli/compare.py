@@ -4,10 +4,17 @@ import math
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
-from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
+from surgisoft.cli.inputs import (
+    check_model,
+    read_before,
+    read_context,
+    read_recordings,
+    warn_all,
+)
 from surgisoft.cli.options import (
     AnyModel,
     Before,
+    Credibility,
     EffectFiles,
     JsonFile,
     ModelError,
@@ -19,7 +26,10 @@ from surgisoft.cli.options import (
     model_options,
     with_effect_files,
 )
+from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
 from surgisoft.files import write_json
+from surgisoft.progress import text_only
 
 AXES_SHOWN = 5
 """Axes that the terminal lists; the page and the JSON file have all of them."""
@@ -38,12 +48,16 @@ def compare(
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
+    credibility: Credibility = None,
     effect_files: EffectFiles = None,
 ) -> None:
     """Compare an arm model with measurements: the error, and what it depends on."""
     check_free(json_file, "rmse_mm")
     check_folder(report)
     check_replay(replay)
+    if credibility and not report:
+        raise InputError("--credibility: writes into the folder of the report; add --report DIR")
+    context = read_context(credibility)
 
     check_model(model, predictions)
     measured = read_recordings(recordings)
@@ -75,6 +89,13 @@ def compare(
         drawn = draw_all(rest, backbone, arm.spec.unit, report, title)
         page = compare_page(result, rest, title, arm.summary(), drawn)
         written += [write_page(page, report / "report.html"), *drawn]
+    if context and report:
+        from surgisoft.credibility.assessment import assess
+        from surgisoft.credibility.page import write_report
+
+        with progress("credibility") as tell:
+            assessed = assess(context, result, rest, measured, progress=text_only(tell))
+        written += write_report(assessed, report)
     if replay:
         from surgisoft.replay.comparison import write_comparison
 
@@ -86,6 +107,8 @@ def compare(
         print(f"set-up: {result.setup}; `surgisoft diagnose` shows what mends it")
     print(arm.summary())
     _show(result)
+    if context:
+        print(f"credibility: {assessed.sentence}")
     for path in written:
         print(f"wrote {path}")
     if result.explainable:

@@ -7,8 +7,8 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
-from surgisoft.cli.inputs import counted
-from surgisoft.cli.options import EffectFiles, ExperimentFile, RigsOfArms
+from surgisoft.cli.inputs import counted, read_context
+from surgisoft.cli.options import Credibility, EffectFiles, ExperimentFile, RigsOfArms
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(
@@ -47,6 +47,7 @@ def run(
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
+    credibility: Credibility = None,
     effect_files: EffectFiles = None,
 ) -> None:
     """Run an experiment; write tables, logs, pictures, replays and one HTML report."""
@@ -55,13 +56,29 @@ def run(
     from surgisoft.experiments.session import finish_experiment, start_experiment
 
     check_folder(output)
+    context = read_context(credibility)
+    if context is not None:
+        from surgisoft.credibility.of_experiment import check_context
+        from surgisoft.experiments.session import open_experiment
+
+        check_context(context, open_experiment(file))
     spec, folder = start_experiment(
         file, output, policy or (), repeats, rigs_in(rig or ""), resume=resume, force=force
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"
         results, files = finish_experiment(spec, folder, processes, replays, about, report)
+    if context is not None:
+        from surgisoft.credibility.of_experiment import assess_experiment
+        from surgisoft.credibility.page import write_report
+        from surgisoft.progress import text_only
+
+        with progress("credibility") as report:
+            assessed = assess_experiment(context, results, text_only(report))
+        files = [*files, *write_report(assessed, folder)]
     print(markdown(results))
+    if context is not None:
+        print(f"credibility: {assessed.sentence}")
     for path in files:
         print(f"wrote {path}")
 

@@ -62,6 +62,15 @@ def read_before(paths: list[Path] | None, paired: str) -> list | None:
     return read_recordings(paths) if paths else None
 
 
+def read_context(path: Path | None):
+    """The context of a credibility report; None where no file is given."""
+    if path is None:
+        return None
+    from surgisoft.credibility.context import load_context
+
+    return load_context(path)
+
+
 def counted(number: int, thing: str) -> str:
     """Number and noun: `1 episode`, `2,000 episodes`."""
     return f"{number:,} {thing}" if number == 1 else f"{number:,} {thing}s"

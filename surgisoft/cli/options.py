@@ -141,6 +141,16 @@ Report = Annotated[
         "--report", metavar="DIR", help="Write an HTML report with its pictures to this folder."
     ),
 ]
+Credibility = Annotated[
+    Path | None,
+    Option(
+        "--credibility",
+        metavar="CONTEXT.toml",
+        help="Also write a credibility report (HTML and JSON) in the terms of ASME V&V 40 and V&V "
+        "20. The file states question of interest, context of use, model risk and limits "
+        "(docs/credibility.md).",
+    ),
+]
 Replay = Annotated[
     Path | None,
     Option("--replay", metavar="FILE.rrd", help="Write a replay for `surgisoft replay`."),

@@ -6,12 +6,12 @@ history (`Resting`), an arm that was held for a while (`Standing`), or given mem
 First-order sensitivities use the signals that a scan has recorded.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.surrogate.arm import ArmState
@@ -33,8 +33,8 @@ class Link(NamedTuple):
     """Stage of an effect, `chambers` or `network`."""
     name: str
     """Name of the effect in its model; `chambers` or `network` for the other two."""
-    part: Effect | nn.Module | None = None
-    """The effect, or the network, that acts there."""
+    part: Any = None
+    """The effect, or the network, that acts there; which of the two follows from the stage."""
 
 
 CHAMBERS_LINK = Link("chambers", "chambers")
@@ -59,6 +59,12 @@ class Signal:
     """(..., m) chamber pressure, once the chambers are passed, in the arm's unit."""
     direction: Tensor | None = None
     """(..., m) direction of change, once the chambers are passed."""
+
+    def behind_chambers(self) -> tuple[Tensor, Tensor]:
+        """Pressure and direction, (..., m) each, of a signal that has passed the chambers."""
+        assert self.pressure is not None
+        assert self.direction is not None
+        return self.pressure, self.direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +226,7 @@ class Scanning:
 
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(R, T, n, 3), or (S, n, 3), key points in mm."""
-        actuation, direction, network = signal.value, signal.direction, link.part
+        (_, direction), actuation, network = signal.behind_chambers(), signal.value, link.part
         if network.whole_runs:
             points = network.along(actuation, self.history, self.start.get(NETWORK))
             return points if self.rows is None else self.rows(points)
@@ -241,6 +247,10 @@ class Holding:
         """Signal behind an effect with its given memory."""
         return link.part.apply(signal.value, self.memory[link.name])
 
+    def direction(self, chain: "Chain", chamber: Tensor) -> Tensor:
+        """Fail: given memories belong to links behind the chambers."""
+        raise AssertionError("memories are given behind the chambers only")
+
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(..., n, 3) key points in mm of a static network."""
         return link.part(signal.value, signal.direction)
@@ -254,8 +264,8 @@ class Chain:
 
     def __init__(
         self,
-        network: nn.Module,
-        effects: nn.ModuleDict,
+        network: Any,
+        effects: Mapping[str, Effect],
         rest: Tensor,
         band: Tensor,
         still: Tensor,
@@ -308,7 +318,8 @@ class Chain:
 
         Without taps the network is left out where no effect behind it needs its key points.
         """
-        mode, behind = Resting(), {}
+        mode = Resting()
+        behind: dict[Stage, Tensor] = {}
         links = self.links if taps or self.outer else self.inner
         signal = self.walk(Signal(pressure), mode, links, behind if taps else None)
         if NETWORK not in mode.memory and self.net.remembers:
@@ -316,7 +327,7 @@ class Chain:
         state = ArmState(pressure, pressure, torch.zeros_like(pressure), mode.memory)
         if not taps:
             return state, None
-        return state, Taps(signal.pressure, signal.direction, mode.memory, behind)
+        return state, Taps(*signal.behind_chambers(), mode.memory, behind)
 
     def standing(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
         """Arms before the first row of runs that begin at `pressure` (R, m), and their signals.
@@ -327,16 +338,19 @@ class Chain:
         effect that is added there starts from rest too (`first_memory`).
         """
         state, taps = self.at_rest(self.rest.expand(len(pressure), -1), taps=True)
+        assert taps is not None
         seen = taps.behind
         away = (pressure != self.rest).any(-1)
         if not away.any():
             return state, seen
-        mode, there = Standing(state), {}
+        mode = Standing(state)
+        there: dict[Stage, Tensor] = {}
         signal = self.walk(Signal(pressure), mode, behind=there)
-        for stage in ("line", "body", "sensor"):
+        stages: tuple[Stage, ...] = ("line", "body", "sensor")
+        for stage in stages:
             wide = away.view(-1, *[1] * (there[stage].ndim - 1))
             seen[stage] = there[stage].where(wide, seen[stage])
-        stood = ArmState(pressure, mode.anchor, signal.direction, mode.memory)
+        stood = ArmState(pressure, mode.anchor, signal.behind_chambers()[1], mode.memory)
         return state.where(away, stood), seen
 
     def first_memory(
@@ -366,7 +380,8 @@ class Chain:
             )
         mode = Stepping(state, context)
         signal = self.walk(Signal(pressure), mode)
-        return ArmState(pressure, mode.anchor, signal.direction, mode.memory), signal.value
+        direction = signal.behind_chambers()[1]
+        return ArmState(pressure, mode.anchor, direction, mode.memory), signal.value
 
     def scan(self, history: History, first: Tensor, links: tuple[Link, ...] | None = None) -> Taps:
         """Signals and memories in each row of a history whose runs begin at `first`, (R, m).
@@ -374,9 +389,9 @@ class Chain:
         links: the links to pass; default all.
         """
         mode = Scanning(self.standing(first)[0].memory, context_of(history), history=history)
-        behind = {}
+        behind: dict[Stage, Tensor] = {}
         signal = self.walk(Signal(history.pressure), mode, links, behind)
-        return Taps(signal.pressure, signal.direction, mode.memory, behind)
+        return Taps(*signal.behind_chambers(), mode.memory, behind)
 
     def hold(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         """Key points (..., n, 3) in mm behind the network, of given memories.

@@ -59,6 +59,7 @@ def train_ensemble(
         rows, target, group = [x[free] for x in rows], target[free], group[free]
     generator = torch.Generator().manual_seed(config.seed)
     fold = _folds(group, members, generator)
+    assert isinstance(model.network, HawNN)
     ensemble = _untrained(model.network, members)
     weights = range_weights(target)
     known, target = ~target.isnan(), target.nan_to_num()
@@ -68,7 +69,8 @@ def train_ensemble(
     optimiser = torch.optim.Adam(trained, lr=config.learning_rate)
     schedule = cosine_schedule(optimiser, epochs * steps, 2 * steps)
     average = copy.deepcopy(ensemble)
-    fast, slow = list(ensemble.parameters()), list(average.parameters())
+    fast: list[Tensor] = list(ensemble.parameters())
+    slow: list[Tensor] = list(average.parameters())
     number = torch.arange(members)[:, None]
     for epoch in range(1, epochs + 1):
         # Every member takes the rows in another order.

@@ -71,6 +71,8 @@ class ArmGraph(nn.Module):
     `warm` says whether the model depends on the room's temperature, which is then a further input.
     """
 
+    rest_state: Tensor
+
     def __init__(self, model: ArmModel):
         super().__init__()
         if isinstance(model.network, CallableNetwork):
@@ -102,14 +104,15 @@ class ArmGraph(nn.Module):
             for part in self.parts
         ]
         names = [part.name.removeprefix("memory.") for part in self.parts[3:]]
-        return ArmState(*values[:3], dict(zip(names, values[3:], strict=True)))
+        pressure, anchor, direction, *memory = values
+        return ArmState(pressure, anchor, direction, dict(zip(names, memory, strict=True)))
 
     def start(self, pressure: Tensor) -> Tensor:
         """(1, S): an arm before its first row at pressure (1, m), see `ArmModel.first_state`."""
         chain, rest = self.model.chain, self.unpacked(self.rest_state)
         mode = Standing(rest)
         signal = chain.walk(Signal(pressure), mode)
-        stood = ArmState(pressure, mode.anchor, signal.direction, mode.memory)
+        stood = ArmState(pressure, mode.anchor, signal.behind_chambers()[1], mode.memory)
         span = pressure.new_tensor(self.model.spec.span)
         away = ((pressure - rest.pressure).abs() > AWAY_SHARE * span) & ~self.model.still
         away = away.any(-1)
@@ -121,7 +124,7 @@ class ArmGraph(nn.Module):
         """(B, S) state and (B, n, 3) key points in mm after pressure (B, m) was held dt_s (B,)."""
         mode = Stepping(self.unpacked(state), Context(dt_s, None, temperature_C))
         signal = self.model.chain.walk(Signal(pressure), mode)
-        after = ArmState(pressure, mode.anchor, signal.direction, mode.memory)
+        after = ArmState(pressure, mode.anchor, signal.behind_chambers()[1], mode.memory)
         return self.packed(after), signal.value
 
     def forward(
@@ -284,8 +287,9 @@ def _played(graph: ArmGraph, history: History, start: Call, step: Call) -> Tenso
     """(T, n, 3) mm: a recording of one run stepped through the functions of a file."""
     (state,) = start(history.pressure[0, :1])
     dt_s, points = history.dt_s.double(), []
+    warm = history.temperature_C
     for row in range(history.pressure.shape[1]):
-        warmth = [history.temperature_C[:, row]] * graph.warm
+        warmth = [] if warm is None else [warm[:, row]] * graph.warm
         state, found = step(state, history.pressure[:, row], dt_s[:, row], *warmth)
         points.append(found[0])
     return torch.stack(points)

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from surgisoft.surrogate.fitted_rows import FittedRows
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.interval import ErrorInterval, calibrate, coverage_of, distance_to
 from surgisoft.surrogate.model import ArmModel
-from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawNN
+from surgisoft.surrogate.networks import HIDDEN, ConstantCurvature, HawEnsemble, HawNN
 from surgisoft.surrogate.prior_mean import arcs_of, fit_prior_mean
 from surgisoft.surrogate.scan import direction_scan
 from surgisoft.surrogate.training import (
@@ -339,7 +340,9 @@ def fit(
     torch.manual_seed(config.seed)
     data = Data.split(train, valid, config.seed)
     low, high, band = (torch.tensor(x) for x in (spec.low, spec.high, spec.band))
-    result = FitResult(None, [], excitation(train, low, high, band), [], 0.0)
+    # Each stage puts its model here.
+    nothing: Any = None
+    result = FitResult(nothing, [], excitation(train, low, high, band), [], 0.0)
     result.warnings.extend(_still_chambers(train, spec))
     if config.network == "recurrent":
         _fit_recurrent(data, spec, config, result, progress)
@@ -364,7 +367,7 @@ def fit(
     _state_interval(data, result)
     validation = replace(result.model.validation, noise_mm=data.validation.noise_mm)
     result.model.validation = validation
-    if not math.isfinite(validation.rmse_mm):
+    if validation.rmse_mm is None or not math.isfinite(validation.rmse_mm):
         raise InputError("the fit did not reach a finite error; check the recordings' key points")
     for number, value in enumerate(validation.per_key_point_mm):
         if value is None:
@@ -399,7 +402,9 @@ def _fit_recurrent(data: Data, spec, config, result: FitResult, progress) -> Non
     predicted, measured = held_rows(model, data)
     model.validation = validated_error(measured, predicted)
     result.model = model
-    result.stages.append(StageReport("recurrent", model.validation.rmse_mm, epochs, 0.0, True))
+    error_mm = model.validation.rmse_mm
+    assert error_mm is not None
+    result.stages.append(StageReport("recurrent", error_mm, epochs, 0.0, True))
 
 
 def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConfig) -> None:
@@ -513,12 +518,14 @@ def _grow(
         normalise(network, data.train)
         return ArmModel(spec, network)
     if name == "constant curvature":
-        network = ConstantCurvature(low, high, spec.key_points, config.sections)
-        network.set_rest(rest_shape(data.train))
-        return ArmModel(spec, network)
+        sections = ConstantCurvature(low, high, spec.key_points, config.sections)
+        sections.set_rest(rest_shape(data.train))
+        return ArmModel(spec, sections)
+    assert model is not None, "the first stage is a network"
     use = support.use(name) if config.check_excitation else torch.ones(spec.chambers)
     grown = copy.deepcopy(model)
     if name == "direction":
+        assert isinstance(grown.network, HawNN)
         return grown.replace(network=grown.network.with_directions(use))
     effect = make_effect(name, model.facts)
     effect.use_chambers(use)
@@ -587,7 +594,7 @@ def _add_memory(data: Data, spec, config, support: _Support, result: FitResult, 
             label = name if name != "none" else "without effects"
             train_model(candidate, data, label, epochs, config, result.loss, progress)
             tried[name] = _rmse(_square(candidate, data))
-        best = min(names, key=tried.get)
+        best = min(names, key=lambda name: tried[name])
         if tried[best] ** 2 > (1 - AUTO_GAIN) * tried["none"] ** 2:
             text = ", ".join(f"{name} {rmse:.3f}" for name, rmse in tried.items())
             result.warnings.append(f"no effect with memory added; held-out RMSE in mm: {text}")
@@ -620,6 +627,7 @@ def _ensemble(data: Data, config, result: FitResult, progress) -> ErrorInterval 
     rows = data.validation_rows(model)
     with torch.no_grad():
         inputs = _network_inputs(model, rows)
+        assert isinstance(model.network, HawEnsemble)
         single = _rmse((model.network.each(*inputs) - rows.target).square().flatten(0, 1))
     model.rest_mm.copy_(result.model.rest_mm)
     result.model = model

@@ -112,7 +112,7 @@ def calibrate(error: Tensor, distance: Tensor, group: Tensor, source: str) -> Er
         return float((scale.mean() * _quantiles(error / scale[:, None], LEVEL)).mean())
 
     radii = {growth: mean_radius(growth) for growth in GROWTHS}
-    growth = min(radii, key=radii.get)
+    growth = min(radii, key=lambda growth: radii[growth])
     if radii[growth] > (1 - LEAST_GAIN) * radii[0.0]:
         growth = 0.0
     scores = error / (1 + growth * distance)[:, None]

@@ -65,6 +65,14 @@ class ArmModel(nn.Module):
     Both pass signals through the same `Chain` and agree.
     """
 
+    effects: dict[str, Effect]
+    network: Network
+    rest_mm: Tensor
+    band: Tensor
+    still: Tensor
+    idle: Tensor
+    rest: Tensor
+
     training_residuals: TrainingResiduals | None = None
     """Residuals of the model on rows of its fit; None where they are not known."""
     fitted_rows: FittedRows | None = None
@@ -85,7 +93,9 @@ class ArmModel(nn.Module):
         order = sorted(effects, key=lambda name: STAGES.index(effects[name].stage))
         self.spec = spec
         self.network = network
-        self.effects = nn.ModuleDict({name: effects[name] for name in order})
+        self.effects = nn.ModuleDict(  # type: ignore[assignment]  # a mapping of modules
+            {name: effects[name] for name in order}
+        )
         self.validation = validation or Validation()
         rest = torch.zeros(spec.key_points, 3) if rest_mm is None else rest_mm.float()
         self.register_buffer("rest_mm", rest)
@@ -268,7 +278,8 @@ class ArmModel(nn.Module):
                 "or effects were added to it since; fit it again"
             )
         interval, distance = self.validation.interval, torch.zeros_like(actuation[:, 0])
-        if interval.growth > 0:
+        assert interval is not None
+        if interval.growth > 0 and self.training_residuals is not None:
             span = torch.tensor(self.spec.span, dtype=actuation.dtype, device=actuation.device)
             reference = self.training_residuals.actuation.to(actuation)
             distance = distance_to(actuation, reference, span)

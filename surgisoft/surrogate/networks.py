@@ -5,6 +5,7 @@ HAW-NN is the Hysteresis-Aware Whole-body Neural Network of Chen et al. (2025, s
 
 import itertools
 import math
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +35,12 @@ class HawNN(nn.Module):
     by mean and standard deviation of the data the network was fitted to. The paper does not name
     its activation; SiLU (Elfwing et al. 2018) is smooth, so that Jacobians are too, and fast.
     """
+
+    centre: Tensor
+    half_range: Tensor
+    use: Tensor
+    mean: Tensor
+    scale: Tensor
 
     remembers = whole_runs = runs_only = False
 
@@ -113,6 +120,11 @@ class HawEnsemble(nn.Module):
     """
 
     remembers = whole_runs = runs_only = False
+    centre: Tensor
+    half_range: Tensor
+    use: Tensor
+    mean: Tensor
+    scale: Tensor
 
     def __init__(
         self,
@@ -245,6 +257,10 @@ def arc_rotation(bend: Tensor) -> Tensor:
 class ConstantCurvature(nn.Module):
     """Key points on constant-curvature arcs; ignores directions (Webster & Jones 2010)."""
 
+    centre: Tensor
+    half_range: Tensor
+    length: Tensor
+
     directions = False
     remembers = whole_runs = runs_only = False
 
@@ -315,6 +331,11 @@ class ArcChain(nn.Module):
     displacements does not.
     """
 
+    centre: Tensor
+    half_range: Tensor
+    length_mm: Tensor
+    base_mm: Tensor
+
     def __init__(self, low: Tensor, high: Tensor, key_points: int, arcs: int):
         """Pressure range low, high (m,) in the arm's unit; arcs: n, or n - 1 from a fixed base."""
         super().__init__()
@@ -373,6 +394,11 @@ class ArcChain(nn.Module):
 class RecurrentArm(nn.Module):
     """Gated recurrent unit (Cho et al. 2014) from pressures and directions to key points."""
 
+    centre: Tensor
+    half_range: Tensor
+    mean: Tensor
+    scale: Tensor
+
     directions = remembers = True
     whole_runs = runs_only = False
 
@@ -406,8 +432,14 @@ class RecurrentArm(nn.Module):
         dt_s (B,) does not count: a recurrent unit takes row by row.
         """
         cell = self.cell
-        weights = (cell.weight_ih_l0, cell.weight_hh_l0, cell.bias_ih_l0, cell.bias_hh_l0)
-        return torch.gru_cell(self._inputs(pressure, direction), memory, *weights)
+        return torch.gru_cell(
+            self._inputs(pressure, direction),
+            memory,
+            cast(Tensor, cell.weight_ih_l0),
+            cast(Tensor, cell.weight_hh_l0),
+            cast(Tensor, cell.bias_ih_l0),
+            cast(Tensor, cell.bias_hh_l0),
+        )
 
     def scan(self, pressure: Tensor, direction: Tensor, memory: Tensor | None = None) -> Tensor:
         """(R, T, width) hidden states along pressure and direction, each (R, T, m)."""

@@ -4,9 +4,10 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.chain import Scanning, Signal, Taps
@@ -113,6 +114,7 @@ class Data:
         """The validation rows, with the inputs that a static model gets in each."""
         if self.valid is not None:
             return make_rows(model, self.valid)
+        assert self.held is not None, "without validation runs, rows are held out"
         held = self.train.rows(self.held)[measured_rows(self.train)]
         return make_rows(model, self.train).take(held)
 
@@ -171,7 +173,7 @@ def validated_error(target: Tensor, predicted: Tensor) -> Validation:
 
 
 @torch.no_grad()
-def normalise(network: nn.Module, history: History) -> None:
+def normalise(network: Any, history: History) -> None:
     """Set a network's output mean and scale (3n,) in mm from the measured key points.
 
     With a prior mean: from what it leaves of them.
@@ -242,7 +244,8 @@ def train(
     schedule = cosine_schedule(optimiser, epochs * steps, 2 * steps)
     through = _Through(model, data, deep, weights, config, epochs, generator) if deep else None
     average = copy.deepcopy(model)
-    fast, slow = list(model.parameters()), list(average.parameters())
+    fast: list[Tensor] = list(model.parameters())
+    slow: list[Tensor] = list(average.parameters())
 
     fixed_rows = None if deep else data.validation_rows(average)
 
@@ -323,7 +326,8 @@ def train_jointly(
         steps_each = config.memory_steps
         through = _Through(model, data, deep, weights, config, epochs, generator, steps_each)
     average = copy.deepcopy(model)
-    fast, slow = list(model.parameters()), list(average.parameters())
+    fast: list[Tensor] = list(model.parameters())
+    slow: list[Tensor] = list(average.parameters())
     for _ in range(epochs):
         order = torch.randperm(len(rows.target), generator=generator)
         for part in order[: steps * batch].split(batch):
@@ -455,19 +459,22 @@ def train_recurrent(
     """
     train = data.train
     generator = torch.Generator().manual_seed(seed)
-    network: RecurrentArm = model.network
+    network = model.network
+    assert isinstance(network, RecurrentArm)
     with torch.no_grad():
         trace = model.trace(train)
     weights = range_weights(train.rows(train.key_points))
     target = data.targets
     window = min(RECURRENT_WINDOW, train.valid.shape[1])
     burn = min(BURN_IN, window // 3)
-    starts = [
-        (run, start)
-        for run in range(train.runs)
-        for start in range(0, max(int(train.valid[run].sum()) - window, 0) + 1, max(1, window // 4))
-    ]
-    starts = torch.tensor(starts)
+    stride = max(1, window // 4)
+    starts = torch.tensor(
+        [
+            (run, start)
+            for run in range(train.runs)
+            for start in range(0, max(int(train.valid[run].sum()) - window, 0) + 1, stride)
+        ]
+    )
     batch = max(1, min(32, len(starts) // 4))
     optimiser = torch.optim.Adam(model.parameters(), lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(

@@ -68,7 +68,9 @@ def statements(named: Named) -> dict[str, Any]:
     low, high = found.get("low"), found.get("high")
     if (low is None) != (high is None):
         raise InputError(f"{named.name}: states 'low' or 'high' only, expected both or none")
-    if low is not None and (len(low) != len(high) or not all(np.array(low) < np.array(high))):
+    if low is None or high is None:
+        return found
+    if len(low) != len(high) or not all(np.array(low) < np.array(high)):
         raise InputError(
             f"{named.name}: 'low' is {low} and 'high' is {high}, expected as many numbers in both, "
             "one for each chamber, each low below its high"

@@ -18,6 +18,11 @@ class PredictedNetwork(nn.Module):
     y + P(u') - P(u). Without predictions (a planned experiment) the key points are P(u').
     """
 
+    centre: Tensor
+    half_range: Tensor
+    exponents: Tensor
+    coefficients: Tensor
+
     directions = False
     remembers = False
     runs_only = False

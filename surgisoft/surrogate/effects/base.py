@@ -112,6 +112,9 @@ class Effect(nn.Module, ABC):
     (now `nonlinear_parameters`) and `columns` (now `sensitivities`); either name works.
     """
 
+    origin: Tensor
+    reach: Tensor
+
     stage: Stage
     """Place in the chain at which the effect acts."""
     version: int = 1

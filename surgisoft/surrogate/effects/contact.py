@@ -44,6 +44,10 @@ support, and to push it back would take no bounded bending."""
 class Contact(Memoryless):
     """A one-sided, yielding support at one key point."""
 
+    lever: Tensor
+    chords: Tensor
+    collect: Tensor
+
     stage = "body"
 
     def __init__(
@@ -128,7 +132,7 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     """Supports around the body, each where it would be met in a part of the recording."""
     points = points[torch.isfinite(points).all(-1).all(-1)]
     n = points.shape[1]
-    made = []
+    made: list[Effect] = []
     if not len(points):
         return made
     # The lowest of several key points hardly moves.
@@ -146,7 +150,11 @@ def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
 
 def _neighbours(some: list[Effect]) -> list[list[int]]:
     """Combinations of the supports in one direction and in the neighbouring directions."""
-    turns = [round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi)) for effect in some]
+    turns = [
+        round(float(effect.azimuth.detach()) * AROUND / (2 * math.pi))
+        for effect in some
+        if isinstance(effect, Contact)
+    ]
     near = [min(turn, AROUND - turn) <= BESIDE for turn in range(AROUND)]
     return [
         [i for i, turn in enumerate(turns) if near[(turn - middle) % AROUND]]

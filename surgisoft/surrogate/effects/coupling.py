@@ -32,6 +32,8 @@ WHO = ("all", "next", "previous")
 class Coupling(Memoryless):
     """Loss of push of each chamber by the loads of the other chambers."""
 
+    spread: Tensor
+
     stage = "material"
 
     def __init__(self, facts: ArmFacts, pairs: bool = False, who: str | None = None):

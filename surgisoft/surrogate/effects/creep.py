@@ -46,6 +46,8 @@ GRID = (
 class Creep(Effect):
     """Delayed loads with a spectrum of retardation times, equal for all chambers."""
 
+    times: Tensor
+
     stage = "material"
 
     def __init__(

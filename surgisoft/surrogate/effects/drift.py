@@ -29,6 +29,7 @@ from surgisoft.surrogate.effects.base import (
     Context,
     Effect,
     Quantity,
+    Stage,
     amplitude,
     logarithm,
     value_of,
@@ -54,7 +55,7 @@ POWER = 0.5
 class Drift(Effect):
     """A yielding holder, or gains and offsets that follow the time or the temperature."""
 
-    stage = "body"
+    stage: Stage = "body"
 
     def __init__(
         self,

@@ -38,6 +38,13 @@ FEW_RADII = (0.015, 0.04, 0.10, 0.22, 0.44, 0.74)
 class Hysteresis(Effect):
     """Rate-independent hysteresis with minor loops."""
 
+    centre: Tensor
+    half_range: Tensor
+    origin: Tensor
+    radius: Tensor
+    use: Tensor
+    turns: Tensor
+
     stage = "material"
 
     def __init__(

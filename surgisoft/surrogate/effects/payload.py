@@ -21,6 +21,11 @@ from surgisoft.surrogate.effects.hypothesis import Hypothesis
 class Payload(Memoryless):
     """Weight at the tip and along the body."""
 
+    down: Tensor
+    lever: Tensor
+    chords: Tensor
+    collect: Tensor
+
     stage = "body"
 
     def __init__(self, facts: ArmFacts):

@@ -28,6 +28,10 @@ from surgisoft.surrogate.effects.hypothesis import Hypothesis
 class Twist(Effect):
     """Torsion of the body by the mean load of the chambers."""
 
+    places: Tensor
+    chords: Tensor
+    collect: Tensor
+
     stage = "body"
 
     def __init__(self, facts: ArmFacts):

@@ -55,6 +55,7 @@ def register_effect_file(path: str | Path, taken: Container[str] = ()) -> str:
     content = path.read_bytes()
     module_name = f"surgisoft_effect_{name}"
     spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec is not None, "a .py file always has a loader"
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module
     try:

@@ -1,0 +1,134 @@
+"""Parts of the validation uncertainty against hand computation and refits."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.credibility.context import Uncertainty
+from surgisoft.credibility.uncertainty import budget, parameter_spread, with_midpoints
+from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.errors import InputError
+from surgisoft.measurement.recordings import Recording
+from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import HawEnsemble, HawNN
+from surgisoft.surrogate.training_residuals import TrainingResiduals
+
+REST = torch.tensor([[0.0, 0.0, 20.0], [0.0, 0.0, 60.0]])
+NOISE_MM = 0.05
+
+
+def recording(rows: int = 240, seed: int = 0, **more) -> Recording:
+    """Two chambers between 1 and 9, key points at rest with white noise, as stated."""
+    rng = np.random.default_rng(seed)
+    pressure = 5.0 + 4.0 * np.sin(np.outer(np.arange(rows) / 15.0, [1.0, 1.7]))
+    points = REST.numpy() + rng.normal(0.0, NOISE_MM, (rows, 2, 3))
+    given = {"name": "rec", "noise_mm": NOISE_MM} | more
+    return Recording(t_s=0.1 * np.arange(rows), measured=pressure, key_points_mm=points, **given)
+
+
+def model(network) -> ArmModel:
+    spec = ArmSpec(2, 2, (0.0, 0.0), (10.0, 10.0), band=(0.1, 0.1))
+    return ArmModel(spec, network, rest_mm=REST).eval().requires_grad_(False)
+
+
+def linear_network(slope_mm: float) -> HawNN:
+    """The tip's x is slope (p_1 - 5) to first order: SiLU is x / 2 near zero."""
+    torch.manual_seed(0)
+    network = HawNN(torch.zeros(2), torch.full((2,), 10.0), 2, hidden=(1,), directions=False)
+    with torch.no_grad():
+        for layer in (network.layers[0], network.layers[2]):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        network.layers[0].weight[0, 0] = 5e-3  # of (p - 5) / 5
+        network.layers[2].weight[3, 0] = slope_mm * 5.0 / (0.5 * 5e-3)
+        network.mean.copy_(REST.flatten())
+    return network
+
+
+def test_inputs_go_through_the_slope_and_noise_has_three_coordinates():
+    """The tip moves by 2 mm/kPa with chamber 1: 0.1 kPa are 0.2 mm; chamber 2 does nothing."""
+    some = [recording()]
+    table = residual_table(model(linear_network(2.0)), some)
+    found = budget(table, some, Uncertainty(input=(0.1, 0.5), parameters_mm=0.3))
+    base, tip = found.per_key_point
+    assert tip.input_mm == pytest.approx(0.2, rel=1e-3)
+    assert base.input_mm == 0.0
+    assert tip.noise_mm == pytest.approx(np.sqrt(3.0) * NOISE_MM)
+    assert tip.parameters_mm == pytest.approx(0.3)
+    assert tip.numerical_mm == pytest.approx(0.0, abs=1e-9)
+    whole = np.sqrt(3 * NOISE_MM**2 + 0.2**2 + 0.3**2)
+    assert tip.expanded_mm == pytest.approx(1.959964 * whole, rel=1e-3)
+    assert found.body.input_mm == pytest.approx(0.2 / np.sqrt(2.0), rel=1e-3)
+
+
+def test_stated_noise_counts_and_one_input_stands_for_all():
+    some = [recording()]
+    table = residual_table(model(linear_network(2.0)), some)
+    found = budget(table, some, Uncertainty(noise_mm=0.4, input=(0.2,)))
+    assert found.per_key_point[1].noise_mm == pytest.approx(0.4 * np.sqrt(3.0))
+    assert found.inputs == (0.2, 0.2)
+    assert found.body.unknown == ("parameters",)
+    assert found.sources["parameters"].startswith("not known")
+    with pytest.raises(InputError, match="3 values, expected one for all or one for each of 2"):
+        budget(table, some, Uncertainty(input=(0.1, 0.1, 0.1)))
+
+
+def test_the_spread_of_an_ensemble_is_that_of_its_members():
+    """Two members 0.6 mm apart in y have a standard deviation of 0.6 / sqrt(2)."""
+    low, high = torch.zeros(2), torch.full((2,), 10.0)
+    network = HawEnsemble(low, high, 2, hidden=(2,), directions=False, members=2)
+    network.biases[-1].data[1, 0, 4] = 0.6
+    table = residual_table(model(network), [recording()])
+    spread, source = parameter_spread(table, Uncertainty())
+    assert np.allclose(spread[0, :, 1, 1], 0.6 / np.sqrt(2.0))
+    assert np.allclose(spread[0, :, 0], 0.0)
+    assert "ensemble" in source
+
+
+def test_the_last_layer_is_as_uncertain_as_refits_say():
+    """Refits of the last layer to the training rows with fresh noise scatter as much."""
+    torch.manual_seed(1)
+    network = HawNN(torch.zeros(2), torch.full((2,), 10.0), 2, hidden=(6,), directions=False)
+    network.layers[0].weight.data.mul_(3.0)
+    rng = np.random.default_rng(0)
+    actuation = torch.from_numpy(rng.uniform(0.0, 10.0, (300, 2))).float()
+    residual = torch.from_numpy(rng.normal(0.0, 0.2, (300, 2, 3)))
+    arm = model(network)
+    arm.training_residuals = TrainingResiduals(actuation, torch.zeros(300, 2), residual)
+    some = recording(40)
+    spread, _ = parameter_spread(residual_table(arm, [some]), Uncertainty())
+
+    def features(values):
+        x = (torch.as_tensor(values).float() - 5.0) / 5.0
+        hidden = network.layers[:-1](x).double().detach().numpy()
+        return np.concatenate([hidden, np.ones((len(hidden), 1))], axis=1)
+
+    base, here = features(actuation), features(some.measured)
+    fits = np.linalg.lstsq(base, rng.normal(0.0, 0.2, (300, 2000)), rcond=None)[0]
+    assert np.allclose(spread[0, :, 1, 0], (here @ fits).std(axis=1), rtol=0.1)
+
+
+def test_midpoints_lie_between_rows_of_one_run():
+    run = np.array([0, 0, 0, 1, 1])
+    points = np.zeros((5, 2, 3))
+    pressure = np.array([[0.0, 4.0], [1.0, 4.0], [3.0, 4.0], [9.0, 0.0], [5.0, 0.0]])
+    some = Recording(
+        "rec",
+        np.array([0.0, 1.0, 2.0, 7.0, 9.0]),
+        pressure,
+        points,
+        run=run,
+        commanded=2 * pressure,
+    )
+    fine, own = with_midpoints(some)
+    assert own.tolist() == [True, False, True, False, True, True, False, True]
+    assert fine.t_s.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 7.0, 8.0, 9.0]
+    assert fine.measured[:, 0].tolist() == [0.0, 0.5, 1.0, 2.0, 3.0, 9.0, 7.0, 5.0]
+    assert fine.commanded[1].tolist() == [1.0, 8.0]
+    assert fine.run.tolist() == [0, 0, 0, 0, 0, 1, 1, 1]
+    assert np.isnan(fine.key_points_mm[~own]).all()
+    settled = dataclasses.replace(some, kind="settled")
+    assert with_midpoints(settled)[0] is settled

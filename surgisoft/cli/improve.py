@@ -6,8 +6,14 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.amended import (
+    NOT_CLAIMED,
+    claim_other_folder,
+    save_amended,
+    show_parameters,
+    write_before_and_after,
+)
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -19,6 +25,7 @@ from surgisoft.cli.options import (
     NewModel,
     Recordings,
     Refit,
+    Replay,
     Report,
 )
 from surgisoft.cli.progress import progress
@@ -35,6 +42,7 @@ def improve(
     ] = 6,
     json_file: JsonFile = None,
     report: Report = None,
+    replay: Replay = None,
     refit: Refit = "auto",
     model_error: ModelError = None,
     effect_files: EffectFiles = None,
@@ -47,6 +55,7 @@ def improve(
     """
     check_free(json_file, "rounds")
     check_folder(report)
+    check_replay(replay)
     check_model(model)
     measured = read_recordings(recordings)
     claim_other_folder(output, model, force)
@@ -79,6 +88,8 @@ def improve(
         written.append(json_file)
     if report:
         written += _write_report(result, report, model.name)
+    if replay:
+        written.append(write_before_and_after(result, model, measured, replay, model_error))
     _show(result)
     for path in written:
         print(f"wrote {path}")

@@ -27,7 +27,8 @@ from surgisoft.replay.colours import (
 )
 from surgisoft.replay.contents import TIME
 from surgisoft.replay.endoscope import CAMERA, PICTURES_HZ, log_camera
-from surgisoft.replay.plots import Plot, plots_of
+from surgisoft.replay.legends import dose_picture
+from surgisoft.replay.plots import Plot, plots_of, time_axis
 from surgisoft.replay.recording import STEP, Columns, new_recording
 from surgisoft.replay.shapes import creased
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
@@ -44,9 +45,13 @@ LEGEND = "/legend"
 """Text that explains the colours of the 3D view."""
 
 
+DOSE = "/dose_scale"
+"""Picture of the tissue's colours over its dose."""
+
+
 def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint:
     """The layout for a log and its plots."""
-    cells = _cells(plots)
+    cells = _cells(plots, float(log.time_s[-1]))
     if log.camera is not None:
         cells.insert(0, rrb.Spatial2DView(origin=CAMERA, name="Endoscope"))
     pairs = [cells[i : i + 2] for i in range(0, len(cells), 2)]
@@ -54,6 +59,9 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
     shares = [1.5 if log.camera is not None and i == 0 else 1.0 for i in range(len(rows))]
     legend = rrb.TextDocumentView(origin=LEGEND, name="Colours")
     below = rrb.Horizontal(_events(), legend, column_shares=[3, 2])
+    if log.dose is not None:
+        dose = rrb.Spatial2DView(origin=DOSE, name="Dose", background=BACKGROUND)
+        below = rrb.Horizontal(_events(), legend, dose, column_shares=[3, 3, 2])
     left = rrb.Vertical(_scene(log), below, row_shares=[4.0, 1])
     right = rrb.Vertical(*rows, row_shares=shares)
     return rrb.Blueprint(
@@ -77,7 +85,7 @@ def _view_names(part: rrb.Container | rrb.View) -> Iterator[str]:
         yield from _view_names(inner)
 
 
-def _cells(plots: tuple[Plot, ...]) -> list:
+def _cells(plots: tuple[Plot, ...], end_s: float) -> list:
     """One view for each plot; the plots of a group become tabs."""
     cells: list[rrb.TimeSeriesView | list[rrb.TimeSeriesView]] = []
     groups: dict[str, list[rrb.TimeSeriesView]] = {}
@@ -90,7 +98,7 @@ def _cells(plots: tuple[Plot, ...]) -> list:
             contents=[line.entity for line in plot.lines],
             name=plot.title,
             plot_legend=legend,
-            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+            axis_x=time_axis(end_s),
         )
         if not plot.group:
             cells.append(view)
@@ -123,7 +131,7 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
     ]
     return rrb.Spatial3DView(
         origin="/",
-        contents=["+ /**", f"- {CAMERA}/**", "- /plots/**", "- /events", f"- {LEGEND}"],
+        contents=["+ /**", f"- {CAMERA}/**", "- /plots/**", *(f"- {flat}" for flat in FLAT)],
         name=SCENE,
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=not log.bodies),
@@ -170,6 +178,10 @@ def _across(log: EpisodeLog, apart: np.ndarray) -> np.ndarray:
 
 MOTION_HZ = 10.0
 """Rate at which bodies are drawn (1/s); plots have every step."""
+FLAT = ("/events", LEGEND, DOSE)
+"""Entities that views other than the 3D view show."""
+PLAN_MM, REAL_MM = 0.28, 0.36
+"""Radii of the reference path and, thicker so that it covers it, of the actual path (mm)."""
 JUMP_MM = 3.0
 """A target that moves farther than this in one step has jumped (mm)."""
 RING_CORNERS, RING_WIDER = 24, 1.15
@@ -233,8 +245,17 @@ def write_replay(
         _log_events(recording, log)
         text = rr.TextDocument(legend(log), media_type="text/markdown")
         recording.log(LEGEND, text, static=True)
+        if log.dose is not None:
+            _log_dose_scale(recording, log, log.dose)
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(log.time_s[-1]), cost)
+
+
+def _log_dose_scale(recording, log: EpisodeLog, dose: DoseLog) -> None:
+    """Log the picture of the tissue's colours over its dose, with unit and thresholds."""
+    role = next(body.role for body in log.bodies if body.name == dose.body)
+    picture = dose_picture(dose.threshold_j_per_mm2, dose.cut_j_per_mm2, ROLE_COLOURS[role])
+    recording.log(DOSE, rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
 
 
 def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
@@ -292,7 +313,7 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     closed = np.vstack((log.path_mm, log.path_mm[:1]))
     planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
     if planned:
-        plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[0.18])
+        plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[PLAN_MM])
         columns.recording.log("/path/planned", plan, static=True)
     shown = np.isfinite(log.actual_mm).all(1)
     if log.beam is not None:
@@ -300,7 +321,7 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
     pieces = np.stack((log.actual_mm[ends - 1], log.actual_mm[ends]), axis=1)
     if len(ends):
-        line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
+        line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=REAL_MM)
         columns.recording.log(TRAIL, line, static=True)
         columns.send(TRAIL, ends, rr.LineStrips3D.columns(strips=list(pieces)))
     count = log.targets_mm.shape[1]
@@ -361,7 +382,9 @@ def legend(log: EpisodeLog) -> str:
     lines = [f"- **{colour}**: {meaning}" for colour, meaning, shown in rows if shown]
     roles = {body.role for body in log.bodies}
     lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
-    return "\n".join(lines) + "\n"
+    what = f"**{log.task}** by {log.driver} in {log.on}"
+    last = f": {log.events[-1].text} at {log.events[-1].time_s:.1f} s" if log.events else ""
+    return f"{what}{last}.\n\n" + "\n".join(lines) + "\n"
 
 
 def _log_events(recording, log: EpisodeLog) -> None:

@@ -224,8 +224,10 @@ class AblationMap:
         )
         kept = [getattr(state, name) for name in _SUMS]
         if in_place:
+            # By index: a mask would be spread over every sample of every environment first.
+            index = mask.nonzero()[:, 0]
             for tensor in kept:
-                tensor[mask] = 0.0
+                tensor.index_fill_(0, index, 0.0)
         else:
             kept = [_pick(mask, 0.0, tensor) for tensor in kept]
         ring = torch.zeros_like(state.ring) if ring is None else ring
@@ -380,11 +382,29 @@ def sweep_fluence(
 
 def longest_run(flags: torch.Tensor) -> torch.Tensor:
     """(B,) length of the longest run of True in rings (B, N): the last neighbours the first."""
+    if flags.device.type == "cpu":
+        found = torch.empty(len(flags), dtype=torch.int64)
+        _longest_runs(flags.contiguous().numpy(), found.numpy())
+        return found
     count = flags.shape[1]
     twice = torch.cat((flags, flags), 1)
     place = torch.arange(1, 2 * count + 1, device=flags.device)
     broken = torch.where(twice, 0, place).cummax(1).values
     return (place - broken).amax(1).clamp(max=count)
+
+
+@compiled
+def _longest_runs(flags, out):
+    """Longest run of True in each ring of flags (B, N), into out (B,)."""
+    count = flags.shape[1]
+    for n in range(len(flags)):
+        longest, run = 0, 0
+        for k in range(2 * count):
+            run = run + 1 if flags[n, k if k < count else k - count] else 0
+            longest = max(longest, run)
+            if k >= count - 1 and run == 0:
+                break
+        out[n] = min(longest, count)
 
 
 def _pick(mask, fresh, old):

@@ -19,10 +19,17 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
-from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
+from surgisoft.scene.distance import (
+    chains_apart,
+    chains_folded,
+    chains_to_surface,
+    divide_steps,
+    longest_steps,
+)
 from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
+from surgisoft.scene.sight import hide_behind_body, hide_behind_chain
 from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
@@ -73,15 +80,17 @@ class BatchedScene:
             raise unknown_name("geometry engine", engine, ENGINES)
         if engine == "compiled" and self.device.type != "cpu":
             raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
-        self._compiled = engine == "compiled"
-        kind = CompiledSurface if self._compiled else TorchSurface
-        self._surfaces = []
+        self.compiled = engine == "compiled"
+        kind = CompiledSurface if self.compiled else TorchSurface
+        self._surfaces, self._trees = [], []
+        self._at_home = {body.name: self._inverse(_pose_of(body)) for body in self.bodies}
         for body in self.bodies:
             tree = build_tree(body.mesh)
             margin = 5.0 * math.ceil((self.horizon_mm + thickest) / 5.0)
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
             field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
             self._surfaces.append(kind(tree, field, self.device))
+            self._trees.append(tree.arrays)
 
     def radius_mm(self, arm: str) -> float:
         """Radius of an arm by name (mm)."""
@@ -176,15 +185,48 @@ class BatchedScene:
             incidence_rad=torch.atan2(sine, cosine).to(dtype).reshape(shape),
         )
 
+    def clear_lines(
+        self,
+        eyes_mm: torch.Tensor,
+        ends_mm: torch.Tensor,
+        distance_mm: torch.Tensor,
+        short_mm: float,
+        wanted: torch.Tensor,
+        arms: Mapping[str, torch.Tensor] | None = None,
+        own: str | None = None,
+        poses: Mapping[str, torch.Tensor] | None = None,
+    ) -> torch.Tensor:
+        """(B, M) bool: the wanted lines of sight that nothing crosses; with the compiled engine.
+
+        From eyes (B, 3) to ends (B, M, 3) mm, world frame, distance_mm (B, M) apart; what a line
+        meets in its last short_mm does not count. Arms, own and poses are those of `cast`.
+        """
+        eyes, clear = eyes_mm.contiguous().numpy(), wanted.clone()
+        ends, distance = ends_mm.numpy(), distance_mm.numpy()
+        flags = clear.numpy()
+        for name, line in (arms or {}).items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            line = _held(line).numpy()
+            hide_behind_chain(
+                eyes, ends, distance, short_mm, line, radius, gap, wanted.numpy(), flags
+            )
+        for body, tree in zip(self.bodies, self._trees, strict=True):
+            turn, shift = (t.numpy() for t in self._inward(body, poses))
+            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree, flags)
+        return clear
+
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
         """World to body: rotations (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
         pose = (poses or {}).get(body.name)
-        pose = torch.tensor(np.array(body.pose))[None] if pose is None else pose.detach()
+        return self._at_home[body.name] if pose is None else self._inverse(pose.detach())
+
+    def _inverse(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         inward = frames.invert(pose.to(self.device, torch.float64))
         return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
-        if not self._compiled:
+        if not self.compiled:
             return chains_apart_torch(first, second, radii, self.horizon_mm)
         out = torch.empty(len(first), dtype=first.dtype)
         chains_apart(first.numpy(), second.numpy(), radii, self.horizon_mm, out.numpy())
@@ -192,14 +234,14 @@ class BatchedScene:
 
     def _folded(self, line, radius: float) -> torch.Tensor:
         gap = self_contact_gap_mm(radius)
-        if not self._compiled:
+        if not self.compiled:
             return chains_folded_torch(line, radius, gap, self.horizon_mm)
         out = torch.empty(len(line), dtype=line.dtype)
         chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
         return out
 
     def _chain_hits(self, origins, aims, line, radius, gap, best):
-        if not self._compiled:
+        if not self.compiled:
             return rays_to_chains_torch(origins, aims, line, radius, gap, best)
         distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
         rays_to_chains(
@@ -266,18 +308,31 @@ class CompiledSurface:
         return torch.from_numpy(distance), torch.from_numpy(face)
 
 
+def _pose_of(body: Body) -> torch.Tensor:
+    """(1, 4, 4) body to world, where the scene puts the body."""
+    return torch.tensor(np.array(body.pose))[None]
+
+
 def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Arms (B, K, 3) mm with long segments divided, and which points were given (K',) bool.
 
     The field gives tight bounds on short segments only. The new points lie on the old segments.
     """
-    steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
-    longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
+    if lines.device.type == "cpu":
+        longest = torch.zeros(lines.shape[1] - 1, dtype=lines.dtype)
+        longest_steps(lines.numpy(), longest.numpy())
+    else:
+        steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
+        longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
     parts = (longest / LONGEST_SEGMENT_MM).ceil().clamp(1, MOST_PARTS).int().tolist()
     given = torch.zeros(sum(parts) + 1, dtype=torch.bool, device=lines.device)
     given[torch.tensor([0, *parts], device=lines.device).cumsum(0)] = True
     if max(parts) == 1:
         return lines, given
+    if lines.device.type == "cpu":
+        fine = torch.empty((len(lines), len(given), 3), dtype=lines.dtype)
+        divide_steps(lines.numpy(), np.array(parts), fine.numpy())
+        return fine, given
     pieces = [lines[:, :1]]
     for k, count in enumerate(parts):
         share = torch.arange(1, count + 1, device=lines.device, dtype=lines.dtype) / count

@@ -144,7 +144,7 @@ def _plane_hits(origins, directions, triangles, rays, faces, coarse):
 
 
 @compiled
-def _capsule_entry(origin, d, a, b, radius):
+def capsule_entry(origin, d, a, b, radius):
     """Distance along the ray to capsule a b, inf for a miss; see `capsules.ray_capsule`."""
     ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
@@ -219,6 +219,6 @@ def rays_to_chains(origins, directions, lines, radius, gap, distance, segment):
                 if x * x + y * y + z * z <= reach * reach:
                     a = (line[k, 0], line[k, 1], line[k, 2])
                     b = (line[k + 1, 0], line[k + 1, 1], line[k + 1, 2])
-                    hit = _capsule_entry(o, d, a, b, radius)
+                    hit = capsule_entry(o, d, a, b, radius)
                     if hit < distance[n, r]:
                         distance[n, r], segment[n, r] = hit, k

@@ -310,9 +310,12 @@ def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):
     (text,) = column(replay.path, "/legend", "TextDocument:text")[-1]
     assert "beam; thick" in text
     assert "olive green" in text
+    assert log.events[-1].text in text
+    (scale,) = column(replay.path, "/dose_scale", "EncodedImage:blob")[-1]
+    assert bytes(scale).startswith(b"\x89PNG")
     assert "white points" not in text
     lone = legend(replace(log, beam=None, camera=None, dose=None, bodies=(), on="rig"))
-    assert "beam" not in lone
+    assert "green line" not in lone
     assert "white points" in lone
 
 

@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import unknown_name
-from surgisoft.scene import frames
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.camera import View, view
+from surgisoft.scene.camera import View, seen_from
 from surgisoft.scene.capsules import BatchClearance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
@@ -177,9 +176,9 @@ class SceneEngine:
     def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
         lines, eye = {name: part.line_mm for name, part in parts.items()}, parts[ENDOSCOPE]
         clearance, hit = self.collision.clearance(lines), self.aimed(parts)
-        pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
         ring = (self.rings_mm[lesion], self.ring_normals[lesion])
-        seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)
+        at = (eye.tip_mm, eye.tip_direction)
+        seen = seen_from(self.geometry, self.camera, *at, *ring, lines, own=ENDOSCOPE)
         return SceneState(clearance, hit, None, seen, lesion)
 
     def _beam(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:

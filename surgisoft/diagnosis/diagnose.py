@@ -401,7 +401,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm)
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
-    sentence = sentence_of(decision, levels, _reached(found, effects))
+    sentence = sentence_of(decision, levels, _reached(found, effects, kind))
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += f"; {' or '.join(others)} would do as well in the place of one of them"
@@ -448,9 +448,11 @@ def _instead(evidence: Evidence) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, margin in both if margin < AS_GOOD))
 
 
-def _reached(found: Findings, effects: tuple[str, ...]) -> float:
+def _reached(found: Findings, effects: tuple[str, ...], kind: Kind) -> float:
     """Held-out error with the named effects, or with the first of a set, mm."""
     selection = found.selection
+    if kind == "ambiguous":
+        effects = effects[:1]
     for proposal in found.proposals:
         if set(proposal.effects) == set(effects):
             return selection.rmse_mm(selection.losses(proposal.chosen))

@@ -12,10 +12,20 @@ ROLE_COLOURS = {
 """Colour of a body by its role."""
 ROLE_NAMES = {"organ": "red-brown", "keep-out": "olive green", "support": "grey"}
 """Name of the colour of each role."""
-ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196), "arm": (236, 226, 208)}
-"""Colour of a soft body by its arm's name."""
-BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196, 132, 56)}
-"""Colour of the bands that mark an arm's key points."""
+ARM_COLOURS = {
+    "laser": (236, 226, 208),
+    "endoscope": (120, 158, 196),
+    "tip": (176, 196, 160),
+    "arm": (236, 226, 208),
+}
+"""Colour of a soft body by its arm's tool; `arm` is one without a tool."""
+BAND_COLOURS = {
+    "laser": (196, 132, 56),
+    "endoscope": (48, 92, 150),
+    "tip": (84, 120, 64),
+    "arm": (196, 132, 56),
+}
+"""Colour of the bands that mark an arm's key points, by its tool."""
 SHAFT_COLOUR = (88, 94, 102)
 MEASURED_COLOUR = rgb(MEASURED_ON_DARK)
 """Colour of a measured body beside a predicted one."""

@@ -207,9 +207,9 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius = self.radius_mm(name)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            line = _held(line).numpy()
+            spine = _held(line).numpy()
             hide_behind_chain(
-                eyes, ends, distance, short_mm, line, radius, gap, wanted.numpy(), flags
+                eyes, ends, distance, short_mm, spine, radius, gap, wanted.numpy(), flags
             )
         for body, tree in zip(self.bodies, self._trees, strict=True):
             turn, shift = (t.numpy() for t in self._inward(body, poses))

@@ -123,7 +123,10 @@ def amend(
         page = amend_page(result, title, result.model.summary())
         written.append(write_page(page, report / "report.html"))
     if replay:
-        written.append(write_before_and_after(result, model, measured, replay, model_error))
+        from surgisoft.diagnosis.compare import tables_of
+
+        tables = tables_of({"before": model, "after": result.model}, measured, model_error)
+        written.append(write_before_and_after(result, tables, model.name, replay))
     for name in result.refitted:
         print(f"{name}: the model had this effect already; its parameters were fitted again")
     show_parameters(result.parameters)

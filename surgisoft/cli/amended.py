@@ -29,14 +29,12 @@ def save_amended(result, output: Path, model: Path, recordings, force: bool) -> 
     save_model(result.model, output, record, force)
 
 
-def write_before_and_after(result, model: Path, recordings, file: Path, error_mm) -> Path:
-    """Write the replay of the old and the new model on the same recordings."""
-    from surgisoft.diagnosis.compare import tables_of
+def write_before_and_after(result, tables: dict, name: str, file: Path) -> Path:
+    """Write the replay of the old and the new model, by their residuals on the same recordings."""
     from surgisoft.replay.model_error import write_models
 
-    names = ", ".join(recording.name for recording in recordings)
-    tables = tables_of({"before": model, "after": result.model}, recordings, error_mm)
-    write_models(tables, f"{model.name} before and after on {names}", file, result.sentence)
+    names = ", ".join(tables["before"].names)
+    write_models(tables, f"{name} before and after on {names}", file, result.sentence)
     return file
 
 

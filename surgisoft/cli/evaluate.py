@@ -15,6 +15,8 @@ from surgisoft.cli.options import (
     EffectFiles,
     Hidden,
     JsonFile,
+    ObserverGain,
+    OfRunTask,
     Preflight,
     Replay,
     Report,
@@ -40,9 +42,7 @@ def evaluate(
             "of a training run. Several policies are evaluated on the same episodes.",
         ),
     ],
-    task: Annotated[
-        str | None, typer.Option(metavar="TASK", help="Task; default: that of the training run.")
-    ] = None,
+    task: OfRunTask = None,
     episodes: Annotated[
         int, typer.Option(min=1, max=100_000, help="Episodes of each policy.")
     ] = 20,
@@ -75,15 +75,7 @@ def evaluate(
             "model predicts."
         ),
     ] = True,
-    observer_gain: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="On the rig: observer gain from 0 to 1, the share of the difference between "
-            "cameras and model that the estimate adopts per step. Default 0.3.",
-        ),
-    ] = None,
+    observer_gain: ObserverGain = None,
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,

@@ -15,11 +15,10 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.scene.capsules import segment_distance
-from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
-from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks.circle_ablation import RING_DIRECTION, RING_PLACE
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
+from surgisoft.tasks.laser_work import BEAM_ERROR, VIEW, VIEW_ERROR, pointing
 from surgisoft.tasks.observations import (
     TIME,
     Block,
@@ -31,6 +30,7 @@ from surgisoft.tasks.observations import (
 from surgisoft.tasks.trajectories.closed_path import draw_traversal, point_on_closed
 from surgisoft.tasks.world.arm import ArmPart
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.scene import PHANTOM
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 LASERS = ("laser_1", "laser_2")
@@ -40,18 +40,6 @@ AGENTS = (*LASERS, ENDOSCOPE)
 TWO_LASERS = PHANTOM / "two_lasers.toml"
 """The liver phantom with the mounts of three arms."""
 
-BEAM_ERROR = Block(
-    "beam_error",
-    "perpendicular offset of the target from the measured beam",
-    "mm",
-    "asinh(x / 1 mm)",
-)
-RING_PLACE = Block(
-    "ring_place", "angle of the target along the ring", "rad", "sin(x), cos(x)", -1.0, 1.0
-)
-RING_DIRECTION = Block(
-    "ring_direction", "direction of travel along the ring, +1 or -1", "-", "x", -1.0, 1.0
-)
 LEAD = Block(
     "lead",
     "share of the ring by which the laser is ahead of half a turn before the other one",
@@ -68,13 +56,6 @@ BEAM_CLEARANCE = Block(
     -2.0,
     6.0,
 )
-VIEW_ERROR = Block(
-    "view_error",
-    "perpendicular offset of the lesion's centre from the measured axis of the camera",
-    "mm",
-    "asinh(x / 1 mm)",
-)
-VIEW = Block("view", "share of the ring that the endoscope sees", "-", "x", 0.0, 1.0)
 SPOTS = Block(
     "spots", "1 if the endoscope sees a laser's target, own laser first", "-", "x", 0.0, 1.0
 )
@@ -225,11 +206,6 @@ class TwoLaserRing:
         self.round = round(c.cut_s / self.dt_s)
         self.weights = {agent: getattr(c.weights, agent) for agent in AGENTS}
 
-    @property
-    def pointing(self) -> dict[str, Pointing]:
-        """Inverse kinematics of each arm's axis, by the arm's name."""
-        return {name: Pointing(arm, self.dt_s) for name, arm in self.world.arms.items()}
-
     def goal(self, stream: Stream) -> tuple[Stream, SharedCut]:
         """Draw start and direction of the cut for each random number stream."""
         stream, way = draw_traversal(stream, anywhere=True)
@@ -259,9 +235,9 @@ class TwoLaserRing:
         return self.measured_errors_mm(state).amax(1)
 
     def _off_targets_mm(self, state: TaskState[SharedCut], points_mm: list[Tensor]) -> Tensor:
-        pointing, targets = self.pointing, self.targets_mm(state)
+        point, targets = pointing(self), self.targets_mm(state)
         off = [
-            pointing[name].offset_mm(points, target).norm(dim=1)
+            point[name].offset_mm(points, target).norm(dim=1)
             for name, points, target in zip(LASERS, points_mm, targets, strict=True)
         ]
         return torch.stack(off, 1)
@@ -285,22 +261,14 @@ class TwoLaserRing:
         arms: their state; None: the true one.
         """
         arms, targets = arms or state.world.arms, self.targets_mm(state)
-        radii, found = self.scene.geometry.radii_mm, []
-        for name, target in zip(LASERS, targets, strict=True):
-            part, others = arms[name], [other for other in arms if other != name]
-            tip = part.tip_mm[:, None]
-            ahead = ((target - part.tip_mm) * part.tip_direction).sum(1).clamp(min=0.0)
-            end = tip + (ahead[:, None] * part.tip_direction)[:, None]
-            away = [
-                segment_distance(tip, end, arms[o].line_mm[:, :-1], arms[o].line_mm[:, 1:]).amin(1)
-                - radii[o]
-                for o in others
-            ]
-            found.append(torch.stack(away).amin(0))
+        found = [
+            self.scene.path_clearance_mm(arms, name, target)
+            for name, target in zip(LASERS, targets, strict=True)
+        ]
         return torch.stack(found, 1)
 
     def _measured_arms(self, state: TaskState[SharedCut]) -> Mapping[str, ArmPart]:
-        """The arms with their bodies where they are measured; the state's own where that is exact."""
+        """The arms with their bodies where they are measured; the state itself where exact."""
         arms = state.world.arms
         if all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values()):
             return arms
@@ -342,7 +310,7 @@ class TwoLaserRing:
     def blocks(self, state: TaskState[SharedCut]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body and pointing error of each arm, and the state of the cut."""
         arms, scene, cut = state.world.arms, state.world.scene, state.goal
-        pointing, tips = self.pointing, {name: arms[name].seen_mm[:, -1] for name in AGENTS}
+        point, tips = pointing(self), {name: arms[name].seen_mm[:, -1] for name in AGENTS}
         ahead = [self.targets_mm(state, k) for k in range(self.config.preview + 1)]
         clear = self.beam_clearance_mm(state, self._measured_arms(state))
         clear = clear.clamp(-20.0, 60.0) / 10.0
@@ -351,7 +319,7 @@ class TwoLaserRing:
         own: dict[str, ObservationBlocks] = {}
         for k, name in enumerate(LASERS):
             at = arms[name].seen_mm
-            offsets = [pointing[name].offset_mm(at, targets[k]) for targets in ahead]
+            offsets = [point[name].offset_mm(at, targets[k]) for targets in ahead]
             angle = 2.0 * math.pi * cut.share(k, self.round)[:, None]
             own[name] = {
                 **numbered(BEAM_ERROR, [offset.asinh() for offset in offsets]),
@@ -362,7 +330,7 @@ class TwoLaserRing:
                 SPOTS: seen.roll(-k, 1),
                 FIRED: fired.roll(-k, 1),
             }
-        look = pointing[ENDOSCOPE].offset_mm(arms[ENDOSCOPE].seen_mm, self.centre_mm(state))
+        look = point[ENDOSCOPE].offset_mm(arms[ENDOSCOPE].seen_mm, self.centre_mm(state))
         own[ENDOSCOPE] = {VIEW_ERROR: look.asinh(), SPOTS: seen, FIRED: fired}
         return {
             name: {
@@ -444,10 +412,8 @@ class TwoLaserRing:
         """Scripted expert: points each laser at its next target, the endoscope at the lesion."""
         targets = dict(zip(LASERS, self.targets_mm(state, 1), strict=True))
         targets[ENDOSCOPE] = self.centre_mm(state)
-        pointing = self.pointing
-        return {
-            name: pointing[name].action(state.world.arms[name], targets[name]) for name in AGENTS
-        }
+        point, arms = pointing(self), state.world.arms
+        return {name: point[name].action(arms[name], targets[name]) for name in AGENTS}
 
 
 class TwoLaserSupervision(LaserSupervision):

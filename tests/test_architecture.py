@@ -28,7 +28,7 @@ MAY_IMPORT = {
         "report",
     },
     "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
-    "replay": {"scene", "tasks"},
+    "replay": {"scene", "tasks", "diagnosis"},
     "report": set(),
     "credibility": {
         "diagnosis",
@@ -96,19 +96,21 @@ FLOORS = {
         ("distance", "torch_queries", "camera"),
         ("batched", "collision", "render"),
         ("reach", "spec"),
-        ("lesion", "repair", "dose_patch"),
+        ("lesion", "repair"),
+        ("contours",),
+        ("dose_patch",),
         ("folder", "mounted_arm", "ablation"),
         ("mounts", "check"),
         ("author",),
     ),
     "replay": (
         ("colours", "contents", "shapes", "surfaces"),
-        ("plots",),
+        ("plots", "legends"),
         ("recording",),
         ("arms", "endoscope"),
         ("episode_view", "scene_view", "reach_map"),
         ("comparison", "viewer"),
-        ("live_view",),
+        ("live_view", "model_error"),
         ("show",),
     ),
     "report": (("parts", "style"), ("charts", "page")),
@@ -141,6 +143,7 @@ ONLY_IN = {
     "serial": "rig/drivers/serial_controller",
     "mcap": "measurement/importing/readers/mcap",
     "mcap_ros2": "measurement/importing/readers/mcap",
+    "distributed": "workers",
 }
 
 

@@ -30,6 +30,7 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.scan import linear_scan
 from surgisoft.surrogate.training_residuals import TrainingResiduals
+from surgisoft.time_axis import continued
 
 ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
@@ -189,6 +190,11 @@ class ResidualTable:
     def residual_mm(self) -> np.ndarray:
         """(N, n, 3) measured less predicted, base frame, mm; NaN where missing."""
         return self.measured_mm - self.predicted_mm
+
+    @cached_property
+    def along_s(self) -> np.ndarray:
+        """(N,) time on the axis that charts and replays share: all recordings in turn, s."""
+        return continued(self.t_s)
 
     @property
     def error_mm(self) -> np.ndarray:

@@ -162,6 +162,7 @@ class BatchedScene:
             turn, shift = self._inward(body, poses)
             o = origins @ turn.mT + shift[:, None]
             d = aims @ turn.mT
+            assert isinstance(surface, TorchSurface), "the compiled engine has its own loops"
             t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
             t, f = t.view_as(best), f.view_as(best)
             nearer = (f >= 0) & (t < best)

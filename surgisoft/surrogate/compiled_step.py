@@ -24,9 +24,11 @@ class CompiledStep:
     Constants are taken from the model again whenever its parameters or buffers have changed.
     """
 
-    def __init__(self, model: ArmModel, name: str | None):
-        """name: that of the model's hysteresis; None where it has none."""
-        self.model, self.name = model, name
+    def __init__(
+        self, model: ArmModel, network: HawNN, name: str | None, hysteresis: Hysteresis | None
+    ):
+        """Parts of the model: network, and name and effect of its hysteresis, None without."""
+        self.model, self.name, self._network, self._hysteresis = model, name, network, hysteresis
         self._tensors = [*model.parameters(), *model.buffers()]
         self._seen: list[tuple[int, int]] = []
         self._constants: list[np.ndarray] = []
@@ -35,19 +37,21 @@ class CompiledStep:
     def of(cls, model: ArmModel) -> CompiledStep | None:
         """The compiled step of a model; None where only the reference can step it."""
         network, effects = model.network, dict(model.effects)
-        known = type(network) is HawNN and network.prior is None and len(effects) <= 1
-        if not known or any(type(effect) is not Hysteresis for effect in effects.values()):
+        name, effect = next(iter(effects.items()), (None, None))
+        if type(network) is not HawNN or network.prior is not None or len(effects) > 1:
+            return None
+        if not (effect is None or type(effect) is Hysteresis):
             return None
         tensors = [*model.parameters(), *model.buffers()]
         if any(t.device.type != "cpu" for t in tensors):
             return None
         if any(t.is_floating_point() and t.dtype != torch.float32 for t in tensors):
             return None
-        return cls(model, next(iter(effects), None))
+        return cls(model, network, name, effect)
 
     def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
-        network = self.model.network
+        network = self._network
         count, chambers = pressure.shape
         memory = pressure.new_empty(count, 0) if self.name is None else state.memory[self.name]
         after, anchor = torch.empty_like(memory), torch.empty_like(pressure)
@@ -74,10 +78,10 @@ class CompiledStep:
 
     def _read(self) -> list[np.ndarray]:
         """Constants of the compiled loops."""
-        model, network = self.model, self.model.network
+        model, network = self.model, self._network
         chain = (model.still, model.idle, model.band)
         constants = [_array(t) for t in (*chain, network.centre, network.half_range, network.use)]
-        return constants + ([] if self.name is None else _plays(model.effects[self.name]))
+        return constants + ([] if self._hysteresis is None else _plays(self._hysteresis))
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -90,7 +90,8 @@ FLOORS = {
     "scene": (
         ("frames",),
         ("mesh", "capsules"),
-        ("meshio", "bvh", "rays", "plate"),
+        ("meshio", "bvh", "plate"),
+        ("rays",),
         ("field", "inside", "segmentation", "sight"),
         ("distance", "torch_queries", "camera"),
         ("batched", "collision", "render"),

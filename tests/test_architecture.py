@@ -66,7 +66,7 @@ FLOORS = {
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("other_models",),
-        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
         ("black_box", "candidates", "setup"),
@@ -90,12 +90,15 @@ FLOORS = {
     "scene": (
         ("frames",),
         ("mesh", "capsules"),
-        ("meshio", "bvh", "rays", "plate"),
+        ("meshio", "bvh", "plate"),
+        ("rays",),
         ("field", "inside", "segmentation", "sight"),
         ("distance", "torch_queries", "camera"),
         ("batched", "collision", "render"),
         ("reach", "spec"),
-        ("lesion", "repair", "dose_patch"),
+        ("lesion", "repair"),
+        ("contours",),
+        ("dose_patch",),
         ("folder", "mounted_arm", "ablation"),
         ("mounts", "check"),
         ("author",),
@@ -140,6 +143,7 @@ ONLY_IN = {
     "serial": "rig/drivers/serial_controller",
     "mcap": "measurement/importing/readers/mcap",
     "mcap_ros2": "measurement/importing/readers/mcap",
+    "distributed": "workers",
 }
 
 

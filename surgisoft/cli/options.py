@@ -172,6 +172,15 @@ RigsOfArms = Annotated[
     ),
 ]
 
+Cluster = Annotated[
+    str | None,
+    Option(
+        metavar="ADDRESS",
+        help="Dask scheduler (tcp://host:8786) whose workers run the work in place of processes on "
+        "this machine. Default: the environment variable SURGISOFT_CLUSTER.",
+    ),
+]
+
 Preflight = Annotated[
     bool,
     Option(

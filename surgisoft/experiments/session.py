@@ -133,12 +133,14 @@ def finish_experiment(
     replays: bool = True,
     about: str = "",
     progress: Progress = silent,
+    cluster: str | None = None,
 ) -> tuple[Results, list[Path]]:
     """Roll out what is not there yet and write tables, pictures, replays and the report.
 
     Returns the results and the files that were written. about: the command, for the report.
+    cluster: address of a Dask scheduler whose workers run the episodes.
     """
-    rows = run_experiment(spec, folder, processes, progress)
+    rows = run_experiment(spec, folder, processes, progress, cluster)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
     logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}

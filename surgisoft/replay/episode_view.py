@@ -324,8 +324,7 @@ def _log_dosed(
 
 def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     """Log the reference path once, and over time the actual path and the target."""
-    closed = np.vstack((log.path_mm, log.path_mm[:1]))
-    planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
+    planned = log.paths_mm or _unbroken(log.target_mm)
     if planned:
         plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[PLAN_MM])
         columns.recording.log("/path/planned", plan, static=True)

@@ -98,7 +98,8 @@ class AblationState:
     band_mm2: torch.Tensor
     """(B, N) float32 mm^2: ablated area of the band at each station."""
     zone_mm2: torch.Tensor
-    """(B, 3) float32 mm^2: ablated area by zone (lesion, ring, healthy)."""
+    """(B, 3) float32 mm^2: ablated area by zone (lesion, ring, healthy); of the lesion with
+    `exact_lesion` the area with the dose that cuts."""
     zone_j: torch.Tensor
     """(B, 3) float32 J: energy received by zone."""
     delivered_j: torch.Tensor
@@ -149,10 +150,13 @@ class AblationMap:
         tissue: Tissue | None = None,
         depth_mm: float = 0.0,
         device: str | torch.device = "cpu",
+        exact_lesion: bool = False,
     ):
         """waist_mm is the beam's 1/e^2 radius; the ring counts as cut where it is depth_mm deep.
 
-        Several patches are the rings of `cut_patches`, which share their samples.
+        Several patches are the rings of `cut_patches`, which share their samples. With
+        exact_lesion the area of the lesion counts from depth_mm too, instead of from the threshold
+        of ablation.
         """
         self.patches = (patch,) if isinstance(patch, DosePatch) else tuple(patch)
         patch = self.patches[0]
@@ -168,6 +172,9 @@ class AblationMap:
         self.patch, self.waist_mm, self.tissue = patch, float(waist_mm), tissue or Tissue()
         self.threshold = self.tissue.threshold_j_per_mm2
         self.cut_dose = self.tissue.dose_for_depth(depth_mm)
+        self._counted = np.full(3, self.threshold)
+        if exact_lesion:
+            self._counted[LESION] = self.cut_dose
         self.device = torch.device(device)
         self._samples = [
             torch.tensor(array, device=self.device)
@@ -179,6 +186,13 @@ class AblationMap:
         self._zones, self._stations = np.stack(zone), np.stack(station)
         lengths = [one.ring_length_mm for one in self.patches]
         self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
+
+    @property
+    def zone_areas_mm2(self) -> tuple[float, float, float]:
+        """Area of the patch's lesion, ring and healthy tissue (of the first ring), mm^2."""
+        zone, areas = self.patch.zone, self.patch.areas_mm2
+        lesion, ring, healthy = (float(areas[zone == k].sum()) for k in (LESION, RING, HEALTHY))
+        return lesion, ring, healthy
 
     def start(
         self,
@@ -297,7 +311,7 @@ class AblationMap:
         samples = (patch.points_mm, patch.normals, patch.areas_mm2, self._zones, self._stations)
         place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
         which = ring.contiguous().numpy()
-        _deposit(*beams, which, self.waist_mm, self.threshold, samples, place, *kept)
+        _deposit(*beams, which, self.waist_mm, self._counted, samples, place, *kept)
         return dose, peak, band, area, joule
 
     def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
@@ -310,8 +324,9 @@ class AblationMap:
             gain = sweep_fluence(p, q, d, energy[part], self.waist_mm, points)
             gain = gain * (-(d @ normals.T)).clamp(min=0.0)
             after = dose[part] + gain
-            burnt = (after >= self.threshold) & (dose[part] < self.threshold)
             zone, station = self._zone[ring[part]], self._station[ring[part]]
+            least = torch.as_tensor(self._counted, dtype=torch.float32, device=self.device)[zone]
+            burnt = (after >= least) & (dose[part] < least)
             in_ring = zone == RING
             joule[part] = joule[part].scatter_add(1, zone, gain * areas)
             area[part] = area[part].scatter_add(1, zone, burnt * areas)
@@ -437,7 +452,7 @@ def _deposit(
     energy,
     ring,
     waist,
-    threshold,
+    counted,
     samples,
     place,
     dose,
@@ -510,7 +525,7 @@ def _deposit(
                         after = dose[n, s] + gain
                         kind = zone[s]
                         joule[n, kind] += gain * areas[s]
-                        if after >= threshold and dose[n, s] < threshold:
+                        if after >= counted[kind] and dose[n, s] < counted[kind]:
                             area[n, kind] += areas[s]
                             if kind == RING:
                                 band[n, station[s]] += areas[s]

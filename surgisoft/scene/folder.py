@@ -54,6 +54,8 @@ class Scene:
         for mount in table["mounts"]:
             if not mount["name"]:
                 del mount["name"]  # scenes of before arms had names keep their hash
+        if not table["contours"]:
+            del table["contours"]
         digest = hashlib.sha256(tomli_w.dumps(table).encode())
         for body in self.bodies:
             digest.update(body.mesh.content_hash.encode())

@@ -4,9 +4,10 @@ Lengths are in mm, times in s. Angles are in degrees in the file, where the fiel
 `_deg`, else in radians. World frame: z up. An arm's base frame: z along the arm at rest.
 """
 
+import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -133,6 +134,66 @@ class LesionSpec:
     """Closed path on the surface to cut in place of the circle, world frame (mm); empty: circle."""
 
 
+CLOSED_POINTS, OPEN_POINTS = 3, 2
+"""Least number of points of a closed and of an open contour."""
+
+
+@dataclass(frozen=True)
+class ContourSpec:
+    """A path on the organ, by points on its surface or as a circle."""
+
+    name: Name
+    """Name of the contour, unique among them."""
+    points_mm: tuple[Point, ...] = ()
+    """Points on the organ's surface, in order, world frame (mm)."""
+    file: str = ""
+    """CSV with the columns x, y, z (mm, world frame), beside this file, in place of `points_mm`."""
+    centre_mm: tuple[Coordinate, ...] = ()
+    """Centre of a circle on the surface, world frame (mm), in place of points."""
+    diameter_mm: Length = 20.0
+    """Diameter of that circle (mm)."""
+    closed: bool = True
+    """Whether the last point is followed by the first."""
+    margin_mm: Distance = 0.0
+    """The path is the outline grown outwards by this (mm); closed contours only."""
+
+    def checked(self, where: Where) -> "ContourSpec":
+        """The contour with the points of its file; an InputError where fields do not fit."""
+        given = [bool(self.points_mm), bool(self.file), bool(self.centre_mm)]
+        if sum(given) != 1:
+            raise where.error(
+                f"{sum(given)} of points_mm, file and centre_mm are given", "one of them"
+            )
+        if self.centre_mm and len(self.centre_mm) != 3:
+            raise (where / "centre_mm").error(f"got {len(self.centre_mm)} numbers", "3, in mm")
+        if not self.closed and (self.margin_mm or self.centre_mm):
+            came = "margin_mm" if self.margin_mm else "centre_mm"
+            raise (where / came).error("got it for an open contour", "it for a closed one only")
+        points = self.points_mm
+        if self.file:
+            points = _points_of(where.path.parent / self.file, where / "file")
+        least = CLOSED_POINTS if self.closed else OPEN_POINTS
+        if not self.centre_mm and len(points) < least:
+            raise (where / "points_mm").error(f"got {len(points)} points", f"at least {least}")
+        return replace(self, points_mm=points, file="")
+
+
+def _points_of(path: Path, where: Where) -> tuple[tuple[float, float, float], ...]:
+    """The columns x, y and z of a CSV file, mm."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+        points = [(float(row["x"]), float(row["y"]), float(row["z"])) for row in rows]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not such a file"
+        raise where.error(
+            f"{path} cannot be read ({reason})", "a CSV file with the columns x, y, z in mm"
+        ) from None
+    if not np.isfinite(points).all():
+        raise where.error(f"{path} has a coordinate that is not finite", "numbers in mm")
+    return tuple(points)
+
+
 @dataclass(frozen=True)
 class MountSpec:
     """The mount of one arm, and the tool that the arm carries."""
@@ -232,6 +293,8 @@ class SceneSpec:
     """Free text."""
     format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
     """Version of this file format."""
+    contours: tuple[ContourSpec, ...] = ()
+    """Paths on the lesion's organ that a task may follow, in this order."""
 
     @property
     def arms(self) -> dict[str, MountSpec]:
@@ -313,6 +376,12 @@ def _check_whole(spec: SceneSpec, where: Where) -> None:
                 f"a second body '{body.name}'", "names that differ"
             )
         seen.add(body.name)
+    contours = [contour.name for contour in spec.contours]
+    for i, name in enumerate(contours):
+        if name in contours[:i]:
+            raise (where / "contours" / i / "name").error(
+                f"a second contour '{name}'", "names that differ"
+            )
     organs = [body.name for body in spec.bodies if body.role == "organ"]
     if not organs:
         raise (where / "bodies").error("no body has the role 'organ'", "at least one organ")

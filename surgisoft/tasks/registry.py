@@ -15,12 +15,15 @@ import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.base import Task, TaskSpec
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
+from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
 from surgisoft.tasks.keyhole import KEYHOLE
 from surgisoft.tasks.laser_plane import LASER_PLANE
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
+from surgisoft.tasks.two_laser_ring import TWO_LASER_RING
 
 TASKS: dict[str, TaskSpec] = {
     "track_circle": TRACK_CIRCLE,
@@ -29,6 +32,9 @@ TASKS: dict[str, TaskSpec] = {
     "laser_plane": LASER_PLANE,
     "keyhole": KEYHOLE,
     "circle_ablation": CIRCLE_ABLATION,
+    "contour_ablation": CONTOUR_ABLATION,
+    "area_ablation": AREA_ABLATION,
+    "two_laser_ring": TWO_LASER_RING,
 }
 """Every task by name."""
 

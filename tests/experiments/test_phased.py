@@ -175,7 +175,7 @@ def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, 
     file = tmp_path / "press.csv"
     file.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1.0,5,0,0\n")
     hand, play = Schedule(file, 3), Episodes(task)
-    point = task.base.centre_mm(state)[0]
+    point = task.base.watched_mm(state)[0]
     way = Waypoints([(0.0, *point.tolist())])
     for _ in range(12):
         actions = {

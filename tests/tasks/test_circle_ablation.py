@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from surgisoft.errors import InputError
+from surgisoft.tasks import laser_work
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.world.arm import Randomisation
@@ -227,10 +228,10 @@ def test_the_gate_follows_what_is_measured_and_never_the_true_beam(quick, cut):
 
     arm = quick.world.arms["laser"]
     truly_off = with_laser(replace(arm.posed(laser, tilted), seen_mm=laser.points_mm))
-    assert (quick.beam_error_mm(truly_off) > 2.0).all()
+    assert (laser_work.beam_error_mm(quick, truly_off) > 2.0).all()
     assert quick.fires(truly_off).all()
     seen_off = with_laser(replace(laser, seen_mm=tilted))
-    assert (quick.beam_error_mm(seen_off) < 0.5).all()
+    assert (laser_work.beam_error_mm(quick, seen_off) < 0.5).all()
     assert not quick.fires(seen_off).any()
 
 
@@ -238,7 +239,7 @@ def test_the_pointing_error_is_measured_with_the_beam_off_too(quick, cut):
     """No gate truncates it; it leaves out the approach alone."""
     states, outcomes = cut
     measured = torch.stack([o.measures["pointing_error_mm"] for o in outcomes])
-    true = torch.stack([quick.beam_error_mm(state) for state in states[1:]])
+    true = torch.stack([laser_work.beam_error_mm(quick, state) for state in states[1:]])
     begins = round(quick.config.approach_s / quick.dt_s)
     assert measured[: begins - 1].isnan().all()
     torch.testing.assert_close(measured[begins + 1 :], true[begins + 1 :])
@@ -257,7 +258,7 @@ def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
     reward = quick.rewards(replace(state, goal=replace(state.goal, fired=on)))
     for agent in quick.agents:
         assert reward[agent]["cut"].tolist() == [1.0, 0.0]
-    error = quick.beam_error_mm(state)
+    error = laser_work.beam_error_mm(quick, state)
     torch.testing.assert_close(reward["laser"]["far"], 10.0 / (10.0 + error))
     torch.testing.assert_close(reward["laser"]["aim"], torch.exp(-error))
     torch.testing.assert_close(reward["laser"]["fine"], torch.exp(-error / 0.1))
@@ -289,7 +290,7 @@ def test_an_arm_in_front_of_the_camera_or_the_beam_hides_what_is_behind(quick, c
     assert (world.scene.view.fraction == 1.0).all()
     assert world.scene.hit.on_organ.all()
     for tool, other in (("endoscope", "laser"), ("laser", "endoscope")):
-        tip, target = world.arms[tool].tip_mm, quick.centre_mm(state)
+        tip, target = world.arms[tool].tip_mm, quick.watched_mm(state)
         if tool == "laser":
             target = world.scene.hit.point_mm
         towards = torch.nn.functional.normalize(target - tip, dim=1)

@@ -36,6 +36,8 @@ SHAPES: dict[type, dict[str, tuple[Shape, str]]] = {
         "targets_mm": (("T", "k", 3), "f"),
         "actuals_mm": (("T", "k", 3), "f"),
         "path_mm": (("M", 3), "f"),
+        "path_starts": (("J",), "i"),
+        "path_closed": (("J",), "b"),
         "clearance_mm": (("T",), "f"),
     },
     ArmLog: {
@@ -136,6 +138,16 @@ def _contradictions(log: EpisodeLog, rows: int):
         yield "its agents are none of its arms"
     if not log.arms:
         yield "it has no arms"
+    if (log.path_starts is None) != (log.path_closed is None):
+        yield "its paths have no beginnings or no ends"
+    elif log.path_starts is not None:
+        starts = log.path_starts
+        if (
+            not len(starts)
+            or starts[0] != 0
+            or (np.diff(starts, append=len(log.path_mm)) < 1).any()
+        ):
+            yield "its paths do not begin one after the other"
     for name, arm in log.arms.items():
         yield from _of_part(f"arm '{name}'", arm, rows)
         if min(arm.points_mm.shape[1], arm.line_mm.shape[1] - 2, arm.command_kPa.shape[1]) < 1:

@@ -57,7 +57,7 @@ class EpisodeLog:
     actuals_mm: np.ndarray
     """(T, k, 3) mm: actual place of the task's points."""
     path_mm: np.ndarray
-    """(M, 3) mm: the closed path that is asked for; (0, 3) where there is none but the targets."""
+    """(M, 3) mm: the paths that are asked for; (0, 3) where there is none but the targets."""
     measures: dict[str, np.ndarray]
     """The task's measures: name with unit -> (T,); nan where one does not apply."""
     rewards: dict[str, dict[str, np.ndarray]]
@@ -78,6 +78,27 @@ class EpisodeLog:
     """The bodies of the scene."""
     events: tuple[Event, ...] = ()
     """Events of the episode, in order of time."""
+    path_starts: np.ndarray | None = None
+    """(J,) int: number of the first point of each path in `path_mm`; None: one path."""
+    path_closed: np.ndarray | None = None
+    """(J,) bool: whether the last point of a path is followed by its first; None: it is."""
+
+    @property
+    def one_ring(self) -> bool:
+        """Whether one closed path is asked for."""
+        return self.path_closed is None or self.path_closed.tolist() == [True]
+
+    @property
+    def paths_mm(self) -> list[np.ndarray]:
+        """The paths that are asked for, (N, 3) mm each; of a closed one the first point is last."""
+        starts = [0] if self.path_starts is None else self.path_starts.tolist()
+        closed = [True] * len(starts) if self.path_closed is None else self.path_closed.tolist()
+        pieces = np.split(self.path_mm, starts[1:])
+        return [
+            np.vstack((piece, piece[:1])) if back else piece
+            for piece, back in zip(pieces, closed, strict=True)
+            if len(piece)
+        ]
 
     @property
     def rows(self) -> int:
@@ -193,7 +214,7 @@ class EpisodeRecorder:
             arms={name: self._arm(name, rows) for name in task.world.arms},
             targets_mm=rows["targets"],
             actuals_mm=rows["actuals"],
-            path_mm=self._path(near),
+            **self._paths(near),
             measures=_below(rows, "measures/"),
             rewards={agent: _below(rows, f"rewards/{agent}/") for agent in task.agents},
             limits={} if near is None else _limits(near),
@@ -286,11 +307,15 @@ class EpisodeRecorder:
         power = burnt / self.task.world.config.dt_s
         return BeamLog(power, rows[f"end/{name}"], rows[f"hits/{name}"])
 
-    def _path(self, near: SceneEngine | None) -> np.ndarray:
-        """(M, 3) mm: the ring's path of this episode's lesion."""
+    def _paths(self, near: SceneEngine | None) -> dict[str, np.ndarray]:
+        """The paths of this episode's lesion, as fields of the log."""
         if near is None:
-            return np.zeros((0, 3), np.float32)
-        return near.paths_mm[self._lesion].detach().cpu().numpy().copy()
+            return {"path_mm": np.zeros((0, 3), np.float32)}
+        return {
+            "path_mm": near.paths_mm[self._lesion].detach().cpu().numpy().copy(),
+            "path_starts": np.array([each.first for each in near.stretches]),
+            "path_closed": np.array([each.closed for each in near.stretches]),
+        }
 
     def _dose_log(self, near: SceneEngine) -> DoseLog:
         ablation, patch = near.ablation, near.ablation.patches[self._lesion]
@@ -372,7 +397,8 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
         found += _changes(log, folded, ("error", "an arm touches itself"), ("info", "arm unfolded"))
     completion = log.measures.get("completion")
     if completion is not None and len(whole := np.flatnonzero(completion >= 1.0)):
-        found.append(Event(float(log.time_s[whole[0]]), "info", "ring cut all around"))
+        text = "ring cut all around" if log.one_ring else "all is treated"
+        found.append(Event(float(log.time_s[whole[0]]), "info", text))
     if ending:
         found.append(Event(float(log.time_s[-1]), *_end(log, ending)))
     return tuple(sorted(found, key=lambda event: event.time_s))

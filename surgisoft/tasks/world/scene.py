@@ -14,17 +14,16 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import View, seen_from
-from surgisoft.scene.capsules import BatchClearance
+from surgisoft.scene.capsules import BatchClearance, segment_distance
 from surgisoft.scene.collision import ExactScene
-from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.lesion import lesions_like
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.spec import PHANTOM as PHANTOM
 from surgisoft.tasks.world.arm import ArmPart, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.treatment import Plan, rings
 
 GEOMETRIES = ("batched", "fcl")
 """Collision engines: `batched` for training, `fcl` exact."""
@@ -33,8 +32,6 @@ LASER, ENDOSCOPE = "laser", "endoscope"
 carries the tool, the arm has its name."""
 BEAM_BEYOND_MM = 50.0
 """The beam is followed this far beyond the laser's largest working distance (mm)."""
-PATH_POINTS = 360
-"""Points of the ring's path that the laser follows."""
 NOT_RANDOMISED = Randomisation()
 """Default: the scene's own lesion only."""
 
@@ -59,6 +56,9 @@ class SceneState:
     """What each endoscope sees of the ring, (B,), by the arm's name."""
     lesion: Tensor | None = None
     """(B,) int64: number of the episode's lesion among those laid out."""
+    watched: Tensor | None = None
+    """(B,) int64: number of the points that the endoscopes have to see from the next step on; a
+    task sets it where its target moves, and it begins with the lesion's number."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
@@ -117,10 +117,11 @@ class SceneEngineConfig:
 class SceneEngine:
     """Computes the state of a scene from the arms in it; built once, holds no state.
 
-    `spec` is the scene's file. `paths_mm` (K, 360, 3) mm, world frame, are the closed paths of the
-    rings around its K lesions, `centres_mm` (K, 3) mm their centres; `path_mm` and `centre_mm` are
-    those of the first. `collision` is the engine of clearance and of the beams' hits. `lasers` and
-    `endoscopes` are the names of the arms with these tools.
+    `spec` is the scene's file. `paths_mm` (K, M, 3) mm, world frame, are the points that the beam
+    follows around its K lesions, `stretches` the paths of which they consist, `centres_mm` (K, 3)
+    mm their centres; `path_mm` and `centre_mm` are those of the first. `looks_mm` (W, V, 3) mm are
+    what endoscopes have to see. `collision` is the engine of clearance and of the beams' hits.
+    `lasers` and `endoscopes` are the names of the arms with these tools.
     """
 
     def __init__(
@@ -130,8 +131,12 @@ class SceneEngine:
         device: str | torch.device = "cpu",
         engine: str | None = None,
         vary: Randomisation = NOT_RANDOMISED,
+        plan: Plan | None = None,
     ):
-        """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere."""
+        """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere.
+
+        plan: what is to be treated; None: rings around the scene's lesion (`treatment.rings`).
+        """
         config, spec, self.device = config or SceneEngineConfig(), scene.spec, torch.device(device)
         radii = {name: 0.5 * mount.diameter_mm for name, mount in spec.arms.items()}
         self.lasers, self.endoscopes = spec.arms_with(LASER), spec.arms_with(ENDOSCOPE)
@@ -140,24 +145,29 @@ class SceneEngine:
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
-        mesh, waist = scene.organ.world_mesh, 0.5 * spec.laser.spot_mm
-        place = (vary.lesions, vary.lesion_mm, vary.lesion_size)
-        scenes = [scene.with_lesion(one) for one in lesions_like(mesh, spec.lesion, *place)]
-        rings = [(one.ring.points_mm, one.ring.normals, one.ring.centre_mm) for one in scenes]
-        patches = cut_patches(mesh, rings, SPACING_WAISTS * waist, config.band_mm)
-        tissue = Tissue(spec.laser.absorption_per_mm)
-        self.ablation = AblationMap(patches, waist, tissue, config.depth_mm, device)
-        looks = [one.ring_of(count=config.view_points) for one in scenes]
-        paths = [one.ring_of(count=PATH_POINTS).points_mm for one in scenes]
+        treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
+        self.work_camera = self.camera
+        if treated.field_rad is not None:
+            narrow = min(treated.field_rad, self.camera.fov_rad)
+            self.work_camera = replace(self.camera, fov_rad=narrow)
+        self.ablation = AblationMap(
+            treated.patches,
+            0.5 * treated.spot_mm,
+            Tissue(spec.laser.absorption_per_mm),
+            config.depth_mm if treated.depth_mm is None else treated.depth_mm,
+            device,
+            exact_lesion=treated.exact_lesion,
+        )
 
-        def held(arrays) -> Tensor:
-            return torch.tensor(np.stack(arrays), dtype=torch.float32, device=self.device)
+        def held(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=self.device)
 
-        self.spec, self.lesions = spec, len(scenes)
-        self.paths_mm, self.centres_mm = held(paths), held([centre for _, _, centre in rings])
+        self.spec, self.lesions = spec, len(treated.patches)
+        self.stretches = treated.stretches
+        self.paths_mm, self.centres_mm = held(treated.paths_mm), held(treated.centres_mm)
+        self.path_normals = held(treated.normals)
         self.path_mm, self.centre_mm = self.paths_mm[0], self.centres_mm[0]
-        self.rings_mm = held([look.points_mm for look in looks])
-        self.ring_normals = held([look.normals for look in looks])
+        self.looks_mm, self.look_normals = held(treated.looks_mm), held(treated.look_normals)
 
     def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, SceneState]:
         """Draw a lesion for each random number stream; the scene with untouched tissue."""
@@ -165,7 +175,7 @@ class SceneEngine:
         if self.lesions > 1:
             stream, draw = stream.uniform(0.0, float(self.lesions))
             lesion = draw.long().clamp(max=self.lesions - 1)
-        scene = self._look(parts, lesion)
+        scene = self._look(parts, lesion, lesion)
         if not self.lasers:
             return stream, scene
         dose = self.ablation.start(*self._beams(scene, parts), lesion)
@@ -179,7 +189,7 @@ class SceneEngine:
         dt_s: float,
     ) -> SceneState:
         """The scene after the arms moved and the beams swept with `power_w` for dt_s."""
-        after = self._look(parts, scene.lesion)
+        after = self._look(parts, scene.lesion, scene.watched)
         if scene.dose is None:
             return replace(after, donated=scene.donated)
         beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
@@ -205,18 +215,36 @@ class SceneEngine:
         beam = parts[laser]
         return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=laser)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
+    def path_clearance_mm(
+        self, parts: Mapping[str, ArmPart], laser: str, target_mm: Tensor
+    ) -> Tensor:
+        """(B,) mm: least distance of a beam's path from the skin of the other arms, without limit.
+
+        The path runs along the tip's direction as far as a target (B, 3) mm lies ahead.
+        """
+        beam = parts[laser]
+        ahead = ((target_mm - beam.tip_mm) * beam.tip_direction).sum(1, keepdim=True).clamp(min=0.0)
+        tip, end = beam.tip_mm[:, None], (beam.tip_mm + ahead * beam.tip_direction)[:, None]
+        away = [
+            segment_distance(tip, end, part.line_mm[:, :-1], part.line_mm[:, 1:]).amin(1)
+            - self.geometry.radius_mm(name)
+            for name, part in parts.items()
+            if name != laser
+        ]
+        return torch.stack(away).amin(0)
+
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor, watched: Tensor) -> SceneState:
         lines = {name: part.line_mm for name, part in parts.items()}
         clearance = self.collision.clearance(lines)
         hits = {name: self.aimed(parts, name) for name in self.lasers}
-        ring = (self.rings_mm[lesion], self.ring_normals[lesion])
+        ring = (self.looks_mm[watched], self.look_normals[watched])
         views = {name: self._seen(parts[name], name, ring, lines) for name in self.endoscopes}
-        return SceneState(clearance, hits, None, views, lesion)
+        return SceneState(clearance, hits, None, views, lesion, watched)
 
     def _seen(self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines) -> View:
         """What an endoscope sees of the ring's points and normals (B, M, 3)."""
         at = (eye.tip_mm, eye.tip_direction)
-        return seen_from(self.geometry, self.camera, *at, *ring, lines, own=name)
+        return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name)
 
     def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
         """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.

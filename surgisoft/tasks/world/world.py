@@ -39,6 +39,7 @@ from surgisoft.tasks.world.scene import (
     SceneEngineConfig,
     SceneState,
 )
+from surgisoft.tasks.world.treatment import Plan
 
 OTHER_LENGTH = 0.1
 """An arm that takes the place of a scene's own may differ by this share of the mount's length: a
@@ -202,11 +203,13 @@ def scene_world(
     engine: str | None = None,
     arm: str | Path | None = None,
     agents: Sequence[str] | None = None,
+    plan: Plan | None = None,
 ) -> World:
     """World of a scene (or its folder): its bodies and its arms, named as in the scene.
 
     arm: a model for all arms instead of those that the scene names, as for `named_arm`. agents:
-    names of the arms that a task drives, the others are passive; None: all arms.
+    names of the arms that a task drives, the others are passive; None: all arms. plan: what is to
+    be treated; None: a ring around the scene's lesion.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
@@ -221,7 +224,7 @@ def scene_world(
             _check_length(model, mount, scene, arm)
         arms[arm_name] = Mounted(model, pose, shaft_mm=mount.shaft_mm)
     vary = config.randomisation
-    around = SceneEngine(scene, config.scene_engine, device, engine, vary)
+    around = SceneEngine(scene, config.scene_engine, device, engine, vary, plan)
     passive = [name for name in arms if name not in agents]
     return World(arms, config, around, device, passive)
 

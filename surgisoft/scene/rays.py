@@ -295,7 +295,8 @@ def rays_to_body(
     """First hits of rays (N, 3) on a body, where they are nearer than t (N,) mm.
 
     `each` rays belong to one environment; turns (B or 1, 3, 3) and shifts (B or 1, 3): world to
-    body, rigid or with strain. Writes struck, body and face (N,), distance t (N,) and normal n (N, 3), world frame.
+    body, rigid or with strain. Writes struck, body and face (N,), distance t (N,) and normal n
+    (N, 3), world frame.
     """
     triangles, starts, lower, upper = tree
     nodes, entry = np.empty(STACK, np.int64), np.empty(STACK)

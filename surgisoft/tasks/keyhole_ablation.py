@@ -112,7 +112,7 @@ class KeyholeAblationConfig:
     """Time for once around with the beam on, s."""
     fire_mm: float = 0.5
     """Measured distance of the beam from its target within which the beam is switched on, mm."""
-    approach_s: float = 12.0
+    approach_s: float = 18.0
     """Time at the beginning that the measure `pointing_error_mm` leaves out, s: feed and approach.
     """
     centred_mm: float = 2.0
@@ -128,7 +128,7 @@ class KeyholeAblationConfig:
     world: WorldConfig = field(
         default_factory=lambda: WorldConfig(randomisation=Randomisation(start_kPa=1.0))
     )
-    """The simulator and its domain randomization; arms are nearly straight when they enter."""
+    """The simulator and its domain randomization."""
 
     def __post_init__(self):
         positive = ("rim_mm", "rim_s", "cut_s", "fire_mm", "approach_s", "centred_mm")

@@ -76,15 +76,22 @@ class WorldConfig:
 class Feed:
     """Carriages that feed all arms in along their axes at the beginning of an episode."""
 
-    way_mm: float = 70.0
+    way_mm: float = 80.0
     """Distance of each base behind its mount when an episode begins, mm."""
     speed_mm_s: float = 10.0
     """Speed of the feed until the bases are at their mounts, mm/s."""
+    wait_s: float = 5.0
+    """Time before the feed begins, in which the arms can be straightened, s."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"feed: {name} is {value}, expected above 0")
+            if not (math.isfinite(value) and value >= (0.0 if name == "wait_s" else 1e-3)):
+                raise InputError(f"feed: {name} is {value}, expected above 0 (wait_s: 0 or more)")
+
+    def move_mm(self, out_mm: Tensor, steps: Tensor, dt_s: float) -> Tensor:
+        """(B,) mm: the feed in a step of bases (B,) mm behind their mounts, after (B,) steps."""
+        begun = steps * dt_s >= self.wait_s - 0.5 * dt_s
+        return out_mm.clamp(max=self.speed_mm_s * dt_s) * begun
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +198,7 @@ class World:
         dt_s, stream, parts = self.config.dt_s, state.stream, {}
         out_mm, move_mm = state.out_mm, None
         if self.feed and out_mm is not None:
-            move_mm = out_mm.clamp(max=self.feed.speed_mm_s * dt_s)
+            move_mm = self.feed.move_mm(out_mm, state.steps, dt_s)
             out_mm = out_mm - move_mm
         for name, arm in self.arms.items():
             part = state.arms[name]

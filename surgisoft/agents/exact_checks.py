@@ -77,6 +77,8 @@ class _Proof:
 
     def holds(self, lines_mm: dict[str, np.ndarray]) -> bool:
         """Whether no arm has moved far enough since to touch a body or another arm."""
+        if any(line.shape != self.lines_mm[name].shape for name, line in lines_mm.items()):
+            return False
         moved = {
             name: float(np.sqrt(((line - self.lines_mm[name]) ** 2).sum(axis=1).max()))
             for name, line in lines_mm.items()
@@ -200,7 +202,7 @@ class ExactChecks:
     def _proof(self, arms: dict[str, ArmShape]) -> _Proof:
         """Exact clearances of the arms."""
         exact = self.checker.clearance(arms)
-        free: dict[tuple[str, ...], float] = dict(exact.arms_mm)
+        free: dict[tuple[str, ...], float] = {**exact.arms_mm}
         for (arm, _), clearance in exact.bodies_mm.items():
             free[arm,] = min(free.get((arm,), math.inf), clearance)
         return _Proof({name: shape.centreline_mm for name, shape in arms.items()}, free)

@@ -202,7 +202,9 @@ class ExactChecks:
     def _proof(self, arms: dict[str, ArmShape]) -> _Proof:
         """Exact clearances of the arms."""
         exact = self.checker.clearance(arms)
-        free: dict[tuple[str, ...], float] = {**exact.arms_mm}
+        free: dict[tuple[str, ...], float] = {
+            (one, other): clearance for (one, other), clearance in exact.arms_mm.items()
+        }
         for (arm, _), clearance in exact.bodies_mm.items():
             free[arm,] = min(free.get((arm,), math.inf), clearance)
         return _Proof({name: shape.centreline_mm for name, shape in arms.items()}, free)

@@ -192,12 +192,14 @@ class CircleAblation:
         return self.pointing["laser"].offset_mm(points_mm, self.target_mm(state)).norm(dim=1)
 
     def fires(self, state: TaskState[RingCut]) -> Tensor:
-        """(B,) bool: as far as is measured the beam is near its target and meets the organ, and the
-        endoscope's picture shows enough of the ring. The true pose of the arms does not enter."""
-        scene = state.world.scene
-        seen = scene.view.fraction >= self.spec.limits.view_fraction
+        """(B,) bool: as far as is measured the beam is near its target and meets the organ, the
+        endoscope's picture shows enough of the ring, and the arms keep the scene's clearance. The
+        true pose of the laser arm does not enter into where the beam goes."""
+        scene, limits = state.world.scene, self.spec.limits
+        seen = scene.view.fraction >= limits.view_fraction
+        clear = (scene.clearance.least_mm >= limits.clearance_mm) & ~scene.clearance.collides
         near = self.measured_error_mm(state) <= self.config.fire_mm
-        return seen & near & self._on_organ(state)
+        return seen & clear & near & self._on_organ(state)
 
     def _on_organ(self, state: TaskState[RingCut]) -> Tensor:
         """(B,) bool: the beam meets the organ, from the measured key points of both arms."""

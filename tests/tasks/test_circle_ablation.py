@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def test_the_beam_waits_until_the_ring_is_seen(cut):
     assert states[60].goal.fired.all()
 
 
-@pytest.mark.parametrize("what", ["view", "aim", "blocked"])
+@pytest.mark.parametrize("what", ["view", "aim", "blocked", "close", "contact", "nothing known"])
 def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
     """A state in which the beam fires, changed in one respect."""
     state = rows(cut[0][80], torch.tensor([0]))
@@ -88,6 +89,13 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
         scene = replace(scene, view=low)
     elif what == "blocked":
         scene = replace(scene, hit=replace(scene.hit, struck=torch.tensor([4])))
+    elif what in ("close", "contact", "nothing known"):
+        least = {"close": quick.spec.limits.clearance_mm - 1e-3, "contact": 50.0}.get(
+            what, math.nan
+        )
+        touch = torch.tensor([what == "contact"])
+        close = SimpleNamespace(least_mm=torch.tensor([least]), collides=touch)
+        scene = replace(scene, clearance=close)
     else:
         goal = replace(goal, done=goal.done + 3)
     changed = replace(state, goal=goal, world=replace(state.world, scene=scene))

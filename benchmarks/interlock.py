@@ -43,8 +43,8 @@ EXPERT = 0.75
 WARM = 50
 """Steps in which all arms follow the expert at first: as many until the beam is on."""
 TIGHT_MM = 24.0
-"""Limit of the clearance in half of the episodes, mm: the expert comes as near as 21 in the phantom, so
-that the limit is crossed again and again with the beam on its path."""
+"""Limit of the clearance in half of the episodes, mm: the expert comes as near as 21 in the
+phantom, so that the limit is crossed again and again with the beam on its path."""
 ADVERSARIES = (
     "expert",
     "other arm",

@@ -20,6 +20,7 @@ EXTRA_OF = {
     "rerun_cli": "replay",
     "elastica": "elastica",
     "serial": "serial",
+    "distributed": "cluster",
     "mcap": "mcap",
     "mcap_ros2": "mcap",
     "nibabel": "segmentation",

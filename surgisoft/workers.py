@@ -1,4 +1,9 @@
-"""Pools of worker processes, one thread each, that end with the process that started them."""
+"""Pools of worker processes: on this machine, or on a Dask cluster of several.
+
+Processes on this machine have one thread each and end with the process that started them. Workers
+of a cluster are started by its owner (`dask worker ADDRESS --nworkers N --nthreads 1`), see the
+same files, and outlive the pool; Dask gives the work of a worker that was killed to another one.
+"""
 
 import contextlib
 import multiprocessing
@@ -7,10 +12,20 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from surgisoft.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables by which libraries of linear algebra set their number of threads."""
+CLUSTER = "SURGISOFT_CLUSTER"
+"""Environment variable with the address of a Dask scheduler, such as tcp://host:8786."""
+ANSWERS_S = 15.0
+"""Time within which the scheduler of a cluster has to answer, s."""
 
 
 def begin_worker(prepare: Callable[[], object] | None = None) -> None:
@@ -55,12 +70,20 @@ def torch_threads(count: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def workers(
-    processes: int, prepare: Callable[[], object] | None = None
-) -> Iterator[ProcessPoolExecutor]:
-    """Pool of so many worker processes; an error in the block cancels the work that waits.
+    processes: int, prepare: Callable[[], object] | None = None, cluster: str | None = None
+) -> Iterator[Executor]:
+    """Pool of worker processes; an error in the block cancels the work that waits.
 
-    prepare: called once in each new process.
+    processes: their number on this machine. prepare: called once in each new process. cluster:
+    address of a Dask scheduler whose workers take the place of processes on this machine; default:
+    that of the environment variable `CLUSTER`. Raises InputError where no such cluster answers,
+    where it has no worker, and where one has several threads.
     """
+    address = cluster or os.environ.get(CLUSTER)
+    if address:
+        with _cluster(address, prepare) as executor:
+            yield executor
+        return
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     context = multiprocessing.get_context("spawn")
@@ -78,3 +101,60 @@ def workers(
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _cluster(address: str, prepare: Callable[[], object] | None) -> Iterator[Executor]:
+    """Pool of the workers of a Dask cluster; see `workers`."""
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=ANSWERS_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f"cluster {address}: no Dask scheduler answers; start one with 'dask scheduler', and "
+            "give its address, such as tcp://host:8786"
+        ) from error
+    with client:
+        _check_workers(client, address)
+        client.register_plugin(_begin_plugin(prepare))
+        # A job that has begun may have written files: it is run again only where its worker died.
+        executor = client.get_executor(pure=False, retries=0)
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False)
+            raise
+
+
+def _check_workers(client: "Client", address: str) -> None:
+    """Raise InputError unless every worker has one thread, and there is one."""
+    threads: dict[str, int] = client.nthreads()
+    if not threads:
+        raise InputError(
+            f"cluster {address}: it has no worker; start some with 'dask worker {address} "
+            "--nworkers N --nthreads 1'"
+        )
+    many = [worker for worker, count in threads.items() if count != 1]
+    if many:
+        raise InputError(
+            f"cluster {address}: worker {many[0]} has {threads[many[0]]} threads, expected 1; "
+            "start it with --nthreads 1"
+        )
+
+
+def _begin_plugin(prepare: Callable[[], object] | None) -> Any:
+    """What each worker does before its first job, also one that joins later."""
+    from distributed import WorkerPlugin
+
+    class Begin(WorkerPlugin):
+        name = "surgisoft"
+
+        def setup(self, worker: Any) -> None:
+            import torch
+
+            torch.set_num_threads(1)
+            if prepare is not None:
+                prepare()
+
+    return Begin()

@@ -18,8 +18,10 @@ from surgisoft.agents.rollout import Instant
 from surgisoft.errors import InputError
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.rays import RayHit
 from surgisoft.tasks.base import Task, TaskState
-from surgisoft.tasks.world.scene import LASER, SceneEngine
+from surgisoft.tasks.world.arm import ArmPart
+from surgisoft.tasks.world.scene import SceneEngine
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are computed."""
@@ -111,15 +113,15 @@ class ExactChecks:
         notes.contact_differs += bool(found) != bool(clearance.collides[row])
         notes.closest.append((float(clearance.least_mm[row]), step, arms))
         notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
-        if LASER in world.arms:
-            self._look_along(notes, state, row, arms)
+        for laser, hit in world.scene.hits.items():
+            self._look_along(notes, world.arms[laser], hit, row, arms, laser)
 
-    def _look_along(self, notes: _Notes, state: TaskState, row: int, arms) -> None:
-        """Compare the beam's exact end with that of the batched geometry."""
-        beam, hit = state.world.arms[LASER], state.world.scene.hit
-        assert hit is not None, "a world with a laser has the beam's hit"
+    def _look_along(
+        self, notes: _Notes, beam: ArmPart, hit: RayHit, row: int, arms, laser: str
+    ) -> None:
+        """Compare the exact end of a laser's beam with that of the batched geometry."""
         origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
-        exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=LASER)
+        exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=laser)
         if int(exact.struck) != int(hit.struck[row]):
             notes.beam_differs += 1
         else:

@@ -21,6 +21,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -30,11 +31,13 @@ from surgisoft.agents.observer import Observer, ObserverGains
 from surgisoft.errors import InputError
 from surgisoft.rig import Rig
 from surgisoft.rig.interface import is_simulated
+from surgisoft.rig.preflight import preflight
 from surgisoft.rig.registry import HiddenEffect, open_rig, parse_rig
 from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
+from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.world.arm import Arm, ArmPart, ModelArm
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -62,6 +65,8 @@ class RigConfig:
     rigs: tuple[str, ...] = ("virtual",)
     """Texts `NAME[:option=value,...]` (`surgisoft.rig.registry`): one for every arm, or
     `ARM=NAME[:...]` for single arms, the others then being virtual."""
+    preflight: bool = False
+    """Whether each real rig has to move as its arm model predicts before the first episode."""
 
     def __post_init__(self):
         _ = self.gains  # which checks them
@@ -354,7 +359,7 @@ def on_rig(
     world, moved = copy.copy(task.world), copy.copy(task)
     dt_s = world.config.dt_s
     texts = rigs_by_arm(config.rigs, tuple(world.arms))
-    arms: dict[str, Arm] = {}
+    arms: dict[str, RigArm] = {}
     with ExitStack() as opened:
         for name, arm in world.arms.items():
             if not isinstance(arm, ModelArm):
@@ -368,8 +373,13 @@ def on_rig(
                     f"{', '.join(texts)}: name the arm that is on it, such as "
                     f"{name}={texts[name]}; the others are virtual"
                 )
+        if config.preflight and all(arm.real is None for arm in arms.values()):
+            raise InputError(
+                f"the pre-flight check is for real rigs, and no arm of {task.name} is on one: "
+                f"{', '.join(f'{name} on {text}' for name, text in texts.items())}"
+            )
         opened.pop_all()
-    world.arms = arms
+    world.arms = {**arms}
     moved.world = world
     return moved
 
@@ -385,9 +395,15 @@ def real_benches(task: Task) -> dict[str, SafeRig]:
 
 @contextmanager
 def at_benches(task: Task) -> Iterator[None]:
-    """Inside it the task's real benches are driven; at its end they are vented and given back."""
+    """Inside it the task's real benches are driven; at its end they are vented and given back.
+
+    Raises InputError where a bench does not pass the pre-flight check that its configuration asks
+    for.
+    """
     with ExitStack() as opened:
         for arm in task.world.arms.values():
             if isinstance(arm, RigArm) and arm.real is not None:
                 opened.enter_context(arm.real)
+                if arm.config.preflight:
+                    preflight(arm.real, partial(steady_key_points, arm.model)).require()
         yield

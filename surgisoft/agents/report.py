@@ -12,7 +12,7 @@ from surgisoft.tasks.episodes.log import EpisodeLog
 
 WORDS = {
     "success": "success",
-    "completion": "share of the ring cut",
+    "completion": "share done",
     "beam_error_mean_mm": "mean beam error [mm]",
     "clearance_mm": "least clearance [mm]",
 }

@@ -11,6 +11,7 @@ from matplotlib import pyplot as plt
 from surgisoft.report import Picture
 from surgisoft.report.charts import AMBER, BLUE, CHART, GREEN, RED, chart, drawing
 from surgisoft.report.style import INK, MUTED
+from surgisoft.scene.dose_patch import HEALTHY, LESION
 from surgisoft.tasks.episodes.log import EpisodeLog
 
 JUMP_MM = 3.0
@@ -19,6 +20,8 @@ OFFSET_MM = 2.0
 """The unrolled dose is shown so far on either side of the ring (mm)."""
 CELL_MM = 0.25
 """Size of a cell of the unrolled dose along the ring, and half of it across (mm)."""
+MAP_CELL_MM = 0.25
+"""Least size of a cell of the dose map (mm); coarser where the samples are."""
 LEAST_DOSE = 0.1
 """Doses below this share of the threshold are left blank."""
 
@@ -29,7 +32,7 @@ def episode_charts(log: EpisodeLog) -> list[Picture]:
         picture
         for picture in (
             path_chart(log),
-            dose_chart(log),
+            dose_chart(log) if log.one_ring else dose_map(log),
             error_chart(log),
             progress_chart(log),
             clearance_chart(log),
@@ -41,19 +44,22 @@ def episode_charts(log: EpisodeLog) -> list[Picture]:
 def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     """Where the beam burnt (or the point went) over where it should, in the path's plane."""
     wanted = log.path_mm if len(log.path_mm) else log.target_mm
-    on = log.beam.on if log.beam is not None else np.ones(log.rows, bool)
-    done = log.beam.end_mm if log.beam is not None else log.actual_mm
+    always = np.ones(log.rows, bool)
+    done = [(beam.end_mm, beam.on) for beam in log.beams.values()] or [(log.actual_mm, always)]
     middle, plane = path_plane(wanted)
-    flat = (wanted - middle) @ plane
-    if len(log.path_mm):
-        flat = np.vstack((flat, flat[:1]))
-    went = (done - middle) @ plane
-    went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
+    flat = [(path - middle) @ plane for path in log.paths_mm or [wanted]]
+    wide = 5.0 if log.one_ring else 2.5
     with drawing():
         figure, axis = plt.subplots(figsize=(CHART[0], 4.2))
-        axis.plot(*broken_at_jumps(flat).T, c=AMBER, lw=5, alpha=0.55, label="reference")
-        word = "burnt" if log.beam is not None else "done"
-        axis.plot(*broken_at_jumps(went).T, c=BLUE, lw=1.3, label=word)
+        for number, path in enumerate(flat):
+            label = "reference" if number == 0 else None
+            axis.plot(*broken_at_jumps(path).T, c=AMBER, lw=wide, alpha=0.55, label=label)
+        for number, (end, on) in enumerate(done):
+            went = (end - middle) @ plane
+            went = np.where((on & np.isfinite(went).all(1))[:, None], went, np.nan)
+            word = [*log.beams][number] if len(done) > 1 else "burnt" if log.beams else "done"
+            colour = (BLUE, GREEN)[number % 2]
+            axis.plot(*broken_at_jumps(went).T, c=colour, lw=1.3, label=word)
         axis.set_aspect("equal", adjustable="datalim")
         axis.set_xlabel("mm")
         axis.set_ylabel("mm")
@@ -76,29 +82,28 @@ def error_chart(log: EpisodeLog) -> Picture | None:
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
-        axis.set_title(
-            "error over time" + (" while the beam is on" if log.beam is not None else "")
-        )
+        axis.set_title("error over time" + (" while the beam is on" if log.beams else ""))
         return chart(figure, "error over time", f"Largest {largest:.3g} mm")
 
 
 def progress_chart(log: EpisodeLog) -> Picture | None:
     """Share of the ring that is cut and seen, over time, with the beam's times shaded."""
     seen = log.view_fraction
-    if log.beam is None or seen is None or "completion" not in log.measures:
+    on = log.burning
+    if on is None or seen is None or "completion" not in log.measures:
         return None
     with drawing():
         figure, axis = plt.subplots()
         axis.fill_between(
-            log.time_s, 0, 1.05, where=log.beam.on, color=GREEN, alpha=0.15, lw=0, label="beam on"
+            log.time_s, 0, 1.05, where=on, color=GREEN, alpha=0.15, lw=0, label="beam on"
         )
-        axis.plot(log.time_s, log.measures["completion"], c=BLUE, label="cut")
+        axis.plot(log.time_s, log.measures["completion"], c=BLUE, label="done")
         axis.plot(log.time_s, seen, c=AMBER, lw=1.0, label="in sight")
         axis.axhline(log.limits["view_fraction"], c=MUTED, lw=0.8, ls="--")
         axis.set_xlim(0.0, log.time_s[-1])
         axis.set_ylim(0.0, 1.05)
         axis.set_xlabel("time [s]")
-        axis.set_ylabel("share of the ring")
+        axis.set_ylabel("share")
         axis.set_title("cut and in sight")
         axis.legend(loc="lower right")
         return chart(figure, "share cut and in sight", "Dashed: what has to be in sight")
@@ -165,6 +170,59 @@ def dose_chart(log: EpisodeLog) -> Picture | None:
             figure,
             "dose unrolled along the ring",
             "Red: where the dose reaches the threshold of ablation; negative: inside the ring",
+        )
+
+
+def dose_map(log: EpisodeLog) -> Picture | None:
+    """The dose at the end on the organ's surface, seen at right angles: 1 is the threshold."""
+    if log.dose is None:
+        return None
+    from matplotlib.colors import LogNorm
+
+    dose = log.dose
+    share = dose.at(-1) / dose.threshold_j_per_mm2
+    middle, plane = path_plane(log.path_mm)
+    flat = (dose.points_mm - middle) @ plane
+    cell = max(MAP_CELL_MM, float(np.sqrt(2.0 * dose.areas_mm2.mean())))
+    x, y = flat.T
+    edges = tuple(np.arange(each.min(), each.max() + cell, cell) for each in (x, y))
+    area, total, inside, spared = (
+        np.histogram2d(x, y, edges, weights=dose.areas_mm2 * factor)[0]
+        for factor in (1.0, share, dose.zone == LESION, dose.zone == HEALTHY)
+    )
+    mean, inside, spared = (
+        np.divide(each, area, out=np.full_like(each, np.nan), where=area > 0.0)
+        for each in (total, inside, spared)
+    )
+    least = dose.cut_j_per_mm2 / dose.threshold_j_per_mm2
+    with drawing():
+        figure, axis = plt.subplots(figsize=(2.0 * CHART[0], 4.2))
+        norm = LogNorm(LEAST_DOSE, max(10.0, 2.0 * least, float(np.nanmax(mean))))
+        shown = axis.pcolormesh(
+            *edges,
+            np.where(mean >= LEAST_DOSE, mean, np.nan).T,
+            norm=norm,
+            cmap="YlOrBr",
+            rasterized=True,
+            shading="flat",
+        )
+        axis.grid(visible=False)
+        middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
+        for share_of, colour, style in ((inside, INK, "-"), (spared, MUTED, "--")):
+            known = np.nan_to_num(share_of)
+            if known.min() < 0.5 < known.max():
+                axis.contour(
+                    *middles, known.T, [0.5], colors=colour, linewidths=0.9, linestyles=style
+                )
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel("mm")
+        axis.set_ylabel("mm")
+        axis.set_title("dose on the organ")
+        figure.colorbar(shown, ax=axis, label="dose / threshold of ablation", pad=0.01)
+        return chart(
+            figure,
+            "dose on the organ",
+            f"Solid: the lesion. Dashed: healthy tissue begins. Treated from {least:.3g} on",
         )
 
 

@@ -28,7 +28,7 @@ from surgisoft.config import POSITIVE, Where, at_least, from_table, to_table, wr
 from surgisoft.errors import InputError
 from surgisoft.files import new_folder, read_json, write_atomically
 from surgisoft.scene.folder import open_scene
-from surgisoft.scene.spec import FILE
+from surgisoft.scene.spec import FILE, arm_names
 from surgisoft.surrogate.checkpoint import save_model
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.registry import config_from, make_task, with_fields
@@ -156,7 +156,10 @@ def _copied_scene(plan: Plan, fresh: Path) -> dict | None:
         target = fresh / "scene" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(scene.folder / name, target)
-    mounts = tuple(replace(mount, arm=f"../arms/{mount.tool}") for mount in scene.spec.mounts)
+    mounts = tuple(
+        replace(mount, arm=f"../arms/{name}")
+        for name, mount in zip(arm_names(scene.spec.mounts), scene.spec.mounts, strict=True)
+    )
     write_toml(fresh / "scene" / FILE, to_table(replace(scene.spec, mounts=mounts)))
     return {"from": str(source), "hash": scene.content_hash}
 

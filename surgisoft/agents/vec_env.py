@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from surgisoft.errors import InputError
+from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task
 
 STATE = "state"
@@ -29,6 +30,7 @@ class JointEnv:
 
     def __init__(self, task: Task, count: int, seed: int, action_kPa: float, first: int = 0):
         """Episodes `first` to `first + count - 1` of a seed, each at another point of its time."""
+        keep_freed_memory()
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
         self.episodes = Episodes(task, donate=True)
         with torch.inference_mode():

@@ -6,8 +6,14 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.amended import (
+    NOT_CLAIMED,
+    claim_other_folder,
+    save_amended,
+    show_parameters,
+    write_before_and_after,
+)
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -20,6 +26,7 @@ from surgisoft.cli.options import (
     NewModel,
     Paired,
     Refit,
+    Replay,
     Report,
     with_effect_files,
 )
@@ -47,6 +54,7 @@ def amend(
     paired: Paired = "auto",
     json_file: JsonFile = None,
     report: Report = None,
+    replay: Replay = None,
     effect_files: EffectFiles = None,
     force: Force = False,
     anyway: Annotated[
@@ -73,6 +81,7 @@ def amend(
     """
     check_free(json_file, "error_mm")
     check_folder(report)
+    check_replay(replay)
     check_model(model)
     measured = read_recordings(data)
     earlier = read_before(before, paired)
@@ -113,6 +122,11 @@ def amend(
         title = f"{model.name} with {' + '.join(result.effects)}"
         page = amend_page(result, title, result.model.summary())
         written.append(write_page(page, report / "report.html"))
+    if replay:
+        from surgisoft.diagnosis.compare import tables_of
+
+        tables = tables_of({"before": model, "after": result.model}, measured, model_error)
+        written.append(write_before_and_after(result, tables, model.name, replay))
     for name in result.refitted:
         print(f"{name}: the model had this effect already; its parameters were fitted again")
     show_parameters(result.parameters)

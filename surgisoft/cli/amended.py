@@ -29,6 +29,15 @@ def save_amended(result, output: Path, model: Path, recordings, force: bool) -> 
     save_model(result.model, output, record, force)
 
 
+def write_before_and_after(result, tables: dict, name: str, file: Path) -> Path:
+    """Write the replay of the old and the new model, by their residuals on the same recordings."""
+    from surgisoft.replay.model_error import write_models
+
+    names = ", ".join(tables["before"].names)
+    write_models(tables, f"{name} before and after on {names}", file, result.sentence)
+    return file
+
+
 def show_parameters(parameters) -> None:
     """Print the fitted parameters, one per line, and which of them are implausible."""
     from surgisoft.diagnosis.estimation.intervals import values_text

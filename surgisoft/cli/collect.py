@@ -10,7 +10,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import check_model, warn
-from surgisoft.cli.options import SEED_MAX, Force, Hidden
+from surgisoft.cli.options import SEED_MAX, Force, Hidden, NewRecording
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -49,10 +49,7 @@ def collect(
     protocol: Annotated[
         str, typer.Argument(metavar="PROTOCOL", help="A protocol's name, or SCHEDULE.csv.")
     ],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
-    ],
+    output: NewRecording,
     rig: RigOption = "virtual",
     seed: Annotated[
         int | None,

@@ -1,11 +1,16 @@
-"""`surgisoft compare`: compare a model with recordings."""
+"""`surgisoft compare`: compare models with recordings."""
 
 import math
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
 
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import (
     check_model,
+    leading_models,
     read_before,
     read_context,
     read_recordings,
@@ -20,7 +25,6 @@ from surgisoft.cli.options import (
     ModelError,
     Paired,
     Predictions,
-    Recordings,
     Replay,
     Report,
     model_options,
@@ -40,7 +44,14 @@ LEAST_SHOWN = 0.02
 @app.command()
 def compare(
     model: AnyModel,
-    recordings: Recordings,
+    recordings: Annotated[
+        list[Path],
+        Argument(
+            metavar="[MODEL...] REC...",
+            help="Further models to show on the same recordings (folders of models, default, or "
+            "callables), then the recordings (.csv, .parquet) or folders of them.",
+        ),
+    ],
     before: Before = None,
     paired: Paired = "auto",
     predictions: Predictions = None,
@@ -48,10 +59,23 @@ def compare(
     json_file: JsonFile = None,
     report: Report = None,
     replay: Replay = None,
+    scale: Annotated[
+        float | None,
+        Option(
+            "--error-scale",
+            metavar="MM",
+            min=1e-6,
+            help="Error at which the replay's colours end, mm; default: from the errors of the "
+            "worst model. Give the same for replays that are to be compared.",
+        ),
+    ] = None,
     credibility: Credibility = None,
     effect_files: EffectFiles = None,
 ) -> None:
-    """Compare an arm model with measurements: the error, and what it depends on."""
+    """Compare arm models with measurements: the error, and what it depends on.
+
+    Several models before the recordings are shown together, with one scale of their errors.
+    """
     check_free(json_file, "rmse_mm")
     check_folder(report)
     check_replay(replay)
@@ -59,54 +83,65 @@ def compare(
         raise InputError("--credibility: writes into the folder of the report; add --report DIR")
     context = read_context(credibility)
 
+    if scale is not None and not replay:
+        raise InputError("--error-scale is that of a replay; add --replay FILE.rrd")
     check_model(model, predictions)
+    others, recordings = leading_models(recordings)
+    if others and predictions:
+        raise InputError("--predictions: one model only; its predictions take the place of one")
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
 
-    from surgisoft.diagnosis.compare import compare as compare_model
+    from surgisoft.diagnosis.compare import compare_all
 
-    result, rest = compare_model(
-        model,
+    models = [model, *others]
+    compared = compare_all(
+        models,
         measured,
+        [each.name for each in models],
         before=earlier,
         paired=paired,
         predictions=predictions,
         error_mm=model_error,
     )
+    result, rest = compared[0].result, compared[0].table
     arm = rest.model
-    warn_all(result.notes)
-    title = f"{model.name} on {', '.join(recording.name for recording in measured)}"
+    for one in compared:
+        warn_all(one.result.notes)
+    names = " and ".join(one.name for one in compared)
+    title = f"{names} on {', '.join(recording.name for recording in measured)}"
     written = []
     if json_file:
-        write_json(json_file, result.to_json())
+        write_json(json_file, _values(compared))
         written.append(json_file)
     if report:
-        from surgisoft.diagnosis.pages.compare import compare_page
-        from surgisoft.diagnosis.pages.pictures import draw_all
-        from surgisoft.report import write_page
+        from surgisoft.diagnosis.pages.compare import write_report
 
-        backbone = arm.backbone() if arm.spec.key_points > 1 else None
-        drawn = draw_all(rest, backbone, arm.spec.unit, report, title)
-        page = compare_page(result, rest, title, arm.summary(), drawn)
-        written += [write_page(page, report / "report.html"), *drawn]
+        written += write_report(compared, report, title)
     if context and report:
         from surgisoft.credibility.assessment import assess
-        from surgisoft.credibility.page import write_report
+        from surgisoft.credibility.page import write_report as write_credibility
 
         with progress("credibility") as tell:
             assessed = assess(context, result, rest, measured, progress=text_only(tell))
-        written += write_report(assessed, report)
+        written += write_credibility(assessed, report)
     if replay:
-        from surgisoft.replay.comparison import write_comparison
+        from surgisoft.replay.model_error import write_compared
 
-        points = (rest.measured_mm, rest.predicted_mm)
-        write_comparison(rest.t_s, *points, title, replay, rest.pressure, arm.spec.unit)
+        write_compared(compared, title, replay, scale)
         written.append(replay)
     print(result.sentence)
     if result.setup:
         print(f"set-up: {result.setup}; `surgisoft diagnose` shows what mends it")
     print(arm.summary())
     _show(result)
+    for one in compared[1:]:
+        print(f"\n{one.sentence}")
+        print(one.summary)
+        _show(one.result)
+    if others:
+        print()
+        _table(compared)
     if context:
         print(f"credibility: {assessed.sentence}")
     for path in written:
@@ -117,6 +152,28 @@ def compare(
         since += model_options(predictions, model_error)
         following = with_effect_files(f"surgisoft diagnose {model} {names}{since}")
         print(f"next, which effect is missing: {following}")
+
+
+def _values(compared) -> dict:
+    """Numbers of the first model; of several, those of all by their names in `models` too."""
+    values = compared[0].result.to_json()
+    if len(compared) > 1:
+        values["models"] = [{"model": one.name} | one.result.to_json() for one in compared]
+    return values
+
+
+def _table(compared) -> None:
+    """One line for each model, on the same recordings."""
+    width = max(len(one.name) for one in compared)
+    print(f"{'model':{width}s}  error [mm]  95 % interval      tip [mm]  explainable")
+    for one in compared:
+        low, high = one.result.rmse_ci95_mm
+        part = one.result.explainable
+        share = "-" if part is None else f"{100 * part:.0f} %"
+        print(
+            f"{one.name:{width}s}  {one.result.rmse_mm:10.4f}  {low:.4f} .. {high:.4f}  "
+            f"{one.result.tip_rmse_mm:8.4f}  {share:>11s}"
+        )
 
 
 def _show(result) -> None:
@@ -154,6 +211,7 @@ def _show(result) -> None:
         print(
             f"  worst: {moment.error_mm:.3f} mm at key point {moment.key_point}, "
             f"{moment.recording} t = {moment.t_s:.2f} s"
+            + ("" if moment.t_s == moment.along_s else f" ({moment.along_s:.2f} s in the report)")
         )
 
 

@@ -15,6 +15,9 @@ from surgisoft.cli.options import (
     EffectFiles,
     Hidden,
     JsonFile,
+    ObserverGain,
+    OfRunTask,
+    Preflight,
     Replay,
     Report,
     RigsOfArms,
@@ -39,9 +42,7 @@ def evaluate(
             "of a training run. Several policies are evaluated on the same episodes.",
         ),
     ],
-    task: Annotated[
-        str | None, typer.Option(metavar="TASK", help="Task; default: that of the training run.")
-    ] = None,
+    task: OfRunTask = None,
     episodes: Annotated[
         int, typer.Option(min=1, max=100_000, help="Episodes of each policy.")
     ] = 20,
@@ -66,6 +67,7 @@ def evaluate(
         typer.Option(min=0, max=SEED_MAX, help="On the rig: seed of the robot; default 0."),
     ] = None,
     hidden: Hidden = None,
+    preflight: Preflight = False,
     cameras: Annotated[
         bool,
         typer.Option(
@@ -73,15 +75,7 @@ def evaluate(
             "model predicts."
         ),
     ] = True,
-    observer_gain: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="On the rig: observer gain from 0 to 1, the share of the difference between "
-            "cameras and model that the estimate adopts per step. Default 0.3.",
-        ),
-    ] = None,
+    observer_gain: ObserverGain = None,
     arm: Arm = None,
     scene: SceneFolder = None,
     config: TaskConfig = None,
@@ -105,7 +99,7 @@ def evaluate(
     check_replay(replay)
     check_folder(report)
     on = on or (PLACES[1] if rig else PLACES[0])
-    rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain)
+    rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain, preflight)
 
     from surgisoft.agents.session import evaluate as evaluate_policies
 
@@ -179,6 +173,7 @@ def _rig_config(
     hidden: list[str] | None,
     cameras: bool,
     observer_gain: float | None,
+    preflight: bool,
 ):
     """The configuration of the rigs; None in simulation."""
     if on not in PLACES:
@@ -190,6 +185,8 @@ def _rig_config(
             raise InputError(
                 "--robot-seed, --hidden, --no-cameras and --observer-gain need --on rig"
             )
+        if preflight:
+            raise InputError("--preflight is for real rigs; name one with --rig")
         return None
     from surgisoft.agents.on_rig import RigConfig, rigs_in
     from surgisoft.rig.registry import hidden_effects
@@ -199,6 +196,7 @@ def _rig_config(
         hidden=tuple(hidden_effects(hidden)),
         cameras=cameras,
         rigs=rigs_in(rigs) if rigs else RigConfig().rigs,
+        preflight=preflight,
     )
     return found if observer_gain is None else replace(found, observer_gain=observer_gain)
 

@@ -8,7 +8,14 @@ import typer
 from surgisoft.cli import app
 from surgisoft.cli.files import check_folder
 from surgisoft.cli.inputs import counted, read_context
-from surgisoft.cli.options import Credibility, EffectFiles, ExperimentFile, RigsOfArms
+from surgisoft.cli.options import (
+    Cluster,
+    Credibility,
+    EffectFiles,
+    ExperimentFile,
+    Preflight,
+    RigsOfArms,
+)
 from surgisoft.cli.progress import progress
 
 commands = typer.Typer(
@@ -29,6 +36,7 @@ def run(
     processes: Annotated[
         int, typer.Option(min=1, max=1024, help="Processes; the results do not depend on them.")
     ] = 1,
+    cluster: Cluster = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run of the experiment.")
     ] = False,
@@ -44,6 +52,7 @@ def run(
         int | None, typer.Option(min=1, max=100_000, help="Episodes of each setting.")
     ] = None,
     rig: RigsOfArms = None,
+    preflight: Preflight = False,
     replays: Annotated[
         bool, typer.Option(help="Write .rrd files of the first and the worst episode.")
     ] = True,
@@ -63,11 +72,18 @@ def run(
 
         check_context(context, open_experiment(file))
     spec, folder = start_experiment(
-        file, output, policy or (), repeats, rigs_in(rig or ""), resume=resume, force=force
+        file,
+        output,
+        policy or (),
+        repeats,
+        rigs_in(rig or ""),
+        preflight=preflight,
+        resume=resume,
+        force=force,
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"
-        results, files = finish_experiment(spec, folder, processes, replays, about, report)
+        results, files = finish_experiment(spec, folder, processes, replays, about, report, cluster)
     if context is not None:
         from surgisoft.credibility.of_experiment import assess_experiment
         from surgisoft.credibility.page import write_report

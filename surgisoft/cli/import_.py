@@ -131,7 +131,12 @@ def recording_(
         ),
     ] = None,
     task: Annotated[
-        str, typer.Option(metavar="TEXT", help="With --lerobot: what the robot does, in words.")
+        str,
+        typer.Option(
+            "--lerobot-task",
+            metavar="TEXT",
+            help="With --lerobot: what the robot does, in words.",
+        ),
     ] = "Drive the soft arm.",
     fps: Annotated[
         int | None,

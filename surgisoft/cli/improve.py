@@ -1,13 +1,18 @@
 """`surgisoft improve`: repeat diagnose and amend until no further effect is significant."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.amended import NOT_CLAIMED, claim_other_folder, save_amended, show_parameters
-from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.amended import (
+    NOT_CLAIMED,
+    claim_other_folder,
+    save_amended,
+    show_parameters,
+    write_before_and_after,
+)
+from surgisoft.cli.files import check_folder, check_free, check_replay
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -19,6 +24,7 @@ from surgisoft.cli.options import (
     NewModel,
     Recordings,
     Refit,
+    Replay,
     Report,
 )
 from surgisoft.cli.progress import progress
@@ -35,6 +41,7 @@ def improve(
     ] = 6,
     json_file: JsonFile = None,
     report: Report = None,
+    replay: Replay = None,
     refit: Refit = "auto",
     model_error: ModelError = None,
     effect_files: EffectFiles = None,
@@ -47,6 +54,7 @@ def improve(
     """
     check_free(json_file, "rounds")
     check_folder(report)
+    check_replay(replay)
     check_model(model)
     measured = read_recordings(recordings)
     claim_other_folder(output, model, force)
@@ -77,8 +85,18 @@ def improve(
     if json_file:
         write_json(json_file, result.to_json())
         written.append(json_file)
+    if report or replay:
+        from surgisoft.diagnosis.compare import tables_of
+
+        tables = tables_of({"before": model, "after": result.model}, measured, model_error)
     if report:
-        written += _write_report(result, report, model.name)
+        from surgisoft.diagnosis.pages.amendment import write_improve_report
+
+        names = ", ".join(recording.name for recording in measured)
+        title = f"What {model.name} lacks on {names}"
+        written += write_improve_report(result, tables, report, title)
+    if replay:
+        written.append(write_before_and_after(result, tables, model.name, replay))
     _show(result)
     for path in written:
         print(f"wrote {path}")
@@ -105,17 +123,3 @@ def _show(result) -> None:
         for name, error in result.steps:
             print(f"{'+ ' + name:{width}s} {error:8.4f} mm")
         print(f"{'floor':{width}s} {fall.floor:8.4f} mm")
-
-
-def _write_report(result, folder: Path, name: str) -> list[Path]:
-    """Write the page and the waterfall chart."""
-    from surgisoft.diagnosis.pages.amendment import improve_page, write_waterfall
-    from surgisoft.report import write_page
-
-    added = " + ".join(step for step, _ in result.steps) or "no more effects"
-    page = improve_page(result, f"{name} with {added}", result.model.summary())
-    written = [write_page(page, folder / "report.html")]
-    if result.steps:
-        fall, path = result.held_out, folder / "waterfall.png"
-        written.append(write_waterfall(fall.before, result.steps, fall.floor, path))
-    return written

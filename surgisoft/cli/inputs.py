@@ -44,6 +44,33 @@ def check_model(folder: Path, predictions: list[Path] | None = None) -> None:
     )
 
 
+def leading_models(given: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Models and recordings of a list of both, models first.
+
+    A model is a folder with a config.json, `default`, or the name of a callable. Raises InputError
+    for a model behind a recording, and where no recording is left.
+    """
+    count = 0
+    while count < len(given) and _is_model(given[count]):
+        count += 1
+    models, recordings = given[:count], given[count:]
+    for path in recordings:
+        if _is_model(path):
+            raise InputError(f"{path}: a model behind a recording; give all models first")
+    if not recordings:
+        raise InputError(
+            f"{' '.join(map(str, given))}: models only; expected recordings (.csv, .parquet) or "
+            "folders of them behind"
+        )
+    return models, recordings
+
+
+def _is_model(path: Path) -> bool:
+    if ":" in str(path) or str(path) == "default":
+        return not path.exists()
+    return (path / "config.json").is_file()
+
+
 def read_recordings(paths: Iterable[Path]) -> list:
     """The recordings in files and folders; prints data-quality warnings."""
     from surgisoft.measurement.recordings import load_recordings

@@ -172,6 +172,24 @@ RigsOfArms = Annotated[
     ),
 ]
 
+Cluster = Annotated[
+    str | None,
+    Option(
+        metavar="ADDRESS",
+        help="Dask scheduler (tcp://host:8786) whose workers run the work in place of processes on "
+        "this machine. Default: the environment variable SURGISOFT_CLUSTER.",
+    ),
+]
+
+Preflight = Annotated[
+    bool,
+    Option(
+        "--preflight",
+        help="On a real rig: try each chamber alone first, and stop where the arm does not move as "
+        "its model predicts.",
+    ),
+]
+
 Hidden = Annotated[
     list[str] | None,
     Option(
@@ -196,6 +214,20 @@ SceneFolder = Annotated[
 TaskConfig = Annotated[
     Path | None,
     Option("--config", metavar="FILE.toml", help="File with fields of the task's configuration."),
+]
+OfRunTask = Annotated[
+    str | None,
+    Option("--task", metavar="TASK", help="Task; default: that of the training run."),
+]
+ObserverGain = Annotated[
+    float | None,
+    Option(
+        "--observer-gain",
+        min=0.0,
+        max=1.0,
+        help="On a rig: share of the difference between cameras and model that the policy's "
+        "estimate adopts per step, 0 to 1. Default 0.3.",
+    ),
 ]
 Threads = Annotated[
     int,

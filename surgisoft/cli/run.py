@@ -14,6 +14,9 @@ from surgisoft.cli.options import (
     EffectFiles,
     Force,
     JsonFile,
+    NewRecording,
+    ObserverGain,
+    OfRunTask,
     Replay,
     Rig,
     TaskConfig,
@@ -34,10 +37,7 @@ def run(
             "SCHEDULE.csv or a continuous protocol ('surgisoft collect --list-protocols').",
         ),
     ],
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="REC", help="New recording, .parquet or .csv."),
-    ],
+    output: NewRecording,
     rig: Rig = "virtual",
     model: Annotated[
         Path | None,
@@ -48,9 +48,7 @@ def run(
             "the training run, else the arm of the package.",
         ),
     ] = None,
-    task: Annotated[
-        str | None, typer.Option(metavar="TASK", help="Task; default: that of the training run.")
-    ] = None,
+    task: OfRunTask = None,
     minutes: Annotated[
         float | None,
         typer.Option(
@@ -96,15 +94,7 @@ def run(
             help="Whether the policy observes measured key points or those that the model predicts."
         ),
     ] = True,
-    observer_gain: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            max=1.0,
-            help="Share of the difference between cameras and model that the policy's estimate "
-            "adopts per step. Default 0.3.",
-        ),
-    ] = None,
+    observer_gain: ObserverGain = None,
     any_model: Annotated[
         bool,
         typer.Option("--any-model", help="Go on although the model seems to be of another arm."),

@@ -88,18 +88,26 @@ def new(
         float,
         typer.Option(metavar="MM", help="Least distance between an arm and anything else, mm."),
     ] = 1.0,
+    arms: Annotated[
+        str,
+        typer.Option(
+            metavar="TOOL,...",
+            help="Tool of each arm: laser, endoscope, or tip for a plain tip that touches. Arms "
+            "with the same tool are numbered: laser_1, laser_2.",
+        ),
+    ] = "laser,endoscope",
     arm: Annotated[
         str | None,
         typer.Option(
             metavar="MODEL",
-            help="Arm model of both mounts ('default' or a fitted model's folder), or of single "
-            "ones: laser=MODEL,endoscope=MODEL.",
+            help="Arm model of all mounts ('default' or a fitted model's folder), or of single "
+            "ones by arm or tool: laser=MODEL,endoscope=MODEL.",
         ),
     ] = None,
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> int:
-    """Make a scene: repair the meshes, place the lesion, find mounts for both arms."""
+    """Make a scene: repair the meshes, place the lesion, find mounts for the arms."""
     _check_meshes(meshes)
 
     from surgisoft.scene.author import NoMounts, author, check_target, write_scene
@@ -122,8 +130,9 @@ def new(
 
     from surgisoft.tasks.world.reach import blank_mounts, reach_of
 
-    mounts = blank_mounts(_arms(arm))
-    reaches = {tool: reach_of(mount) for tool, mount in mounts.items()}
+    tools = [tool.strip() for tool in arms.split(",")]
+    mounts = blank_mounts(tools, _models(arm, tools))
+    reaches = {name: reach_of(mount) for name, mount in mounts.items()}
     try:
         try:
             with progress("scene new") as report:
@@ -157,7 +166,7 @@ def check(
     effect_files: EffectFiles = None,
 ) -> int:
     """Check a scene with FCL: meshes, lesion, reach of the ring, contacts, view."""
-    from surgisoft.scene.check import check_scene, reach_patch
+    from surgisoft.scene.check import check_scene, reach_patches
     from surgisoft.scene.folder import open_scene
     from surgisoft.tasks.world.reach import reaches_of
 
@@ -169,7 +178,7 @@ def check(
     if picture is not None and drawn:
         from surgisoft.replay.reach_map import draw_reach_map
 
-        draw_reach_map(scene, verdict, reach_patch(scene, reaches), picture)
+        draw_reach_map(scene, verdict, reach_patches(scene, reaches), picture)
     _print_check(verdict)
     if drawn:
         print(f"wrote {picture}")
@@ -227,21 +236,16 @@ def _check_meshes(meshes: list[str]) -> None:
             raise InputError(f"{path or text}: there is no such file; expected a mesh")
 
 
-def _arms(given: str | None) -> dict[str, str]:
-    """The arm model of each tool; raises InputError for an unknown tool or one given twice."""
-    from surgisoft.errors import unknown_name
-    from surgisoft.scene.spec import TOOLS
-
+def _models(given: str | None, tools: list[str]) -> dict[str, str]:
+    """The arm model of each arm or tool that is given; raises InputError for one given twice."""
     if given is None or "=" not in given:
-        return {} if given is None else dict.fromkeys(TOOLS, given)
+        return {} if given is None else dict.fromkeys(tools, given)
     models: dict[str, str] = {}
     for text in given.split(","):
-        tool, _, model = text.partition("=")
-        if tool not in TOOLS:
-            raise unknown_name("tool", tool, TOOLS)
-        if tool in models:
-            raise InputError(f"--arm {given}: two arms for the {tool}; expected one")
-        models[tool] = model
+        name, _, model = text.partition("=")
+        if name in models:
+            raise InputError(f"--arm {given}: two arms for the {name}; expected one")
+        models[name] = model
     return models
 
 

@@ -12,21 +12,21 @@ from pathlib import Path
 from surgisoft.agents.report import episode_parts
 from surgisoft.agents.session import Evaluations, evaluate
 from surgisoft.diagnosis.amend import Amendment, amend
-from surgisoft.diagnosis.compare import Comparison, compare
+from surgisoft.diagnosis.compare import Compared, Comparison, compare
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
 from surgisoft.diagnosis.pages.amendment import amend_page, track_chart
-from surgisoft.diagnosis.pages.compare import compare_page
+from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
-from surgisoft.diagnosis.pages.pictures import draw_all
+from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.progress import Progress, silent
-from surgisoft.replay.comparison import write_comparison
 from surgisoft.replay.episode_view import write_replay
+from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
 from surgisoft.report import Command, Gallery, Page, Picture, Section, Text, write_page
 from surgisoft.rig.trial import collect
-from surgisoft.surrogate.checkpoint import load_model, save_model
+from surgisoft.surrogate.checkpoint import save_model
 
 FOLDER = "surgisoft_demo"
 """Default folder of the demonstration."""
@@ -93,19 +93,9 @@ def demo(
 
     progress(60, 100, "step 3 of 5: the model is compared with it")
     comparison, table = compare("default", folder / "bench.parquet")
-    arm = load_model("default")
-    drawn = draw_all(table, arm.backbone(), arm.spec.unit, folder / "compare", "default")
-    report = compare_page(comparison, table, "default", arm.summary(), drawn)
-    write_page(report, folder / "compare" / "report.html")
-    write_comparison(
-        table.t_s,
-        table.measured_mm,
-        table.predicted_mm,
-        "default",
-        folder / "compare.rrd",
-        table.pressure,
-        arm.spec.unit,
-    )
+    compared = [Compared("default", comparison, table)]
+    _, *drawn = write_report(compared, folder / "compare", "default on bench")
+    write_compared(compared, "default on bench", folder / "compare.rrd")
 
     progress(70, 100, "step 4 of 5: which effect is missing?")
     found = diagnose("default", folder / "bench.parquet")
@@ -118,6 +108,9 @@ def demo(
         save_model(amendment.model, folder / "amended")
         page = amend_page(amendment, "default, amended", amendment.model.summary())
         write_page(page, folder / "amendment.html")
+        tables = {"before": table, "after": residual_table(amendment.model, [recording])}
+        title = "Before and after the amendment"
+        write_models(tables, title, folder / "amended.rrd", amendment.sentence)
 
     result = Demonstration(cut, comparison, found, amendment, folder / "index.html", no_picture)
     write_page(_page(result, log, picture, drawn), result.page)
@@ -169,7 +162,7 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
             Text(
                 "The folder amended holds the new model; it is used like any other, for example "
                 "by surgisoft train --task track_circle --arm amended. "
-                "Details: amendment.html"
+                "Details: amendment.html; before and after in 3-D: surgisoft replay amended.rrd"
             ),
         ]
     return Page(

@@ -112,7 +112,7 @@ class Track:
     """The error along the recordings, for pictures."""
 
     time_s: np.ndarray
-    """(S,) time in the recording, s."""
+    """(S,) time on the axis that charts and replays share, s."""
     before_mm: np.ndarray
     """(S,) RMS distance over the key points by the old model, mm; NaN where not measured."""
     after_mm: np.ndarray
@@ -364,4 +364,5 @@ def track_of(before: Problem, after: Problem) -> Track:
         for problem in (before, after)
     ]
     run = before.history.run_of_row[before.index].numpy()
-    return Track(before.time_s, *levels, np.diff(run, prepend=-1) != 0)
+    time_s = before.table.along_s[before.index.numpy()]
+    return Track(time_s, *levels, np.diff(run, prepend=-1) != 0)

@@ -36,6 +36,11 @@ class Candidate:
     fitted: bool = False
     """Whether its nonlinear parameters were fitted and not taken from a grid."""
 
+    @property
+    def amplitudes(self) -> int:
+        """Number of amplitudes that its fit chooses."""
+        return self.sensitivities.shape[3]
+
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:
         """The effect at amplitudes (K,); None for more of one that the model has."""

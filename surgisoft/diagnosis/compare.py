@@ -1,6 +1,6 @@
 """`compare`: a model's error on recordings, what it depends on, and the best achievable error."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -38,6 +38,7 @@ from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.interval import coverage_of
+from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.training_residuals import TrainingResiduals
 from surgisoft.workers import torch_threads
 
@@ -57,6 +58,8 @@ class Moment:
     """Name of the recording."""
     t_s: float
     """Time in the recording, s."""
+    along_s: float
+    """Time on the axis of the charts and of the replay, s: all recordings in turn."""
     error_mm: float
     """Largest distance of a key point, mm."""
     key_point: int
@@ -257,6 +260,86 @@ def compare(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One of the models that were compared with the same recordings."""
+
+    name: str
+    """Name of the model."""
+    result: Comparison
+    """Its error."""
+    table: ResidualTable
+    """Its residuals on every row."""
+
+    @property
+    def summary(self) -> str:
+        """What model it is, in one line."""
+        return self.table.model.summary()
+
+    @property
+    def sentence(self) -> str:
+        """Name and result in words."""
+        return f"{self.name}: {self.result.sentence}"
+
+
+def compare_all(
+    models: Sequence[Model],
+    recordings: Recordings,
+    names: Sequence[str] | None = None,
+    **options,
+) -> list[Compared]:
+    """Compare several models with the same recordings; `options` are those of `compare`.
+
+    names: names of the models, which default to those of their folders.
+    """
+    if names is None:
+        names = [
+            Path(m).name if isinstance(m, str | Path) else f"model {i}"
+            for i, m in enumerate(models, 1)
+        ]
+    measured = load_recordings(recordings)
+    results = [compare(model, measured, **options) for model in models]
+    sizes = {table.measured_mm.shape for _, table in results}
+    if len(sizes) > 1:
+        listed = ", ".join(
+            f"{name} {table.measured_mm.shape[1]}"
+            for name, (_, table) in zip(names, results, strict=True)
+        )
+        raise InputError(
+            f"the models predict different numbers of key points ({listed}); "
+            "compare them one at a time"
+        )
+    return [
+        Compared(name, result, table)
+        for name, (result, table) in zip(distinct(names), results, strict=True)
+    ]
+
+
+def tables_of(
+    models: Mapping[str, Model], recordings: Recordings, error_mm: float | None = None
+) -> dict[str, ResidualTable]:
+    """The residuals of several models on every row of the same recordings, by the models' names.
+
+    error_mm: validated error of those that are callables, mm.
+    """
+    found = {}
+    for name, model in models.items():
+        own = None if isinstance(model, ArmModel) else error_mm
+        opened, given, _ = open_model(model, recordings, None, None, own)
+        opened, given, _ = open_inputs(opened, given, sized=False)
+        found[name] = residual_table(opened, given)
+    return found
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number behind those that occur before."""
+    found: list[str] = []
+    for name in names:
+        count = sum(1 for each in found if each == name or each.startswith(f"{name} ("))
+        found.append(f"{name} ({count + 1})" if count else name)
+    return found
+
+
 def achievable(problem: Problem) -> BestAchievable | None:
     """The best achievable error of a problem; None where it has too few blocks of time.
 
@@ -338,6 +421,7 @@ def _worst(table: ResidualTable):
         yield Moment(
             table.names[table.recording[row]],
             float(table.t_s[row]),
+            float(table.along_s[row]),
             float(peak[row]),
             int(error[row].argmax()),
         )

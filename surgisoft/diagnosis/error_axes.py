@@ -255,6 +255,28 @@ LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True)
+class Profile:
+    """What one column of an axis explains, laid out over its values in bands of equal count."""
+
+    column: str
+    """The column: the axis, with the number of the chamber where it has one."""
+    rows: tuple[int, ...]
+    """(B,) number of rows of each band."""
+    middle: tuple[float, ...]
+    """(B,) mean value of the rows of each band, in the axis's unit."""
+    without_mm: tuple[float, ...]
+    """(B,) RMS distance of a key point before the axis explains anything, mm: the error itself, or
+    for an axis of memory or context what the actuation leaves of it."""
+    left_mm: tuple[float, ...]
+    """(B,) RMS distance that is left when the axis is taken into account too, mm. The share of the
+    axis is the fall of the square from `without_mm` to this."""
+    shift_mm: tuple[float, ...]
+    """(B,) mean residual of the tip along the direction in which it follows the column, mm."""
+    shift_ci95_mm: tuple[tuple[float, float], ...]
+    """(B,) 95 % interval of it from a bootstrap of blocks; NaN where too few blocks are in it."""
+
+
+@dataclass(frozen=True)
 class AxisShare:
     """How much of the squared error an axis explains on blocks that took no part."""
 
@@ -270,6 +292,8 @@ class AxisShare:
     """95 % interval of it from a bootstrap of blocks."""
     static: bool
     """Whether it was evaluated alone, not beyond the actuation."""
+    profiles: tuple[Profile, ...] = ()
+    """The same over the values of each column."""
 
     @property
     def clear(self) -> bool:
@@ -288,27 +312,95 @@ def shares(problem: Problem) -> list[AxisShare]:
     fold = problem.fold[block]
 
     def left(design: np.ndarray) -> np.ndarray:
-        """(K,) squared error of each block with a design, held out; mm^2."""
-        predicted = cross_validated_ridge(design, target, fold).predicted
-        return block_sums(np.nansum(np.square(target - predicted), axis=1), block)
+        """(R, 3n) residual that a design leaves, held out; mm."""
+        return target - cross_validated_ridge(design, target, fold).predicted
+
+    def squared(residual: np.ndarray) -> np.ndarray:
+        """(K,) squared error of each block; mm^2."""
+        return block_sums(np.nansum(np.square(residual), axis=1), block)
 
     static = AXES["pressure"].design(table)[rows]
-    before = block_sums(np.nansum(np.square(target), axis=1), block)
-    base = left(static)
+    before = squared(target)
+    beyond = left(static)
+    base = squared(beyond)
+    if base.sum() > before.sum():
+        beyond = target
     answer = []
     for name, axis in found.items():
         own = axis.design(table)[rows]
         if axis.static:
-            won = before - (base if name == "pressure" else left(own))
+            without, rest = target, beyond if name == "pressure" else left(own)
+            won = before - (base if name == "pressure" else squared(rest))
         else:
-            won = np.minimum(base, before) - left(np.concatenate([static, own], axis=1))
+            without, rest = beyond, left(np.concatenate([static, own], axis=1))
+            won = np.minimum(base, before) - squared(rest)
         total = max(float(before.sum()), 1e-30)
         low, high = block_interval(lambda part, whole: part / whole, (won, before))
         share = max(0.0, float(won.sum()) / total)
         unit = axis.unit.format(unit=table.spec.unit)
         ci95 = (float(low), float(high))
-        answer.append(AxisShare(name, axis.about, unit, share, ci95, axis.static))
+        values = axis.columns(table)[rows]
+        laid_out = tuple(
+            _profile(_column_title(name, values, column), values[:, column], without, rest, block)
+            for column in range(values.shape[1])
+            if _varies(values[:, column])
+        )
+        answer.append(AxisShare(name, axis.about, unit, share, ci95, axis.static, laid_out))
     return sorted(answer, key=lambda each: -each.share)
+
+
+def _varies(values: np.ndarray) -> bool:
+    """Whether there are two different known values (R,)."""
+    seen = values[~np.isnan(values)]
+    return bool(len(seen)) and bool(np.ptp(seen) > 1e-9)
+
+
+def _profile(
+    title: str, values: np.ndarray, without: np.ndarray, left: np.ndarray, block: np.ndarray
+) -> Profile:
+    """The profile of a column (R,) with the residuals (R, 3n) without and with its axis, mm."""
+    band, _ = _cut(values)
+    if len(np.unique(values[~np.isnan(values)])) <= BANDS:
+        band = np.unique(values, return_inverse=True)[1].reshape(-1)
+    tip = without[:, -3:]
+    known = ~np.isnan(values) & ~np.isnan(tip).any(axis=1)
+    centred = np.where(known, values - values[known].mean() if known.any() else 0.0, 0.0)
+    slope = centred @ np.nan_to_num(tip)
+    along = np.nan_to_num(tip) @ (slope / max(float(np.linalg.norm(slope)), 1e-30))
+    numbers = np.unique(band[~np.isnan(values)])
+    inside = (band[:, None] == numbers) & ~np.isnan(values)[:, None]
+    held = inside & known[:, None]
+    sums = block_sums(np.where(held, along[:, None], 0.0), block), block_sums(held, block)
+    low, high = block_interval(_mean, sums)
+    middle = [float(values[rows].mean()) for rows in inside.T]
+    return Profile(
+        column=title,
+        rows=tuple(int(part.sum()) for part in inside.T),
+        middle=tuple(middle),
+        without_mm=tuple(_rms(without[rows]) for rows in inside.T),
+        left_mm=tuple(_rms(left[rows]) for rows in inside.T),
+        shift_mm=tuple(map(float, _mean(*(total.sum(axis=0) for total in sums)))),
+        shift_ci95_mm=tuple(zip(map(float, low), map(float, high), strict=True)),
+    )
+
+
+def _mean(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return total / count
+
+
+def _rms(residual: np.ndarray) -> float:
+    """RMS distance of a key point, mm, of residuals (R, 3n) mm; NaN where none is known."""
+    square = np.square(residual.reshape(len(residual), -1, 3)).sum(-1)
+    seen = square[~np.isnan(square)]
+    return float(np.sqrt(seen.mean())) if len(seen) else float("nan")
+
+
+def _column_title(axis: str, values: np.ndarray, column: int) -> str:
+    """Title of a column (S, c): `p1`, `rate 2`, or the axis where it has one column."""
+    if values.shape[1] == 1 and axis not in NAMES:
+        return axis
+    return NAMES.get(axis, f"{axis} ") + str(column + 1)
 
 
 # Bands ---------------------------------------------------------------------------------------
@@ -356,9 +448,7 @@ def bands(problem: Problem) -> list[Band]:
 
 
 def _column_bands(table, square, block, name, axis: Axis, values, column) -> Iterator[Band]:
-    title = NAMES.get(name, f"{name} ") + str(column + 1) if values.shape[1] > 1 else name
-    if values.shape[1] == 1 and name in NAMES:
-        title = f"{NAMES[name]}1"
+    title = _column_title(name, values, column)
     own = values[:, column]
     if name == "direction":
         which = np.where(own > 0, 0, np.where(own < 0, 1, -1))

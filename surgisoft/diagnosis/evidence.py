@@ -45,15 +45,23 @@ class EffectEvidence:
     """Share of the change that the best effect explains which this effect's sensitivities can
     imitate, 0 to 1; 1 for the best one itself."""
     amplitudes: int
-    """Number of its amplitudes."""
+    """Number of its sensitivities; a refined candidate has one."""
     exact_form: bool
-    """Whether real arms have exactly its formula (a rotated frame, a weight)."""
+    """Whether real arms have exactly its formula (a rotated frame)."""
     form_gain: float | None = None
     """Additional gain of its relaxed form; None where it was not tested."""
     form_log_gain: float | None = None
     """Log gain of its relaxed form."""
     form_z: float | None = None
     """Normal quantile of the p-value of its relaxed form."""
+    free_amplitudes: int | None = None
+    """Number of amplitudes that its fit chose, those of a refined candidate too; None in stored
+    evidence that does not have it."""
+
+    @property
+    def size(self) -> int:
+        """Number of amplitudes that its fit chose, as far as it is known."""
+        return self.amplitudes if self.free_amplitudes is None else self.free_amplitudes
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,8 @@ class Evidence:
     """All effects alone, the best first."""
     proposals: tuple[ProposalEvidence, ...]
     """The best effect and the best two, as far as they are worth a look."""
+    paired: bool = False
+    """Whether the paired difference of two sets of recordings is explained."""
 
     def to_json(self) -> dict:
         """Plain values."""
@@ -189,6 +199,7 @@ def evidence_of(found: Findings) -> Evidence:
         motions=int(problem.motion.max()) + 1,
         effects=tuple(_effect(found, best, score) for score in found.first),
         proposals=tuple(_proposal(found, place) for place in range(len(found.proposals))),
+        paired=problem.table.paired_discrepancy_mm is not None,
     )
 
 
@@ -214,6 +225,7 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
         unique=float(found.unique.get(score.effect, 0.0)),
         collinear=1.0 if score is best else collinearity(selection, best, score),
         amplitudes=len(score.option.chosen),
+        free_amplitudes=score.option.amplitudes,
         exact_form=hypothesis_of(known_effects()[score.effect]).exact_form,
         form_gain=form and form.share,
         form_log_gain=form and form.log_gain,

@@ -83,6 +83,8 @@ class Improvement:
     """Time that it took, s."""
     notes: tuple[str, ...] = ()
     """Recordings under another direction of gravity, or beyond the range of the model's fit."""
+    diagnoses: tuple[Diagnosis, ...] = ()
+    """The diagnosis of each model in turn: the first is that of the given one."""
 
     @property
     def steps(self) -> list[tuple[str, float]]:
@@ -148,6 +150,7 @@ def improve(
     table = residual_table(model, recordings)
     problem = table.training()
     models, rounds, parameters = [model], [], ()
+    diagnoses: list[Diagnosis] = []
     added: list[str] = []
 
     def note(done: Round) -> None:
@@ -165,6 +168,7 @@ def improve(
             processes=processes,
             setup_tests=not added,
         )
+        diagnoses.append(found)
         error = fall_of(problem, problem.with_model(models[-1])).after
         current = Round(found.verdict.kind, found.verdict.sentence, None, (), None, error)
         names = [name for name in next_effects(found) if name not in added]
@@ -229,6 +233,7 @@ def improve(
         tracks=(track_of(problem, problem.with_model(models[-1])), track_of(held_out, final)),
         seconds=time.perf_counter() - begin,
         notes=notes,
+        diagnoses=tuple(diagnoses),
     )
 
 

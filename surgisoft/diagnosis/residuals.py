@@ -30,6 +30,7 @@ from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.scan import linear_scan
 from surgisoft.surrogate.training_residuals import TrainingResiduals
+from surgisoft.time_axis import continued
 
 ROWS = 2000
 """Rows that amplitudes are fitted to; memories follow every row."""
@@ -189,6 +190,11 @@ class ResidualTable:
     def residual_mm(self) -> np.ndarray:
         """(N, n, 3) measured less predicted, base frame, mm; NaN where missing."""
         return self.measured_mm - self.predicted_mm
+
+    @cached_property
+    def along_s(self) -> np.ndarray:
+        """(N,) time on the axis that charts and replays share: all recordings in turn, s."""
+        return continued(self.t_s)
 
     @property
     def error_mm(self) -> np.ndarray:
@@ -592,7 +598,7 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     """
     rows = np.flatnonzero(block >= 0)
     rows = rows[:: max(1, -(-len(rows) // MOTION_ROWS))]
-    state, owner = _motion_states(history, half)[rows], block[rows]
+    state, owner = motion_states(history, half)[rows], block[rows]
     count = int(block.max()) + 1
     whole = np.maximum(np.bincount(owner, minlength=count), 1)
     moving = np.abs(state[:, history.chambers :]).max(1) > STILL
@@ -613,7 +619,7 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     return answer
 
 
-def _motion_states(history: History, half: np.ndarray) -> np.ndarray:
+def motion_states(history: History, half: np.ndarray) -> np.ndarray:
     """(N, 3 m) the actuation of every row and how far it runs ahead of its low passes."""
     signal = history.pressure.double() / torch.from_numpy(half)
     decay = torch.exp(-history.dt_s.double().unsqueeze(-1) / torch.tensor(MOTION_TIMES_S))

@@ -37,6 +37,9 @@ class Option:
     """Its sensitivities."""
     candidate: int | None
     """Number of the candidate; None: several of them."""
+    amplitudes: int
+    """Number of amplitudes that were fitted to the recordings; a refined candidate has one
+    sensitivity, whose amplitudes were all fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,7 @@ def _options_of(
     """One option for each candidate, numbered and indexed from the given numbers on."""
     for candidate in candidates:
         end = first + candidate.sensitivities.shape[3]
-        yield Option(candidate.name, tuple(range(first, end)), number)
+        yield Option(candidate.name, tuple(range(first, end)), number, candidate.amplitudes)
         number, first = number + 1, end
 
 
@@ -117,7 +120,8 @@ class ModelSelection:
             members = [candidates[option.candidate].effect for option in choices]
             for some in [] if own else hypothesis_of(members[0]).combinations(members):
                 if len(some) > 1:
-                    choices.append(Option(name, sum((choices[i].chosen for i in some), ()), None))
+                    chosen = sum((choices[i].chosen for i in some), ())
+                    choices.append(Option(name, chosen, None, len(chosen)))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(
             problem, candidates, validation, options, sensitivities, validation.counts * noise

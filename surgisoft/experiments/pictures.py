@@ -28,10 +28,10 @@ def film(log: EpisodeLog, count: int = PICTURES) -> Picture:
 
     if log.camera is None:
         raise InputError("the episode has no endoscope, so it has no pictures")
-    on = np.flatnonzero(log.beam.on) if log.beam is not None else np.array([], int)
+    on = np.array([], int) if log.burning is None else np.flatnonzero(log.burning)
     ends = (int(on[0]), int(on[-1])) if len(on) > 1 else (0, log.rows - 1)
     rows = np.unique(np.append(np.linspace(*ends, count - 1).astype(int), log.rows - 1))
-    frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, log.camera, rows)]
+    frames = [Image.open(io.BytesIO(data)) for data in jpegs(log, next(iter(log.cameras)), rows)]
     side = frames[0].width
     strip = Image.new("RGB", (len(frames) * (side + GAP_PX) - GAP_PX, side), "white")
     for place, frame in enumerate(frames):

@@ -159,7 +159,9 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
                 )
     specimen = int(varied.get("rig.specimen", setting.case.specimen))
     pairs = tuple((name, strength) for name, strength in hidden.items() if strength > 0.0)
-    return RigConfig(seed=specimen, hidden=pairs, rigs=setting.case.rigs)
+    return RigConfig(
+        seed=specimen, hidden=pairs, rigs=setting.case.rigs, preflight=setting.case.preflight
+    )
 
 
 def scene_of(spec: Experiment, setting: Setting) -> Scene:

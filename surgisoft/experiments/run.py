@@ -6,6 +6,7 @@ one go and one that was interrupted give the same rows.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import as_completed
@@ -39,7 +40,7 @@ from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.supervision import Row
-from surgisoft.workers import torch_threads, workers
+from surgisoft.workers import CLUSTER, torch_threads, workers
 
 DROPPED = ("phase", "reason", "reason_phase", "beam", "beam_unsafe", "safe")
 """Measures of single steps whose means mean nothing."""
@@ -133,15 +134,22 @@ def check_playable(spec: Experiment) -> None:
 
 
 def run_experiment(
-    spec: Experiment, folder: Path, processes: int = 1, report: Progress = silent
+    spec: Experiment,
+    folder: Path,
+    processes: int = 1,
+    report: Progress = silent,
+    cluster: str | None = None,
 ) -> list[Row]:
-    """Run every block that has no results yet; returns all rows, in order. See `open_results`."""
+    """Run every block that has no results yet; returns all rows, in order. See `open_results`.
+
+    cluster: address of a Dask scheduler whose workers, which see the same folder, run the blocks.
+    """
     every = jobs(spec)
     left = [job for job in every if not _is_done(folder, job)]
     total = float(sum(job.count for job in every))
     done = total - sum(job.count for job in left)
     report(done, total, "")
-    if processes == 1:
+    if processes == 1 and not (cluster or os.environ.get(CLUSTER)):
         with torch_threads(1):
             for job in left:
                 began = done
@@ -153,7 +161,7 @@ def run_experiment(
                 done += job.count
                 report(done, total, job.setting.words)
     else:
-        for job in _in_processes(spec, folder, left, processes):
+        for job in _in_processes(spec, folder.resolve(), left, processes, cluster):
             done += job.count
             report(done, total, job.setting.words)
     return read_rows(folder, every)
@@ -197,12 +205,20 @@ def _run_block(spec: Experiment, folder: Path, job: Job, progress: Progress = si
         write_json(row_file(folder, job.setting, row["episode"]), row)
 
 
-def _in_processes(spec: Experiment, folder: Path, left: list[Job], processes: int) -> Iterator[Job]:
+def _run_missing(spec: Experiment, folder: Path, job: Job) -> None:
+    """Run a block unless it is done: a cluster asks again where a worker died with its result."""
+    if not _is_done(folder, job):
+        _run_block(spec, folder, job)
+
+
+def _in_processes(
+    spec: Experiment, folder: Path, left: list[Job], processes: int, cluster: str | None
+) -> Iterator[Job]:
     """Run the blocks in worker processes; yields each block as it is done."""
     try:
         prepare = partial(name_code, named_code())
-        with workers(processes, prepare) as pool:
-            waiting = {pool.submit(_run_block, spec, folder, job): job for job in left}
+        with workers(processes, prepare, cluster) as pool:
+            waiting = {pool.submit(_run_missing, spec, folder, job): job for job in left}
             for future in as_completed(waiting):
                 future.result()
                 yield waiting[future]

@@ -73,16 +73,19 @@ def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     return replace(spec, cases=(*spec.cases, *twins))
 
 
-def with_rigs(spec: Experiment, rigs: Iterable[str]) -> Experiment:
+def with_rigs(spec: Experiment, rigs: Iterable[str], preflight: bool = False) -> Experiment:
     """The experiment with other rigs in every case whose plant is `rig`.
 
     rigs: `NAME[:option=value,...]`, or `ARM=NAME[:...]` for single arms. A bench that may be real
-    runs one episode after the other.
+    runs one episode after the other. preflight: whether real rigs have to move as predicted first.
     """
     rigs = tuple(rigs)
     if not any(case.plant == "rig" for case in spec.cases):
         raise InputError(f"--rig: {spec.name} has no case with plant = 'rig' that could use it")
-    cases = tuple(replace(case, rigs=rigs) if case.plant == "rig" else case for case in spec.cases)
+    cases = tuple(
+        replace(case, rigs=rigs, preflight=preflight) if case.plant == "rig" else case
+        for case in spec.cases
+    )
     names = {parse_rig(text).name for text in rigs_by_arm(rigs, spec.of.agents).values()}
     together = spec.together if names <= set(SIMULATED) else 1
     return replace(spec, cases=cases, together=together)
@@ -95,13 +98,15 @@ def start_experiment(
     repeats: int | None = None,
     rigs: Iterable[str] = (),
     *,
+    preflight: bool = False,
     resume: bool = False,
     force: bool = False,
 ) -> tuple[Experiment, Path]:
     """The experiment and its folder of results, new or ready to be resumed.
 
     output: default `results/NAME`. policies: folders of training runs, each added as a case.
-    repeats: episodes of each setting. rigs: in place of those of the cases on rigs. resume:
+    repeats: episodes of each setting. rigs: in place of those of the cases on rigs. preflight:
+    whether real ones have to move as their models predict before each setting. resume:
     continue existing results; force: replace them.
     """
     if resume and force:
@@ -110,8 +115,10 @@ def start_experiment(
     for folder in policies:
         spec = with_policy(spec, folder)
     rigs = tuple(rigs)
+    if preflight and not rigs:
+        raise InputError("--preflight is for real rigs; name one with --rig")
     if rigs:
-        spec = with_rigs(spec, rigs)
+        spec = with_rigs(spec, rigs, preflight)
         settings(spec)
     spec = spec if repeats is None else replace(spec, repeats=repeats)
     place = Path(output) if output else Path("results") / spec.name
@@ -126,12 +133,14 @@ def finish_experiment(
     replays: bool = True,
     about: str = "",
     progress: Progress = silent,
+    cluster: str | None = None,
 ) -> tuple[Results, list[Path]]:
     """Roll out what is not there yet and write tables, pictures, replays and the report.
 
     Returns the results and the files that were written. about: the command, for the report.
+    cluster: address of a Dask scheduler whose workers run the episodes.
     """
-    rows = run_experiment(spec, folder, processes, progress)
+    rows = run_experiment(spec, folder, processes, progress, cluster)
     results = sum_up(spec, folder, rows)
     files = write_tables(results)
     logs = {(label, n): results.log(label, n) for label, n in shown_episodes(results)}

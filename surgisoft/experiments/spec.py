@@ -115,6 +115,8 @@ class Case:
     """On a simulated rig: seed of the robot."""
     rigs: tuple[str, ...] = ("virtual",)
     """On the rig: `NAME[:option=value,...]` for all arms, or `ARM=NAME[:...]` for one of them."""
+    preflight: bool = False
+    """On a real rig: whether it has to move as its arm model predicts before each setting."""
     arm: str = ""
     """Arm model of all arms: default or a folder; without it the scene's."""
 

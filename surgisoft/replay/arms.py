@@ -26,8 +26,7 @@ SOLID = rr.components.FillMode.Solid
 
 def log_arm(columns: Columns, name: str, arm: ArmLog, rows: np.ndarray) -> None:
     """Log one arm in the log's `rows`: shaft, body, bands at the key points, tip."""
-    colour = ARM_COLOURS.get(name, ARM_COLOURS["arm"])
-    band = BAND_COLOURS.get(name, BAND_COLOURS["arm"])
+    colour, band = ARM_COLOURS[arm.tool or "arm"], BAND_COLOURS[arm.tool or "arm"]
     radius, base = arm.radius_mm, arm.mount[:3, 3]
     behind = base - max(arm.shaft_mm, SOCKET_MM) * arm.mount[:3, 2]
     _log_rod(columns.recording, f"/arms/{name}/shaft", behind, base, 1.02 * radius)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from surgisoft.palette import MEASURED_ON_DARK, RED, rgb
+
 ROLE_COLOURS = {
     "organ": (142, 58, 48),
     "keep-out": (112, 140, 62),
@@ -10,11 +12,25 @@ ROLE_COLOURS = {
 """Colour of a body by its role."""
 ROLE_NAMES = {"organ": "red-brown", "keep-out": "olive green", "support": "grey"}
 """Name of the colour of each role."""
-ARM_COLOURS = {"laser": (236, 226, 208), "endoscope": (120, 158, 196), "arm": (236, 226, 208)}
-"""Colour of a soft body by its arm's name."""
-BAND_COLOURS = {"laser": (196, 132, 56), "endoscope": (48, 92, 150), "arm": (196, 132, 56)}
-"""Colour of the bands that mark an arm's key points."""
+ARM_COLOURS = {
+    "laser": (236, 226, 208),
+    "endoscope": (120, 158, 196),
+    "tip": (176, 196, 160),
+    "arm": (236, 226, 208),
+}
+"""Colour of a soft body by its arm's tool; `arm` is one without a tool."""
+BAND_COLOURS = {
+    "laser": (196, 132, 56),
+    "endoscope": (48, 92, 150),
+    "tip": (84, 120, 64),
+    "arm": (196, 132, 56),
+}
+"""Colour of the bands that mark an arm's key points, by its tool."""
 SHAFT_COLOUR = (88, 94, 102)
+MEASURED_COLOUR = rgb(MEASURED_ON_DARK)
+"""Colour of a measured body beside a predicted one."""
+PREDICTED_COLOUR = rgb(RED)
+"""Colour of the body that one model predicts."""
 LESION_COLOUR = (214, 172, 118)
 LESION_TINT = 0.35
 """Share of the lesion's colour that is mixed into the organ's inside the ring."""
@@ -69,9 +85,16 @@ def tissue_colours(heat: np.ndarray, base: np.ndarray | tuple[int, int, int]) ->
     return np.column_stack((colour, np.full(len(heat), 255))).astype(np.uint8)
 
 
+ERROR_STOPS = ((72, 60, 140), (48, 104, 150), (40, 160, 130), (140, 205, 70), (253, 231, 37))
+"""Colours from no error to the end of the scale, evenly spaced: after viridis (van der Walt &
+Smith 2015), apart from the models' red and blue, and safe for colour-blind viewers."""
+ERROR_NAMES = ("violet", "yellow")
+"""Names of the first and of the last of them."""
+
+
 def error_colours(error: np.ndarray, largest: float) -> np.ndarray:
-    """(..., 3) uint8 from blue by yellow to red for errors (...) from 0 to `largest`."""
-    stops = np.array([[60, 130, 230], [90, 210, 170], [250, 220, 70], [240, 60, 40]], float)
+    """(..., 3) uint8 from violet by green to yellow for errors (...) from 0 to `largest`."""
+    stops = np.array(ERROR_STOPS, float)
     place = np.clip(np.nan_to_num(error) / max(largest, 1e-12), 0.0, 1.0) * (len(stops) - 1)
     low = np.minimum(place.astype(int), len(stops) - 2)
     share = (place - low)[..., None]

@@ -1,74 +1,107 @@
-"""Replays of a model beside a recording, and of a recording before and after a change."""
+"""Replays of models beside a recording, and of a recording before and after a change."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from surgisoft.error_scale import Scale, bar_length, body_size, error_scale, quantile, stretch_of
 from surgisoft.errors import InputError
+from surgisoft.palette import model_colour, rgb
 from surgisoft.replay.colours import (
     BACKGROUND,
+    ERROR_STOPS,
+    MEASURED_COLOUR,
     PLAN_COLOUR,
     REAL_COLOUR,
-    SHAFT_COLOUR,
     error_colours,
 )
 from surgisoft.replay.contents import TIME
 from surgisoft.replay.episode_view import Replay
-from surgisoft.replay.plots import Line, series_colour
+from surgisoft.replay.legends import legend_picture
+from surgisoft.replay.plots import Line, series_colour, time_axis
 from surgisoft.replay.recording import Columns, new_recording
 from surgisoft.replay.shapes import finer
+from surgisoft.tasks.episodes.parts import Event
+from surgisoft.time_axis import continued, pauses
 
 MOST_ROWS = 6000
 """Longer comparisons are thinned evenly to so many rows."""
-STRETCH_OF_ERROR = 0.15
-"""Length of the drawn error at the 95 % quantile, as a share of the body's size."""
-LARGE = 0.95
-"""Quantile of the errors at which the colour scale ends."""
 LINE_MM = 2.0
 """Spacing of the drawn centreline's points (mm)."""
+MEASURED_WIDE, PREDICTED_WIDE, POINT_WIDE, ARROW_WIDE, BAR_WIDE = 0.012, 0.006, 0.014, 0.006, 0.005
+"""Radii of what is drawn, as shares of the body's length: a short and a long arm look alike."""
+LEGEND, SEEN, EVENTS = "/legend", "/seen", "/events"
+"""Entities of the legend's picture, of the text panel and of the events."""
+LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
+"""An event's level in Rerun's text log."""
 
 
 def write_comparison(
     t_s: np.ndarray,
     measured_mm: np.ndarray,
-    predicted_mm: np.ndarray,
+    predicted_mm: np.ndarray | Mapping[str, np.ndarray],
     name: str,
     path: str | Path,
     pressure: np.ndarray | None = None,
     unit: str = "kPa",
+    *,
+    seen: str = "",
+    events: Sequence[Event] = (),
+    large_mm: float | None = None,
 ) -> Replay:
     """Write measured against predicted key points as an .rrd file.
 
     t_s (S,) s; a new run begins where it decreases. measured_mm (S, n, 3) and predicted_mm
-    (S, n, 3) are in the base frame, nan where missing. pressure (S, m) in `unit` is plotted if
-    given. `name` describes the comparison. The two bodies nearly coincide, so each error is also
-    drawn as an arrow from measured to predicted, magnified by the factor in the view's title.
+    (S, n, 3) are in the base frame, nan where missing; predicted_mm of several models by their
+    names are shown side by side, with one scale of their errors. pressure (S, m) in `unit` is
+    plotted if given. `name` describes the comparison, `seen` is Markdown that says what is seen,
+    and the times of `events` are on the axis of `continued`. The bodies nearly coincide, so each
+    error is also drawn as an arrow from measured to predicted, magnified, and coloured from none to
+    `large_mm` (default: the 95 % quantile of the worst model, rounded up).
     """
     began, path = time.perf_counter(), Path(path)
-    t_s, measured, predicted = (np.asarray(x, float) for x in (t_s, measured_mm, predicted_mm))
-    _check(t_s, measured, predicted)
+    models = predicted_mm if isinstance(predicted_mm, Mapping) else {"model": predicted_mm}
+    t_s, measured = np.asarray(t_s, float), np.asarray(measured_mm, float)
+    models = {label: np.asarray(points, float) for label, points in models.items()}
+    for points in models.values():
+        _check(t_s, measured, points)
     keep = np.unique(np.linspace(0, len(t_s) - 1, min(len(t_s), MOST_ROWS)).round().astype(int))
     time_s = continued(t_s)[keep]
-    measured, predicted = measured[keep], predicted[keep]
-    error = np.linalg.norm(predicted - measured, axis=-1)
-    large = _quantile(error, LARGE)
-    stretch = _stretch(measured, large)
-    lines = _lines(error, None if pressure is None else np.asarray(pressure, float)[keep], unit)
-    title = f"{name}: errors x {stretch:g}, red from {large:.2g} mm"
-    blueprint = _blueprint(title, measured, ("/measured", "/predicted", "/errors"), lines)
+    measured = measured[keep]
+    models = {label: points[keep] for label, points in models.items()}
+    errors = {label: np.linalg.norm(points - measured, axis=-1) for label, points in models.items()}
+    scale = error_scale(measured, list(errors.values()), large_mm)
+    pressure = None if pressure is None else np.asarray(pressure, float)[keep]
+    lines = _lines(errors, pressure, unit)
+    blueprint = _layout(measured, errors, lines, scale, float(time_s[-1]), bool(seen), bool(events))
     with new_recording(path, "surgisoft_comparison", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        _log_body(columns, "/measured", measured, SHAFT_COLOUR, 0.5)
-        _log_body(columns, "/predicted", predicted, PLAN_COLOUR, 0.3)
-        _log_errors(columns, measured, predicted, error, stretch, large)
+        body = scale.body_mm
+        _log_body(columns, "/measured", measured, MEASURED_COLOUR, MEASURED_WIDE * body)
+        _log_bars(recording, measured, scale)
+        for number, (label, points) in enumerate(models.items(), 1):
+            where, colour = f"/model{number}", rgb(model_colour(number - 1))
+            _log_body(columns, where, points, colour, PREDICTED_WIDE * body)
+            _log_errors(columns, where, measured, points, errors[label], scale)
         for line in (line for group in lines.values() for line in group):
             columns.plot(line)
+            _break_at_pauses(columns, line.entity)
+        _log_legend(recording, list(models), scale)
+        if seen:
+            words = rr.TextDocument(seen, media_type="text/markdown")
+            recording.log(SEEN, words, static=True)
+        for event in events:
+            recording.set_time(TIME, duration=event.time_s)
+            text = f"{event.time_s:7.2f} s  {event.text}"
+            recording.log(EVENTS, rr.TextLog(text, level=LEVELS[event.level]))
+        recording.reset_time()
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(time_s[-1] - time_s[0]), cost)
 
@@ -98,8 +131,8 @@ def write_change(
     before, after, explained = before[keep], after[keep], explained[keep]
     change = after - before
     size = np.linalg.norm(change, axis=-1)
-    large = _quantile(size, LARGE)
-    stretch = _stretch(before, large)
+    large = quantile(size)
+    stretch, body = stretch_of(before, large), body_size(before)
     along = _main_direction(change[:, -1])
     lines = {
         "Change of the tip along its main direction (mm)": [
@@ -112,16 +145,17 @@ def write_change(
         ],
     }
     title = f"{name}: changes x {stretch:g}"
-    blueprint = _blueprint(title, before, ("/before", "/after", "/change"), lines)
+    blueprint = _beside(title, before, ("/before", "/after", "/change"), lines, time_s[-1])
     with new_recording(path, "surgisoft_change", name, blueprint) as recording:
         columns = Columns(recording, time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        _log_body(columns, "/before", before, SHAFT_COLOUR, 0.5)
-        _log_body(columns, "/after", after, REAL_COLOUR, 0.3)
-        _log_arrows(columns, "/change/measured", before, stretch * change, REAL_COLOUR)
-        _log_arrows(columns, "/change/explained", before, stretch * explained, PLAN_COLOUR)
+        _log_body(columns, "/before", before, MEASURED_COLOUR, MEASURED_WIDE * body)
+        _log_body(columns, "/after", after, REAL_COLOUR, PREDICTED_WIDE * body)
+        _log_arrows(columns, "/change/measured", before, stretch * change, REAL_COLOUR, body)
+        _log_arrows(columns, "/change/explained", before, stretch * explained, PLAN_COLOUR, body)
         for line in (line for group in lines.values() for line in group):
             columns.plot(line)
+            _break_at_pauses(columns, line.entity)
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(time_s[-1] - time_s[0]), cost)
 
@@ -131,22 +165,14 @@ def _main_direction(change: np.ndarray) -> np.ndarray:
     return np.linalg.svd(np.nan_to_num(change), full_matrices=False)[2][0]
 
 
-def _log_arrows(columns: Columns, entity: str, origins, vectors, colour) -> None:
+def _log_arrows(columns: Columns, entity: str, origins, vectors, colour, body_mm) -> None:
     """Log one arrow from each key point; missing values are omitted."""
     known = np.isfinite(origins + vectors).all(-1)
     rows, counts = np.flatnonzero(known.any(1)), known.sum(1)
-    style = rr.Arrows3D.from_fields(colors=colour, radii=0.35)
+    style = rr.Arrows3D.from_fields(colors=colour, radii=ARROW_WIDE * body_mm)
     columns.recording.log(entity, style, static=True)
     arrows = rr.Arrows3D.columns(origins=origins[known], vectors=vectors[known])
     columns.send(entity, rows, arrows.partition(counts[rows]))
-
-
-def continued(t_s: np.ndarray) -> np.ndarray:
-    """(S,) s that never decrease: a run whose time starts again continues after the one before."""
-    steps = np.diff(t_s)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
-    steps = np.where(steps < 0.0, usual, steps)
-    return np.concatenate(([0.0], np.cumsum(steps)))
 
 
 def _check(t_s, measured, predicted) -> None:
@@ -162,34 +188,45 @@ def _check(t_s, measured, predicted) -> None:
         raise InputError("comparison: no key point is both measured and predicted, nothing to draw")
 
 
-def _quantile(error: np.ndarray, share: float) -> float:
-    known = error[np.isfinite(error)]
-    return float(np.quantile(known, share)) if len(known) else 0.0
-
-
-def _stretch(measured: np.ndarray, large: float) -> float:
-    """The round factor by which the drawn errors are magnified."""
-    points = measured[np.isfinite(measured).all(-1)]
-    size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 1.0
-    factor = STRETCH_OF_ERROR * size / max(large, 1e-9)
-    rounds = [k * 10.0**p for p in range(4) for k in (1.0, 2.0, 5.0)]
-    return max((r for r in rounds if r <= factor), default=1.0)
-
-
-def _lines(error, pressure, unit: str) -> dict[str, list[Line]]:
+def _lines(errors: Mapping[str, np.ndarray], pressure, unit: str) -> dict[str, list[Line]]:
     """Lines of each plot by its title."""
-    count = error.shape[1]
-    groups = {
-        "Error of each key point (mm)": [
-            Line(f"/plots/error/k{i}", f"k{i}", error[:, i], series_colour(i)) for i in range(count)
+    groups = {}
+    if len(errors) > 1:
+        groups["Error of the tip (mm)"] = [
+            Line(f"/plots/tip/model{i}", label, error[:, -1], rgb(model_colour(i - 1)))
+            for i, (label, error) in enumerate(errors.items(), 1)
         ]
-    }
+    for number, (label, error) in enumerate(errors.items(), 1):
+        of = f", {label}" if len(errors) > 1 else ""
+        where = f"/plots/error/model{number}"
+        groups[f"Error of each key point (mm){of}"] = [
+            Line(f"{where}/k{i}", f"k{i}{_end_of_arm(i, error.shape[1])}", values, series_colour(i))
+            for i, values in enumerate(error.T)
+        ]
     if pressure is not None:
-        groups[f"Pressure ({unit})"] = [
-            Line(f"/plots/pressure/p{i + 1}", f"p{i + 1}", pressure[:, i], series_colour(i))
+        what, one = ("Pressure", "chamber") if unit == "kPa" else ("Actuation", "channel")
+        groups[f"{what} ({unit})"] = [
+            Line(f"/plots/pressure/p{i + 1}", f"{one} {i + 1}", pressure[:, i], series_colour(i))
             for i in range(pressure.shape[1])
         ]
     return groups
+
+
+def _end_of_arm(number: int, count: int) -> str:
+    if count == 1:
+        return ""
+    return {0: " (base)", count - 1: " (tip)"}.get(number, "")
+
+
+def _break_at_pauses(columns: Columns, entity: str) -> None:
+    """End a plot's line before each pause, so that none is drawn across it."""
+    time_s = columns.time_s
+    last = pauses(time_s)
+    ends = 0.9 * time_s[last] + 0.1 * time_s[last + 1]
+    if len(ends):
+        nothing = rr.Scalars.columns(scalars=np.full(len(ends), np.nan))
+        times = [rr.TimeColumn(TIME, duration=ends)]
+        columns.recording.send_columns(entity, indexes=times, columns=nothing)
 
 
 def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> None:
@@ -204,42 +241,118 @@ def _log_body(columns: Columns, entity: str, points, colour, radius: float) -> N
     columns.send(f"{entity}/body", rows, rr.LineStrips3D.columns(strips=strips))
 
 
-def _log_errors(columns: Columns, measured, predicted, error, stretch: float, large: float) -> None:
+def _log_errors(columns: Columns, where: str, measured, predicted, error, scale: Scale) -> None:
     """Log key points coloured by error, and an arrow for each; missing values are omitted."""
     known = np.isfinite(error)
     rows, counts = np.flatnonzero(known.any(1)), known.sum(1)
     counts = counts[rows]
-    colours = error_colours(error[known], large)
+    colours = error_colours(error[known], scale.large_mm)
     points = rr.Points3D.columns(positions=measured[known], colors=colours)
-    columns.recording.log("/errors/points", rr.Points3D.from_fields(radii=1.3), static=True)
-    columns.send("/errors/points", rows, points.partition(counts))
-    arrows = rr.Arrows3D.columns(
-        origins=measured[known], vectors=stretch * (predicted - measured)[known], colors=colours
-    )
-    columns.recording.log("/errors/arrows", rr.Arrows3D.from_fields(radii=0.35), static=True)
-    columns.send("/errors/arrows", rows, arrows.partition(counts))
+    style = rr.Points3D.from_fields(radii=POINT_WIDE * scale.body_mm)
+    columns.recording.log(f"{where}/errors/points", style, static=True)
+    columns.send(f"{where}/errors/points", rows, points.partition(counts))
+    vectors = scale.stretch * (predicted - measured)[known]
+    arrows = rr.Arrows3D.columns(origins=measured[known], vectors=vectors, colors=colours)
+    thick = rr.Arrows3D.from_fields(radii=ARROW_WIDE * scale.body_mm)
+    columns.recording.log(f"{where}/errors/arrows", thick, static=True)
+    columns.send(f"{where}/errors/arrows", rows, arrows.partition(counts))
 
 
-def _blueprint(title: str, measured, entities, lines) -> rrb.Blueprint:
-    """A view of some entities in space, beside the plots."""
+def _log_bars(recording, measured: np.ndarray, scale: Scale) -> None:
+    """Log two bars beside the workspace: one of lengths, one of the magnified errors."""
     points = measured[np.isfinite(measured).all(-1)]
     low, high = points.min(axis=0), points.max(axis=0)
+    length = scale.bar_mm
+    error = bar_length(length / scale.stretch)
+    corner = np.array([low[0], low[1], low[2] - 0.12 * scale.body_mm])
+    corner[0] = 0.5 * (low[0] + high[0]) - 0.5 * length
+    strips, labels = [], []
+    for row, (drawn, text) in enumerate(
+        ((length, f"{length:g} mm"), (scale.stretch * error, f"error of {error:g} mm"))
+    ):
+        start = corner - np.array([0.0, 0.0, 0.10 * row * scale.body_mm])
+        strips.append(np.stack((start, start + np.array([drawn, 0.0, 0.0]))))
+        labels.append(text)
+    bars = rr.LineStrips3D(
+        strips,
+        colors=[MEASURED_COLOUR, ERROR_STOPS[-1]],
+        radii=BAR_WIDE * scale.body_mm,
+        labels=labels,
+        show_labels=True,
+    )
+    recording.log("/bars", bars, static=True)
+
+
+def _log_legend(recording, names: Sequence[str], scale: Scale) -> None:
+    picture = rr.EncodedImage(contents=legend_picture(names, scale), media_type="image/png")
+    recording.log(LEGEND, picture, static=True)
+
+
+def _layout(measured, errors, lines, scale: Scale, end_s: float, seen: bool, events: bool):
+    """Models side by side over legend and text; plots and events to the right."""
+    views = []
+    for number, (label, error) in enumerate(errors.items(), 1):
+        known = error[np.isfinite(error)]
+        rms = float(np.sqrt(np.square(known).mean()))
+        title = f"{label}: error {rms:.3g} mm (arrows x {scale.stretch:g})"
+        shown = ("/measured", "/bars", f"/model{number}")
+        views.append(_space(title, measured, shown, 0.25 * scale.body_mm))
+    bodies = views[0] if len(views) == 1 else rrb.Horizontal(*views)
+    below: list = [rrb.Spatial2DView(origin=LEGEND, name="Legend", background=BACKGROUND)]
+    if seen:
+        below.append(rrb.TextDocumentView(origin=SEEN, name="What is seen"))
+    left = rrb.Vertical(bodies, rrb.Horizontal(*below), row_shares=[2.6, 1.0])
+    plots = [_plot(title, group, end_s) for title, group in lines.items()]
+    tabs = [plot for plot in plots if "each key point" in str(plot.name)]
+    cells: list = [plot for plot in plots if plot not in tabs]
+    cells.insert(min(1, len(errors) - 1), tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs))
+    if events:
+        hidden = rrb.encodings.TimelineColumn(TIME, visible=False)
+        log = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
+        cells.append(rrb.TextLogView(origin=EVENTS, name="Events", columns=log))
+    right = rrb.Vertical(*cells)
+    return _window(rrb.Horizontal(left, right, column_shares=[1.1, 1.0]))
+
+
+def _plot(title: str, group: Sequence[Line], end_s: float) -> rrb.TimeSeriesView:
+    """A plot of the whole time, with room for its legend at the end: it hides no curve."""
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[line.entity for line in group],
+        name=title,
+        plot_legend=rrb.PlotLegend(corner="righttop", visible=len(group) > 1),
+        axis_x=time_axis(end_s),
+    )
+
+
+def _space(
+    title: str, points_mm: np.ndarray, entities: Sequence[str], below_mm: float = 0.0
+) -> rrb.Spatial3DView:
+    """A view of some entities in space: the points (S, n, 3) mm, and so much below them."""
+    points = points_mm[np.isfinite(points_mm).all(-1)]
+    low, high = points.min(axis=0) - [0.0, 0.0, below_mm], points.max(axis=0)
     middle, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    eye = middle + 1.3 * size * np.array([0.35, -0.9, 0.3])
-    scene = rrb.Spatial3DView(
+    eye = middle + 0.95 * size * np.array([0.35, -0.9, 0.3])
+    return rrb.Spatial3DView(
         origin="/",
         contents=[f"+ {entity}/**" for entity in entities],
         name=title,
         background=rrb.Background(BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
     )
-    plots = [
-        rrb.TimeSeriesView(origin="/", contents=[line.entity for line in group], name=title)
-        for title, group in lines.items()
-    ]
+
+
+def _window(content) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(scene, rrb.Vertical(*plots)),
+        content,
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIME, play_state="paused"),
     )
+
+
+def _beside(title: str, points_mm, entities, lines, end_s: float) -> rrb.Blueprint:
+    """A view of some entities in space, beside the plots."""
+    plots = [_plot(title, group, end_s) for title, group in lines.items()]
+    return _window(rrb.Horizontal(_space(title, points_mm, entities), rrb.Vertical(*plots)))

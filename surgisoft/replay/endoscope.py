@@ -19,13 +19,8 @@ from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Body, Mesh
 from surgisoft.scene.render import Renderer
-from surgisoft.tasks.episodes.log import CameraLog, EpisodeLog
-from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
+from surgisoft.tasks.episodes.log import EpisodeLog
 
-CAMERA = "/endoscope/camera"
-"""The camera's pose and its pictures, for the 2D view."""
-CONE = "/endoscope/cone"
-"""The camera's round field of view as lines, for the 3D view: a pinhole is drawn as a pyramid."""
 PIXELS = 240
 """Width and height of a picture."""
 PICTURES_HZ = 2.5
@@ -41,68 +36,80 @@ SAMPLE_MM = 0.4
 """A pixel takes its dose from a sample within this distance (mm)."""
 
 
+def camera_entity(endoscope: str) -> str:
+    """Entity of a camera's pose and its pictures, for the 2D view."""
+    return f"/{endoscope}/camera"
+
+
+def cone_entity(endoscope: str) -> str:
+    """Entity of a camera's field of view as lines: a pinhole is drawn as a pyramid in 3D."""
+    return f"/{endoscope}/cone"
+
+
 def log_camera(
     columns: Columns,
     log: EpisodeLog,
-    camera: CameraLog,
+    name: str,
     rows: np.ndarray,
     looks: np.ndarray,
     report: Progress = silent,
 ) -> None:
-    """Log the camera's pose in the log's `rows`, and its picture in rows `looks`."""
-    arm, half = log.arms[ENDOSCOPE], 0.5 * camera.fov_rad
+    """Log the pose of an endoscope's camera in the log's `rows`, its picture in rows `looks`."""
+    arm, camera = log.arms[name], log.cameras[name]
+    half, place, cone = 0.5 * camera.fov_rad, camera_entity(name), cone_entity(name)
     pinhole = rr.Pinhole(
         resolution=[PIXELS, PIXELS],
         focal_length=0.5 * PIXELS / math.tan(half),
         camera_xyz=rr.ViewCoordinates.RDF,
     )
-    columns.recording.log(CAMERA, pinhole, static=True)
+    columns.recording.log(place, pinhole, static=True)
     lines = view_cone(np.zeros(3), np.array([0.0, 0.0, 1.0]), half, CONE_MM)
-    cone = rr.LineStrips3D(lines, colors=[CONE_COLOUR] * len(lines), radii=[0.15] * len(lines))
-    columns.recording.log(CONE, cone, static=True)
+    drawn = rr.LineStrips3D(lines, colors=[CONE_COLOUR] * len(lines), radii=[0.15] * len(lines))
+    columns.recording.log(cone, drawn, static=True)
     poses = frames.pose_from_z(arm.line_mm[rows, -1].astype(float), arm.tip_direction[rows])
-    for entity in (CAMERA, CONE):
+    for entity in (place, cone):
         moving = rr.Transform3D.columns(
             translation=poses[:, :3, 3], mat3x3=poses[:, :3, :3].astype(np.float32)
         )
         columns.send(entity, rows, moving)
-    pictures = jpegs(log, camera, looks, report)
+    pictures = jpegs(log, name, looks, report)
     style = rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="linear")
-    columns.recording.log(f"{CAMERA}/picture", style, static=True)
+    columns.recording.log(f"{place}/picture", style, static=True)
     shown = rr.EncodedImage.columns(blob=pictures)
-    columns.send(f"{CAMERA}/picture", looks, shown)
+    columns.send(f"{place}/picture", looks, shown)
 
 
-def jpegs(
-    log: EpisodeLog, camera: CameraLog, rows: np.ndarray, report: Progress = silent
-) -> list[bytes]:
-    """The endoscope's round picture in each of the log's `rows`, as JPEG files."""
+def jpegs(log: EpisodeLog, name: str, rows: np.ndarray, report: Progress = silent) -> list[bytes]:
+    """The round picture of an endoscope in each of the log's `rows`, as JPEG files."""
     from PIL import Image
+
+    camera, arm = log.cameras[name], log.arms[name]
 
     bodies = [Body(b.name, b.role, Mesh(b.vertices_mm, b.faces)) for b in log.bodies]
     low, high = camera.range_mm
     renderer = Renderer(bodies, Camera(camera.fov_rad, (low, high)), PIXELS, PIXELS)
     paint, files = _Paint(log), []
-    poses = frames.pose_from_z(
-        log.arms[ENDOSCOPE].line_mm[:, -1].astype(float), log.arms[ENDOSCOPE].tip_direction
-    )
+    poses = frames.pose_from_z(arm.line_mm[:, -1].astype(float), arm.tip_direction)
     for row in rows:
         shapes = {name: ArmShape(arm.line_mm[row], arm.radius_mm) for name, arm in log.arms.items()}
         picture = renderer.image(
-            poses[row], shapes, ENDOSCOPE, _visible_beam(log, row), paint.at(int(row))
+            poses[row], shapes, name, _visible_beams(log, row), paint.at(int(row))
         )
         file = io.BytesIO()
         Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
         files.append(file.getvalue())
-        report(len(files), len(rows), "endoscope")
+        report(len(files), len(rows), name)
     return files
 
 
-def _visible_beam(log: EpisodeLog, row: int) -> np.ndarray | None:
-    """(2, 3) mm: the beam's ends while it is on, else None."""
-    if log.beam is None or not log.beam.on[row]:
-        return None
-    return np.stack((log.arms[LASER].line_mm[row, -1], log.beam.end_mm[row]))
+def _visible_beams(log: EpisodeLog, row: int) -> np.ndarray | None:
+    """(L, 2, 3) mm: both ends of the L beams that are on; None where none is."""
+    ends = [
+        np.stack((log.arms[name].line_mm[row, -1], beam.end_mm[row]))
+        for name, beam in log.beams.items()
+        if beam.on[row]
+    ]
+    return np.stack(ends) if ends else None
 
 
 class _Paint:

@@ -26,15 +26,15 @@ from surgisoft.replay.colours import (
     tissue_colours,
 )
 from surgisoft.replay.contents import TIME
-from surgisoft.replay.endoscope import CAMERA, PICTURES_HZ, log_camera
-from surgisoft.replay.plots import Plot, plots_of
+from surgisoft.replay.endoscope import PICTURES_HZ, camera_entity, log_camera
+from surgisoft.replay.legends import dose_picture
+from surgisoft.replay.plots import Plot, plots_of, time_axis
 from surgisoft.replay.recording import STEP, Columns, new_recording
-from surgisoft.replay.shapes import creased
+from surgisoft.replay.shapes import creased, widest_apart
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
-from surgisoft.tasks.episodes.log import BeamLog, DoseLog, EpisodeLog
-from surgisoft.tasks.world.scene import ENDOSCOPE, LASER
+from surgisoft.tasks.episodes.log import DoseLog, EpisodeLog
 
 SCENE = "Scene"
 """Name of the 3D view."""
@@ -44,16 +44,21 @@ LEGEND = "/legend"
 """Text that explains the colours of the 3D view."""
 
 
+DOSE = "/dose_scale"
+"""Picture of the tissue's colours over its dose."""
+
+
 def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint:
     """The layout for a log and its plots."""
-    cells = _cells(plots)
-    if log.camera is not None:
-        cells.insert(0, rrb.Spatial2DView(origin=CAMERA, name="Endoscope"))
+    cells = [*_pictures(log), *_cells(plots, float(log.time_s[-1]))]
     pairs = [cells[i : i + 2] for i in range(0, len(cells), 2)]
     rows = [pair[0] if len(pair) == 1 else rrb.Horizontal(*pair) for pair in pairs]
-    shares = [1.5 if log.camera is not None and i == 0 else 1.0 for i in range(len(rows))]
+    shares = [1.5 if log.cameras and i == 0 else 1.0 for i in range(len(rows))]
     legend = rrb.TextDocumentView(origin=LEGEND, name="Colours")
     below = rrb.Horizontal(_events(), legend, column_shares=[3, 2])
+    if log.dose is not None:
+        dose = rrb.Spatial2DView(origin=DOSE, name="Dose", background=BACKGROUND)
+        below = rrb.Horizontal(_events(), legend, dose, column_shares=[3, 3, 2])
     left = rrb.Vertical(_scene(log), below, row_shares=[4.0, 1])
     right = rrb.Vertical(*rows, row_shares=shares)
     return rrb.Blueprint(
@@ -62,6 +67,18 @@ def episode_blueprint(log: EpisodeLog, plots: tuple[Plot, ...]) -> rrb.Blueprint
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIME, play_state="playing", loop_mode="all"),
     )
+
+
+def _pictures(log: EpisodeLog) -> list:
+    """A view of the endoscope's pictures; those of several endoscopes become tabs."""
+    alone = len(log.cameras) == 1
+    views = [
+        rrb.Spatial2DView(
+            origin=camera_entity(name), name="Endoscope" if alone else f"Picture of {name}"
+        )
+        for name in log.cameras
+    ]
+    return [rrb.Tabs(*views)] if len(views) > 1 else views
 
 
 def layout_names(log: EpisodeLog) -> tuple[str, ...]:
@@ -77,7 +94,7 @@ def _view_names(part: rrb.Container | rrb.View) -> Iterator[str]:
         yield from _view_names(inner)
 
 
-def _cells(plots: tuple[Plot, ...]) -> list:
+def _cells(plots: tuple[Plot, ...], end_s: float) -> list:
     """One view for each plot; the plots of a group become tabs."""
     cells: list[rrb.TimeSeriesView | list[rrb.TimeSeriesView]] = []
     groups: dict[str, list[rrb.TimeSeriesView]] = {}
@@ -90,7 +107,7 @@ def _cells(plots: tuple[Plot, ...]) -> list:
             contents=[line.entity for line in plot.lines],
             name=plot.title,
             plot_legend=legend,
-            axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+            axis_x=time_axis(end_s),
         )
         if not plot.group:
             cells.append(view)
@@ -123,20 +140,25 @@ def _scene(log: EpisodeLog) -> rrb.Spatial3DView:
     ]
     return rrb.Spatial3DView(
         origin="/",
-        contents=["+ /**", f"- {CAMERA}/**", "- /plots/**", "- /events", f"- {LEGEND}"],
+        contents=[
+            "+ /**",
+            *(f"- {camera_entity(name)}/**" for name in log.cameras),
+            "- /plots/**",
+            *(f"- {flat}" for flat in FLAT),
+        ],
         name=SCENE,
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=not log.bodies),
         eye_controls=rrb.EyeControls3D(position=eye, look_target=target, eye_up=(0.0, 0.0, 1.0)),
-        overrides={TRAIL: rrb.VisibleTimeRanges(so_far)},
+        overrides={entity: rrb.VisibleTimeRanges(so_far) for entity, _, _ in _trails(log)},
     )
 
 
 def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
     """Eye and target (3,) mm of the 3D view, with the arms and the path in the picture.
 
-    Two arms are seen side by side, from the side that the lesion faces. A single arm is seen from
-    the front, a little from above.
+    Arms in a scene are seen side by side, from the side that the lesion faces. A single arm is seen
+    from the front, a little from above.
     """
     alone = len(log.arms) == 1
     lines = [arm.line_mm for arm in log.arms.values()]
@@ -147,15 +169,15 @@ def viewpoint(log: EpisodeLog) -> tuple[np.ndarray, np.ndarray]:
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     towards, above, distance = np.array([0.3, -1.0, 0.0]), 1.0, 1.2
-    if ENDOSCOPE in log.arms and len(log.arms) == 2:
-        first, second = (arm.mount[:3, 3] for arm in log.arms.values())
-        towards, above, distance = _across(log, first - second), 0.5, 0.8
+    if len(log.arms) > 1:
+        bases = np.array([arm.mount[:3, 3] for arm in log.arms.values()])
+        towards, above, distance = _across(log, widest_apart(bases)), 0.5, 0.8
     direction = frames.normalise(frames.normalise(towards) + np.array([0.0, 0.0, above]))
     return middle + distance * size * direction, middle
 
 
 def _across(log: EpisodeLog, apart: np.ndarray) -> np.ndarray:
-    """(3,) horizontal direction from which both arms lie side by side and the lesion is seen."""
+    """(3,) horizontal direction from which the arms lie side by side and the lesion is seen."""
     facing = np.array([0.0, -1.0, 0.0])
     if log.dose is not None:
         normal = log.dose.normals.mean(axis=0) * [1.0, 1.0, 0.0]
@@ -170,6 +192,10 @@ def _across(log: EpisodeLog, apart: np.ndarray) -> np.ndarray:
 
 MOTION_HZ = 10.0
 """Rate at which bodies are drawn (1/s); plots have every step."""
+FLAT = ("/events", LEGEND, DOSE)
+"""Entities that views other than the 3D view show."""
+PLAN_MM, REAL_MM = 0.28, 0.36
+"""Radii of the reference path and, thicker so that it covers it, of the actual path (mm)."""
 JUMP_MM = 3.0
 """A target that moves farther than this in one step has jumped (mm)."""
 RING_CORNERS, RING_WIDER = 24, 1.15
@@ -224,17 +250,26 @@ def write_replay(
         for name, arm in log.arms.items():
             log_arm(columns, name, arm, moments)
         _log_paths(columns, log, moments)
-        if log.beam is not None:
-            _log_beam(columns, log, log.beam, moments)
-        if log.camera is not None and ENDOSCOPE in log.arms:
-            log_camera(columns, log, log.camera, moments, finite_rows(log, pictures_hz), report)
+        for name in log.beams:
+            _log_beam(columns, log, name, moments)
+        for name in log.cameras:
+            log_camera(columns, log, name, moments, finite_rows(log, pictures_hz), report)
         for line in (line for plot in plots for line in plot.lines):
             columns.plot(line)
         _log_events(recording, log)
         text = rr.TextDocument(legend(log), media_type="text/markdown")
         recording.log(LEGEND, text, static=True)
+        if log.dose is not None:
+            _log_dose_scale(recording, log, log.dose)
     cost = time.perf_counter() - began
     return Replay(path, path.stat().st_size / 1e6, float(log.time_s[-1]), cost)
+
+
+def _log_dose_scale(recording, log: EpisodeLog, dose: DoseLog) -> None:
+    """Log the picture of the tissue's colours over its dose, with unit and thresholds."""
+    role = next(body.role for body in log.bodies if body.name == dose.body)
+    picture = dose_picture(dose.threshold_j_per_mm2, dose.cut_j_per_mm2, ROLE_COLOURS[role])
+    recording.log(DOSE, rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
 
 
 def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
@@ -289,27 +324,36 @@ def _log_dosed(
 
 def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     """Log the reference path once, and over time the actual path and the target."""
-    closed = np.vstack((log.path_mm, log.path_mm[:1]))
-    planned = [closed] if len(log.path_mm) else _unbroken(log.target_mm)
+    planned = log.paths_mm or _unbroken(log.target_mm)
     if planned:
-        plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[0.18])
+        plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[PLAN_MM])
         columns.recording.log("/path/planned", plan, static=True)
-    shown = np.isfinite(log.actual_mm).all(1)
-    if log.beam is not None:
-        shown &= log.beam.on
-    ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
-    pieces = np.stack((log.actual_mm[ends - 1], log.actual_mm[ends]), axis=1)
-    if len(ends):
-        line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=0.25)
-        columns.recording.log(TRAIL, line, static=True)
-        columns.send(TRAIL, ends, rr.LineStrips3D.columns(strips=list(pieces)))
+    for entity, went, on in _trails(log):
+        shown = np.isfinite(went).all(1) & on
+        ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
+        pieces = np.stack((went[ends - 1], went[ends]), axis=1)
+        if len(ends):
+            line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=REAL_MM)
+            columns.recording.log(entity, line, static=True)
+            columns.send(entity, ends, rr.LineStrips3D.columns(strips=list(pieces)))
     count = log.targets_mm.shape[1]
     style = rr.Points3D.from_fields(colors=PLAN_COLOUR, radii=0.55)
     columns.recording.log("/path/target", style, static=True)
     moving = rr.Points3D.columns(positions=log.targets_mm[rows].reshape(-1, 3))
     columns.send("/path/target", rows, moving.partition([count] * len(rows)))
-    if count > 1:
+    if count > 1 and not log.beams:
         _log_target_body(columns, log.targets_mm[rows], rows, log.arms[log.agents[0]].radius_mm)
+
+
+def _trails(log: EpisodeLog) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Entity, place (T, 3) mm and shown (T,) bool of the actual path, of each beam's where several.
+
+    With a beam the path is shown while the beam is on.
+    """
+    if len(log.beams) > 1:
+        return [(f"{TRAIL}/{name}", beam.end_mm, beam.on) for name, beam in log.beams.items()]
+    always = np.ones(log.rows, dtype=bool)
+    return [(TRAIL, log.actual_mm, always if log.burning is None else log.burning)]
 
 
 def _unbroken(points_mm: np.ndarray) -> list[np.ndarray]:
@@ -333,35 +377,39 @@ def _log_target_body(columns: Columns, targets: np.ndarray, rows, radius_mm: flo
     columns.send("/path/target_body", rows, strips.partition([count] * len(rows)))
 
 
-def _log_beam(columns: Columns, log: EpisodeLog, beam: BeamLog, rows: np.ndarray) -> None:
-    """Log the beam from the tip to its end: thick while the laser is on, thin while it aims."""
-    ends = np.stack((log.arms[LASER].line_mm[:, -1], beam.end_mm), axis=1)[rows]
+def _log_beam(columns: Columns, log: EpisodeLog, name: str, rows: np.ndarray) -> None:
+    """Log a beam from the tip to its end: thick while the laser is on, thin while it aims."""
+    beam, entity = log.beams[name], "/beam" if len(log.beams) == 1 else f"/beams/{name}"
+    ends = np.stack((log.arms[name].line_mm[:, -1], beam.end_mm), axis=1)[rows]
     on = beam.on[rows]
     strips = rr.LineStrips3D.columns(
         strips=list(ends),
         radii=np.where(on, 0.4, 0.08),
         colors=np.where(on[:, None], BEAM_COLOUR, paler(BEAM_COLOUR, 0.7)).astype(np.uint8),
     )
-    columns.send("/beam", rows, strips)
+    columns.send(entity, rows, strips)
     spots = rr.Points3D.columns(positions=ends[:, 1], radii=np.where(on, 0.8, 0.3))
-    columns.recording.log("/beam/hit", rr.Points3D.from_fields(colors=BEAM_COLOUR), static=True)
-    columns.send("/beam/hit", rows, spots)
+    style = rr.Points3D.from_fields(colors=BEAM_COLOUR)
+    columns.recording.log(f"{entity}/hit", style, static=True)
+    columns.send(f"{entity}/hit", rows, spots)
 
 
 def legend(log: EpisodeLog) -> str:
     """Markdown that explains those colours of the 3D view that occur in the log."""
     rows = [
         ("yellow", "reference: path and target", True),
-        ("cyan", "actual path, while the beam is on" if log.beam else "actual path", True),
-        ("green line", "beam; thick while it is on", log.beam is not None),
-        ("blue lines", "field of view of the endoscope's camera", log.camera is not None),
+        ("cyan", "actual path, while the beam is on" if log.beams else "actual path", True),
+        ("green line", "beam; thick while it is on", bool(log.beams)),
+        ("blue lines", "field of view of the endoscope's camera", bool(log.cameras)),
         ("pale, then black", "tissue below and above the dose of ablation", log.dose is not None),
         ("white points", "key points as measured by the cameras", log.on == "rig"),
     ]
     lines = [f"- **{colour}**: {meaning}" for colour, meaning, shown in rows if shown]
     roles = {body.role for body in log.bodies}
     lines += [f"- **{c}**: {role}" for role, c in ROLE_NAMES.items() if role in roles]
-    return "\n".join(lines) + "\n"
+    what = f"**{log.task}** by {log.driver} in {log.on}"
+    last = f": {log.events[-1].text} at {log.events[-1].time_s:.1f} s" if log.events else ""
+    return f"{what}{last}.\n\n" + "\n".join(lines) + "\n"
 
 
 def _log_events(recording, log: EpisodeLog) -> None:

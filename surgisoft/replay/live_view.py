@@ -20,10 +20,12 @@ from surgisoft.errors import InputError
 from surgisoft.files import new_file
 from surgisoft.replay.colours import (
     BACKGROUND,
+    ERROR_NAMES,
     LIMIT_COLOUR,
+    MEASURED_COLOUR,
     PLAN_COLOUR,
+    PREDICTED_COLOUR,
     REAL_COLOUR,
-    SHAFT_COLOUR,
     error_colours,
     paler,
     series_colour,
@@ -51,9 +53,9 @@ EVENTS = "/events"
 """Entity of the text log."""
 LEGEND = "/legend"
 """Text that explains the colours of the 3D view."""
-LEGEND_TEXT = f"""- **grey**: measured body
-- **yellow**: body that the model predicts
-- **points**: measured key points, blue to red from 0 to {LARGE_MM:g} mm of residual
+LEGEND_TEXT = f"""- **white**: measured body
+- **red**: body that the model predicts
+- **points**: measured key points, {" to ".join(ERROR_NAMES)} from 0 to {LARGE_MM:g} mm of residual
 - **arrows**: residual (measured less predicted), {STRETCH:g} times as long
 """
 
@@ -83,8 +85,8 @@ class LiveView:
         self.recording, self.bench = recording, bench
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for entity, colour, radius in (
-            ("measured", SHAFT_COLOUR, 0.5),
-            ("predicted", PLAN_COLOUR, 0.3),
+            ("measured", MEASURED_COLOUR, 0.5),
+            ("predicted", PREDICTED_COLOUR, 0.3),
         ):
             style = rr.LineStrips3D.from_fields(colors=colour, radii=radius)
             recording.log(f"/body/{entity}", style, static=True)

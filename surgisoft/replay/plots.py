@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import rerun.blueprint as rrb
 
 from surgisoft.replay.colours import LIMIT_COLOUR, paler, series_colour
 from surgisoft.tasks.episodes.log import EpisodeLog
@@ -59,6 +60,17 @@ class Plot:
     """Corner of the legend; None: no legend."""
     group: str = ""
     """Plots of one group share a place in the layout, as tabs."""
+
+
+LEGEND_ROOM = 0.42
+"""Empty room at the end of each plot, in which its legend stands, as a share of the duration."""
+
+
+def time_axis(end_s: float) -> rrb.TimeAxis:
+    """The whole time from 0 on, and room behind it for the legend, which so hides no curve."""
+    end = rrb.TimeRangeBoundary.absolute(seconds=end_s * (1.0 + LEGEND_ROOM))
+    start = rrb.TimeRangeBoundary.absolute(seconds=0.0)
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end))
 
 
 def plots_of(log: EpisodeLog) -> tuple[Plot, ...]:

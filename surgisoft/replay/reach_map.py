@@ -1,21 +1,25 @@
 """The reachability map of a scene: which surface around the lesion the laser reaches."""
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically
-from surgisoft.scene.check import REASONS, Patch, SceneCheck, Work, sentence
+from surgisoft.scene.check import REASONS, Patch, SceneCheck, sentence
 from surgisoft.scene.folder import Scene
+from surgisoft.scene.mounted_arm import RingSolution, ring_moments
 
 REASON_COLOURS = ("#2a9d4a", "#5b6472", "#b5651d", "#7b2d8b", "#c1121f", "#1d5fa8")
 """Colour of each reason, in the order of REASONS."""
 
 
-def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) -> None:
-    """Write a .png: the patch coloured by the beam's incidence, and the values around the ring."""
+def draw_reach_map(
+    scene: Scene, verdict: SceneCheck, patches: Mapping[str, Patch], path: Path
+) -> None:
+    """Write a .png: each laser's patch coloured by the beam's incidence, and values on the ring."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -25,13 +29,23 @@ def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) 
     work = verdict.work
     if work is None:
         raise InputError("the ring does not lie on the organ, so there is no map to draw")
-    figure = Figure(figsize=(12.0, 5.6), layout="constrained")
+    if not patches:
+        raise InputError("no arm of the scene carries a laser, so there is no map to draw")
+    figure = Figure(figsize=(12.0, 5.6 * len(patches)), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
-    _draw_patch(figure, left, scene, work, patch)
-    rows = right.get_subplotspec().subgridspec(3, 1)
-    right.remove()
-    _draw_ring([figure.add_subplot(row) for row in rows], scene, work)
+    grid = figure.subplots(len(patches), 2, width_ratios=(1.0, 1.15), squeeze=False)
+    for number, ((name, patch), (left, right)) in enumerate(
+        zip(patches.items(), grid, strict=True)
+    ):
+        whose = "" if len(patches) == 1 else f" ({name})"
+        _draw_patch(figure, left, scene, work.reasons[name], patch, whose)
+        rows = right.get_subplotspec().subgridspec(3, 1)
+        right.remove()
+        axes = [figure.add_subplot(row) for row in rows]
+        order = ring_moments(len(work.clearance_mm), len(patches))[:, number]
+        clearance_mm = np.empty_like(work.clearance_mm)
+        clearance_mm[order] = work.clearance_mm
+        _draw_ring(axes, scene, work.reasons[name], work.cuts[name], clearance_mm, whose)
     figure.suptitle(f"{scene.spec.name}: {sentence(verdict)}", fontsize=9, wrap=True)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
@@ -39,7 +53,7 @@ def draw_reach_map(scene: Scene, verdict: SceneCheck, patch: Patch, path: Path) 
     write_atomically(path, buffer.getvalue())
 
 
-def _draw_patch(figure, axes, scene: Scene, work: Work, patch: Patch) -> None:
+def _draw_patch(figure, axes, scene: Scene, reason: np.ndarray, patch: Patch, whose: str) -> None:
     from matplotlib.tri import Triangulation
 
     triangles = Triangulation(*patch.flat_mm.T)
@@ -58,8 +72,8 @@ def _draw_patch(figure, axes, scene: Scene, work: Work, patch: Patch) -> None:
         axes.scatter(*bad.T, s=26, marker="s", color=REASON_COLOURS[code], label=REASONS[code])
     closed = np.vstack((patch.ring_flat_mm, patch.ring_flat_mm[:1]))
     axes.plot(*closed.T, color="white", lw=3.5)
-    for code in np.unique(work.reason):
-        here = work.reason == code
+    for code in np.unique(reason):
+        here = reason == code
         axes.scatter(
             *patch.ring_flat_mm[here].T,
             s=14,
@@ -67,23 +81,29 @@ def _draw_patch(figure, axes, scene: Scene, work: Work, patch: Patch) -> None:
             label=f"ring: {REASONS[code]} ({100 * here.mean():.0f} %)",
             zorder=3,
         )
-    axes.set(aspect="equal", xlabel="mm", ylabel="mm", title="surface around the lesion")
+    axes.set(aspect="equal", xlabel="mm", ylabel="mm", title=f"surface around the lesion{whose}")
     axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
 
 
-def _draw_ring(axes, scene: Scene, work: Work) -> None:
+def _draw_ring(
+    axes,
+    scene: Scene,
+    reason: np.ndarray,
+    cut: RingSolution,
+    clearance_mm: np.ndarray,
+    whose: str,
+) -> None:
     """Clearance, incidence and length of the beam over the angle around the ring."""
-    angle = 360.0 * np.arange(len(work.reason)) / len(work.reason)
+    angle = 360.0 * np.arange(len(reason)) / len(reason)
     limits, laser = scene.spec.limits, scene.spec.laser
-    cut = work.cut
     rows = (
-        ("clearance (mm)", work.clearance_mm, (limits.clearance_mm,)),
+        ("clearance (mm)", clearance_mm, (limits.clearance_mm,)),
         ("incidence (deg)", np.degrees(cut.incidence_rad), (laser.max_incidence_deg,)),
         ("beam length (mm)", cut.standoff_mm, laser.standoff_mm),
     )
     for one, (label, values, bounds) in zip(axes, rows, strict=True):
         one.plot(angle, values, color="#333333", lw=1.2)
-        colours = [REASON_COLOURS[code] for code in work.reason]
+        colours = [REASON_COLOURS[code] for code in reason]
         one.scatter(angle, values, s=9, c=colours, zorder=3)
         for bound in bounds:
             one.axhline(bound, color="#c1121f", lw=0.9, ls="--")
@@ -91,5 +111,5 @@ def _draw_ring(axes, scene: Scene, work: Work) -> None:
         one.grid(alpha=0.3)
         if one is not axes[-1]:
             one.set_xticklabels([])
-    axes[0].set_title("around the ring (dashed: the scene's limits)", fontsize=9)
+    axes[0].set_title(f"around the ring{whose} (dashed: the scene's limits)", fontsize=9)
     axes[-1].set_xlabel("angle around the ring (degrees)")

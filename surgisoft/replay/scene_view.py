@@ -1,4 +1,4 @@
-"""A scene as a Rerun recording: bodies, both arms at work, ring, beam and the camera's cone."""
+"""A scene as a Rerun recording: bodies, all arms at work, ring, beams and the cameras' cones."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from surgisoft.replay.colours import (
     SHAFT_COLOUR,
 )
 from surgisoft.replay.recording import new_recording
-from surgisoft.replay.shapes import creased, finer, polar_patch, tube, view_cone
+from surgisoft.replay.shapes import creased, finer, polar_patch, tube, view_cone, widest_apart
 from surgisoft.scene import frames
 from surgisoft.scene.check import mounted_arms
 from surgisoft.scene.folder import Scene
@@ -27,7 +27,9 @@ from surgisoft.scene.mounted_arm import (
     MountedArm,
     RingSolution,
     look_at_lesion,
+    ring_moments,
     solve_ring,
+    touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
 
@@ -41,24 +43,30 @@ FRAMES = 72
 
 def save_scene_view(scene: Scene, reaches: dict[str, ArmReach], path: Path) -> None:
     """Write the scene as an .rrd file that includes its layout."""
-    arms, ring = mounted_arms(scene, reaches), scene.ring
-    cut = solve_ring(arms["laser"], ring, scene.spec.laser)
-    look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
+    arms, ring, spec = mounted_arms(scene, reaches), scene.ring, scene.spec
+    lasers = spec.arms_with("laser")
+    cuts = {name: solve_ring(arms[name], ring, spec.laser) for name in lasers}
     identity = scene.content_hash[:16]
     with new_recording(path, "surgisoft_scene", identity, blueprint(scene, arms)) as recording:
         _log_bodies(recording, scene)
         _log_lesion(recording, scene)
-        _log_endoscope(recording, scene, arms["endoscope"], look)
-        _log_laser(recording, arms["laser"], cut, ring.points_mm)
+        for name in spec.arms_with("endoscope"):
+            look = look_at_lesion(arms[name], ring, spec.camera)
+            _log_endoscope(recording, scene, name, arms[name], look)
+        for name in spec.arms_with("tip"):
+            touch = touch_lesion(arms[name], ring, spec.limits.clearance_mm)
+            _log_shaft(recording, name, arms[name])
+            _log_arm(recording, name, "tip", arms[name], touch.way_mm[0], static=True)
+        _log_lasers(recording, arms, cuts)
 
 
 def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
-    """A layout with one 3D view from the lesion's side that contains lesion and both bases."""
+    """A layout with one 3D view from the lesion's side that contains lesion and all bases."""
     organ = scene.organ.world_mesh.bounds_mm
     points = np.array([*organ, *(arm.pose[:3, 3] for arm in arms.values())])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    towards = _side_of_both_arms(scene, arms)
+    towards = _side_of_arms(scene, arms)
     eye = middle + 1.05 * size * frames.normalise(towards + np.array([0.0, 0.0, 0.45]))
     view = rrb.Spatial3DView(
         origin="/",
@@ -75,14 +83,15 @@ def blueprint(scene: Scene, arms: dict[str, MountedArm]) -> rrb.Blueprint:
     )
 
 
-def _side_of_both_arms(scene: Scene, arms: dict[str, MountedArm]) -> np.ndarray:
-    """(3,) horizontal unit vector towards an eye that sees both arms side by side."""
-    first, second = (arm.pose[:3, 3] for arm in arms.values())
-    apart = (first - second) * [1.0, 1.0, 0.0]
+def _side_of_arms(scene: Scene, arms: dict[str, MountedArm]) -> np.ndarray:
+    """(3,) horizontal unit vector towards an eye that sees the arms side by side."""
+    apart = widest_apart(np.array([arm.pose[:3, 3] for arm in arms.values()])) * [1.0, 1.0, 0.0]
     facing = scene.ring.normal * [1.0, 1.0, 0.0]
     if np.linalg.norm(facing) < 0.1:
         facing = np.array([0.0, -1.0, 0.0])
     facing = frames.normalise(facing)
+    if np.linalg.norm(apart) < 1e-6:
+        return facing
     across = frames.normalise(np.cross([0.0, 0.0, 1.0], apart))
     across = across if across @ facing >= 0.0 else -across
     return frames.normalise(across + 0.5 * facing)
@@ -141,12 +150,14 @@ def _log_lesion(recording, scene: Scene) -> None:
     )
 
 
-def _log_arm(recording, tool: str, arm: MountedArm, line_mm: np.ndarray, static: bool) -> None:
+def _log_arm(
+    recording, name: str, tool: str, arm: MountedArm, line_mm: np.ndarray, static: bool
+) -> None:
     """Log the soft body as a tube."""
     body = line_mm[1:] if arm.shaft_mm > 0.0 else line_mm
     vertices, faces, normals = tube(finer(body, 2.0), arm.reach.radius_mm, BORE_MM)
     recording.log(
-        f"/arms/{tool}/body",
+        f"/arms/{name}/body",
         rr.Mesh3D(
             vertex_positions=vertices,
             triangle_indices=faces,
@@ -157,13 +168,13 @@ def _log_arm(recording, tool: str, arm: MountedArm, line_mm: np.ndarray, static:
     )
 
 
-def _log_shaft(recording, tool: str, arm: MountedArm) -> None:
+def _log_shaft(recording, name: str, arm: MountedArm) -> None:
     if arm.shaft_mm <= 0.0:
         return
     ends = arm.pose[:3, 3] - np.array([arm.shaft_mm, 0.0])[:, None] * arm.pose[:3, 2]
     vertices, faces, normals = tube(finer(ends, 10.0), 1.02 * arm.reach.radius_mm)
     recording.log(
-        f"/arms/{tool}/shaft",
+        f"/arms/{name}/shaft",
         rr.Mesh3D(
             vertex_positions=vertices,
             triangle_indices=faces,
@@ -174,28 +185,34 @@ def _log_shaft(recording, tool: str, arm: MountedArm) -> None:
     )
 
 
-def _log_endoscope(recording, scene: Scene, arm: MountedArm, look: EndoscopePose) -> None:
-    _log_shaft(recording, "endoscope", arm)
-    _log_arm(recording, "endoscope", arm, look.line_mm, static=True)
+def _log_endoscope(
+    recording, scene: Scene, name: str, arm: MountedArm, look: EndoscopePose
+) -> None:
+    _log_shaft(recording, name, arm)
+    _log_arm(recording, name, "endoscope", arm, look.line_mm, static=True)
     half = np.radians(scene.spec.camera.fov_deg / 2)
     lines = view_cone(look.line_mm[-1], look.direction, half, 0.8 * look.distance_mm)
     recording.log(
-        "/arms/endoscope/view",
+        f"/arms/{name}/view",
         rr.LineStrips3D(lines, colors=[CONE_COLOUR] * len(lines), radii=[0.2] * len(lines)),
         static=True,
     )
 
 
-def _log_laser(recording, arm: MountedArm, cut: RingSolution, ring_mm: np.ndarray) -> None:
-    """Log the laser arm going round the ring, one frame for each point."""
-    _log_shaft(recording, "laser", arm)
-    for i in range(0, len(ring_mm), max(1, len(ring_mm) // FRAMES)):
-        recording.set_time("ring_point", sequence=i)
-        _log_arm(recording, "laser", arm, cut.lines_mm[i], static=False)
-        tip = cut.lines_mm[i, -1]
-        end = tip + cut.directions[i] * max(float(cut.standoff_mm[i]), 1.0)
-        recording.log(
-            "/beam", rr.LineStrips3D([np.stack((tip, end))], colors=[BEAM_COLOUR], radii=[0.35])
-        )
-        recording.log("/beam/hit", rr.Points3D([end], colors=[BEAM_COLOUR], radii=[0.9]))
+def _log_lasers(recording, arms: dict[str, MountedArm], cuts: dict[str, RingSolution]) -> None:
+    """Log the lasers going round the ring at once, evenly spread, one frame for each point."""
+    count = max((len(cut.commands) for cut in cuts.values()), default=0)
+    for name in cuts:
+        _log_shaft(recording, name, arms[name])
+    for moment in range(0, count, max(1, count // FRAMES)):
+        recording.set_time("ring_point", sequence=moment)
+        points = ring_moments(count, len(cuts))[moment]
+        for (name, cut), i in zip(cuts.items(), points, strict=True):
+            _log_arm(recording, name, "laser", arms[name], cut.lines_mm[i], static=False)
+            tip = cut.lines_mm[i, -1]
+            end = tip + cut.directions[i] * max(float(cut.standoff_mm[i]), 1.0)
+            entity = "/beam" if len(cuts) == 1 else f"/beams/{name}"
+            beam = rr.LineStrips3D([np.stack((tip, end))], colors=[BEAM_COLOUR], radii=[0.35])
+            recording.log(entity, beam)
+            recording.log(f"{entity}/hit", rr.Points3D([end], colors=[BEAM_COLOUR], radii=[0.9]))
     recording.reset_time()

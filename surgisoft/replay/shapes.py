@@ -101,3 +101,9 @@ def creased(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return mesh.vertices_mm, mesh.faces, mesh.vertex_normals
     vertices = mesh.triangles_mm.reshape(-1, 3)
     return vertices, np.arange(len(vertices)).reshape(-1, 3), np.repeat(mesh.face_normals, 3, 0)
+
+
+def widest_apart(points_mm: np.ndarray) -> np.ndarray:
+    """(3,) mm: the longest of the differences between points (N, 3) mm."""
+    apart = points_mm[:, None] - points_mm
+    return apart.reshape(-1, 3)[np.linalg.norm(apart, axis=2).argmax()]

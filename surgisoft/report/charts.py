@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import matplotlib as mpl
 
+from surgisoft.palette import AMBER, BLUE, GREEN, RED
 from surgisoft.report.parts import Picture
 from surgisoft.report.style import DARK_INK, DARK_LINE, DARK_MUTED, INK, LINE, MUTED
 
@@ -21,10 +22,10 @@ from typing import Any
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
+__all__ = ["AMBER", "BLUE", "CHART", "GREEN", "RED", "chart", "drawing"]
+
 CHART = (4.6, 3.0)
 """Size of a chart that is legible on a phone, inches."""
-BLUE, RED, GREEN, AMBER = "#3b82c4", "#d1495b", "#3c9a6b", "#cf9330"
-"""Colours with contrast on light and on dark backgrounds."""
 _STYLE: Any = {
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",

@@ -9,7 +9,7 @@ heat conduction and no shielding by the plume, and the surface keeps its shape.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +86,10 @@ Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class AblationState:
-    """Dose and ablated areas so far: B environments, P samples, N stations; the patch's frame."""
+    """Dose and ablated areas so far: B environments, P samples, N stations; the patch's frame.
+
+    With L beams the fields of a beam have the shape (B, L, ...) in place of (B, ...).
+    """
 
     dose: torch.Tensor
     """(B, P) float32 J/mm^2: radiant exposure of the surface."""
@@ -95,17 +98,18 @@ class AblationState:
     band_mm2: torch.Tensor
     """(B, N) float32 mm^2: ablated area of the band at each station."""
     zone_mm2: torch.Tensor
-    """(B, 3) float32 mm^2: ablated area by zone (lesion, ring, healthy)."""
+    """(B, 3) float32 mm^2: ablated area by zone (lesion, ring, healthy); of the lesion with
+    `exact_lesion` the area with the dose that cuts."""
     zone_j: torch.Tensor
     """(B, 3) float32 J: energy received by zone."""
     delivered_j: torch.Tensor
-    """(B,) float32 J: energy that reached the organ, on the patch or off it."""
+    """(B,) or (B, L) float32 J: each beam's energy on the organ, on the patch or off it."""
     last_point_mm: torch.Tensor
-    """(B, 3) mm: where the beam ended at the last moment."""
+    """(B, 3) or (B, L, 3) mm: where the beam ended at the last moment."""
     last_direction: torch.Tensor
-    """(B, 3): the beam's direction at the last moment."""
+    """(B, 3) or (B, L, 3): the beam's direction at the last moment."""
     last_on: torch.Tensor
-    """(B,) bool: whether the beam ended on the organ at the last moment."""
+    """(B,) or (B, L) bool: whether the beam ended on the organ at the last moment."""
     ring: torch.Tensor
     """(B,) int64: which of the map's rings is to be cut."""
 
@@ -146,10 +150,13 @@ class AblationMap:
         tissue: Tissue | None = None,
         depth_mm: float = 0.0,
         device: str | torch.device = "cpu",
+        exact_lesion: bool = False,
     ):
         """waist_mm is the beam's 1/e^2 radius; the ring counts as cut where it is depth_mm deep.
 
-        Several patches are the rings of `cut_patches`, which share their samples.
+        Several patches are the rings of `cut_patches`, which share their samples. With
+        exact_lesion the area of the lesion counts from depth_mm too, instead of from the threshold
+        of ablation.
         """
         self.patches = (patch,) if isinstance(patch, DosePatch) else tuple(patch)
         patch = self.patches[0]
@@ -165,6 +172,9 @@ class AblationMap:
         self.patch, self.waist_mm, self.tissue = patch, float(waist_mm), tissue or Tissue()
         self.threshold = self.tissue.threshold_j_per_mm2
         self.cut_dose = self.tissue.dose_for_depth(depth_mm)
+        self._counted = np.full(3, self.threshold)
+        if exact_lesion:
+            self._counted[LESION] = self.cut_dose
         self.device = torch.device(device)
         self._samples = [
             torch.tensor(array, device=self.device)
@@ -177,6 +187,13 @@ class AblationMap:
         lengths = [one.ring_length_mm for one in self.patches]
         self._ring_mm = torch.tensor(lengths, device=self.device, dtype=torch.float32)
 
+    @property
+    def zone_areas_mm2(self) -> tuple[float, float, float]:
+        """Area of the patch's lesion, ring and healthy tissue (of the first ring), mm^2."""
+        zone, areas = self.patch.zone, self.patch.areas_mm2
+        lesion, ring, healthy = (float(areas[zone == k].sum()) for k in (LESION, RING, HEALTHY))
+        return lesion, ring, healthy
+
     def start(
         self,
         point_mm: torch.Tensor,
@@ -185,6 +202,8 @@ class AblationMap:
         ring: torch.Tensor | None = None,
     ) -> AblationState:
         """Untouched tissue, the beam at (B, 3) mm along (B, 3), on the organ or not (B,) bool.
+
+        Several beams, whose doses add up, are (B, L, 3) mm, (B, L, 3) and (B, L) bool.
 
         ring (B,) int64 is the number of the ring to cut; None: the first.
         """
@@ -195,7 +214,7 @@ class AblationMap:
             (count, patch.stations),
             (count, 3),
             (count, 3),
-            (count,),
+            tuple(point_mm.shape[:-1]),
         )
         empty = [torch.zeros(size, device=self.device) for size in sizes]
         ring = torch.zeros(count, dtype=torch.int64, device=self.device) if ring is None else ring
@@ -224,8 +243,10 @@ class AblationMap:
         )
         kept = [getattr(state, name) for name in _SUMS]
         if in_place:
+            # By index: a mask would be spread over every sample of every environment first.
+            index = mask.nonzero()[:, 0]
             for tensor in kept:
-                tensor[mask] = 0.0
+                tensor.index_fill_(0, index, 0.0)
         else:
             kept = [_pick(mask, 0.0, tensor) for tensor in kept]
         ring = torch.zeros_like(state.ring) if ring is None else ring
@@ -245,27 +266,29 @@ class AblationMap:
         """The state dt_s later, the beam having swept from its last place to this one.
 
         point_mm (B, 3) mm, unit direction (B, 3), on (B,) bool as for `start`; power_w a number or
-        (B,), constant over the step. If the beam was on the organ at one end of the step only, it
-        receives half of the step's energy. With in_place the old state's tensors are overwritten.
+        (B,), constant over the step; for several beams (B, L, 3), (B, L, 3), (B, L) and (B, L). A
+        beam on the organ at one end of the step only gives half of the step's energy. With in_place
+        the old state's tensors are overwritten.
         """
         point, aim, on = self._beam(point_mm, direction, on)
         power = torch.as_tensor(power_w, dtype=torch.float32, device=self.device)
         both, one = on & state.last_on, on ^ state.last_on
         energy = torch.where(both, 1.0, torch.where(one, 0.5, 0.0)) * power * dt_s
         energy = torch.where(energy > 0.0, energy, 0.0)
-        began = torch.where(state.last_on[:, None], state.last_point_mm, point)
-        ended = torch.where(on[:, None], point, state.last_point_mm)
-        before = torch.where(state.last_on[:, None], state.last_direction, aim)
-        after = torch.where(on[:, None], aim, state.last_direction)
-        middle = torch.nn.functional.normalize(before + after, dim=1)
-        tensors = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
+        began = torch.where(state.last_on[..., None], state.last_point_mm, point)
+        ended = torch.where(on[..., None], point, state.last_point_mm)
+        before = torch.where(state.last_on[..., None], state.last_direction, aim)
+        after = torch.where(on[..., None], aim, state.last_direction)
+        middle = torch.nn.functional.normalize(before + after, dim=-1)
+        sums = [state.dose, state.peak, state.band_mm2, state.zone_mm2, state.zone_j]
         if not in_place:
-            tensors = [t.clone() for t in tensors]
+            sums = [t.clone() for t in sums]
         deposit = self._deposit if self.device.type == "cpu" else self._deposit_torch
-        dose, peak, band, area, joule = deposit(began, ended, middle, energy, state.ring, *tensors)
-        return AblationState(
-            dose, peak, band, area, joule, state.delivered_j + energy, point, aim, on, state.ring
-        )
+        for began_of, ended_of, along, joule in _each_beam(began, ended, middle, energy):
+            sums = [*deposit(began_of, ended_of, along, joule, state.ring, *sums)]
+        dose, peak, band, area, zone_j = sums
+        total = state.delivered_j + energy
+        return AblationState(dose, peak, band, area, zone_j, total, point, aim, on, state.ring)
 
     @staticmethod
     def _last(point_mm, direction, on) -> dict[str, torch.Tensor]:
@@ -277,8 +300,8 @@ class AblationMap:
         point = point_mm.detach().to(self.device, torch.float32)
         aim = direction.detach().to(self.device, torch.float32)
         on = torch.as_tensor(on, device=self.device)
-        finite = point.isfinite().all(1) & aim.isfinite().all(1)
-        held = finite[:, None]
+        finite = point.isfinite().all(-1) & aim.isfinite().all(-1)
+        held = finite[..., None]
         return torch.where(held, point, 0.0), torch.where(held, aim, 0.0), on & finite
 
     def _deposit(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
@@ -288,7 +311,7 @@ class AblationMap:
         samples = (patch.points_mm, patch.normals, patch.areas_mm2, self._zones, self._stations)
         place = (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts)
         which = ring.contiguous().numpy()
-        _deposit(*beams, which, self.waist_mm, self.threshold, samples, place, *kept)
+        _deposit(*beams, which, self.waist_mm, self._counted, samples, place, *kept)
         return dose, peak, band, area, joule
 
     def _deposit_torch(self, began, ended, direction, energy, ring, dose, peak, band, area, joule):
@@ -301,8 +324,9 @@ class AblationMap:
             gain = sweep_fluence(p, q, d, energy[part], self.waist_mm, points)
             gain = gain * (-(d @ normals.T)).clamp(min=0.0)
             after = dose[part] + gain
-            burnt = (after >= self.threshold) & (dose[part] < self.threshold)
             zone, station = self._zone[ring[part]], self._station[ring[part]]
+            least = torch.as_tensor(self._counted, dtype=torch.float32, device=self.device)[zone]
+            burnt = (after >= least) & (dose[part] < least)
             in_ring = zone == RING
             joule[part] = joule[part].scatter_add(1, zone, gain * areas)
             area[part] = area[part].scatter_add(1, zone, burnt * areas)
@@ -318,7 +342,8 @@ class AblationMap:
         gap = longest_run(~cut)
         cut_length = cut.sum(1) * length
         burnt = (state.band_mm2 * cut).sum(1)
-        beyond = (state.delivered_j - state.zone_j.sum(1)).clamp(min=0.0)
+        delivered = state.delivered_j.reshape(len(cut), -1).sum(1)
+        beyond = (delivered - state.zone_j.sum(1)).clamp(min=0.0)
         return RingReport(
             completion=cut.float().mean(1),
             largest_gap_mm=gap * length,
@@ -327,7 +352,7 @@ class AblationMap:
             healthy_mm2=state.zone_mm2[:, HEALTHY],
             healthy_j=state.zone_j[:, HEALTHY] + beyond,
             lesion_mm2=state.zone_mm2[:, LESION],
-            delivered_j=state.delivered_j,
+            delivered_j=delivered,
         )
 
     def paint(self, state: AblationState, environment: int = 0) -> Paint:
@@ -344,6 +369,15 @@ class AblationMap:
             return np.where(heat >= 1.0, charred, pale)
 
         return recolour
+
+
+def _each_beam(*fields: torch.Tensor) -> Iterator[tuple[torch.Tensor, ...]]:
+    """The fields (B, ...) of each beam, from those of one beam or of L beams (B, L, ...)."""
+    if fields[-1].ndim == 1:
+        yield fields
+        return
+    for k in range(fields[-1].shape[1]):
+        yield tuple(one[:, k] for one in fields)
 
 
 def sweep_fluence(
@@ -380,11 +414,29 @@ def sweep_fluence(
 
 def longest_run(flags: torch.Tensor) -> torch.Tensor:
     """(B,) length of the longest run of True in rings (B, N): the last neighbours the first."""
+    if flags.device.type == "cpu":
+        found = torch.empty(len(flags), dtype=torch.int64)
+        _longest_runs(flags.contiguous().numpy(), found.numpy())
+        return found
     count = flags.shape[1]
     twice = torch.cat((flags, flags), 1)
     place = torch.arange(1, 2 * count + 1, device=flags.device)
     broken = torch.where(twice, 0, place).cummax(1).values
     return (place - broken).amax(1).clamp(max=count)
+
+
+@compiled
+def _longest_runs(flags, out):
+    """Longest run of True in each ring of flags (B, N), into out (B,)."""
+    count = flags.shape[1]
+    for n in range(len(flags)):
+        longest, run = 0, 0
+        for k in range(2 * count):
+            run = run + 1 if flags[n, k if k < count else k - count] else 0
+            longest = max(longest, run)
+            if k >= count - 1 and run == 0:
+                break
+        out[n] = min(longest, count)
 
 
 def _pick(mask, fresh, old):
@@ -400,7 +452,7 @@ def _deposit(
     energy,
     ring,
     waist,
-    threshold,
+    counted,
     samples,
     place,
     dose,
@@ -473,7 +525,7 @@ def _deposit(
                         after = dose[n, s] + gain
                         kind = zone[s]
                         joule[n, kind] += gain * areas[s]
-                        if after >= threshold and dose[n, s] < threshold:
+                        if after >= counted[kind] and dose[n, s] < counted[kind]:
                             area[n, kind] += areas[s]
                             if kind == RING:
                                 band[n, station[s]] += areas[s]

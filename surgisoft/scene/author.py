@@ -37,7 +37,8 @@ from surgisoft.scene.meshio import (
     stored_unit,
     write_ply,
 )
-from surgisoft.scene.mounts import Pair, find_mounts
+from surgisoft.scene.mounted_arm import RingSolution
+from surgisoft.scene.mounts import Arrangement, find_mounts
 from surgisoft.scene.reach import ArmReach
 from surgisoft.scene.repair import repair
 from surgisoft.scene.segmentation import Label, is_segmentation, read_segmentation
@@ -150,7 +151,7 @@ _NamedBody = tuple[str, Mesh, np.ndarray]
 
 
 class NoMounts(InputError):
-    """No pair of mounts was found for the lesion; the message gives the best one and its flaw."""
+    """No mounts were found for the lesion; the message gives the best one and its flaw."""
 
     def __init__(self, message: str, notes: tuple[str, ...] = ()):
         """`notes` are the units and repairs, which may be the reason."""
@@ -406,7 +407,8 @@ def author(
 ) -> Authored:
     """Make and check a scene from mesh files; nothing is written.
 
-    `mounts` gives each tool's arm (name, length, diameter, shaft); this function finds its place.
+    `mounts` gives each arm's tool, model and size by the arm's name, `reaches` its reach table;
+    this function finds its place.
     """
     prepared = prepare(request, report)
     report(5, 100, "meshes read")
@@ -418,24 +420,24 @@ def author(
         bodies = _bodies(prepared, site)
         engine = BatchedScene(
             bodies,
-            {tool: reach.radius_mm for tool, reach in reaches.items()},
+            {name: reach.radius_mm for name, reach in reaches.items()},
             most_nodes=PLANNING_NODES,
         )
         span = (10 + 80 * number / len(sites), 80 / len(sites))
-        pairs, shortfall = find_mounts(
+        arrangements, shortfall = find_mounts(
             engine,
             reaches,
+            mounts,
             _coarse(site.ring),
             request.laser,
             request.camera,
             request.limits,
-            {tool: mount.shaft_mm for tool, mount in mounts.items()},
             lambda done, total, note="", span=span: report(
                 span[0] + span[1] * done / total / 2, 100, note
             ),
         )
-        for pair in pairs:
-            scene = _scene(request, prepared, site, bodies, pair, mounts, name)
+        for arranged in arrangements:
+            scene = _scene(request, prepared, site, bodies, arranged, mounts, name)
             check = check_scene(scene, reaches)
             if check.good:
                 chosen = _chosen(scene, check, site, prepared)
@@ -471,9 +473,9 @@ def _bodies(prepared: Prepared, site: Site) -> tuple[Body, ...]:
     )
 
 
-def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> Scene:
+def _scene(request, prepared, site: Site, bodies, arranged: Arrangement, mounts, name) -> Scene:
     operable = [i for i, role in enumerate(prepared.roles) if role != "support"]
-    arms = {"laser": pair.laser.arm, "endoscope": pair.look.arm}
+    arms = {arm: found.arm for arm, found in arranged.sites.items()}
     spec = SceneSpec(
         name=name,
         bodies=tuple(BodySpec(body.name, f"{body.name}.ply", body.role) for body in bodies),
@@ -483,8 +485,8 @@ def _scene(request, prepared, site: Site, bodies, pair: Pair, mounts, name) -> S
             float(request.diameter_mm),
         ),
         mounts=tuple(
-            replace(mounts[tool], **rounded_mount(arm.pose[:3, 3], arm.pose[:3, :3]))
-            for tool, arm in arms.items()
+            replace(mounts[arm], **rounded_mount(at.pose[:3, 3], at.pose[:3, :3]))
+            for arm, at in arms.items()
         ),
         laser=request.laser,
         camera=request.camera,
@@ -513,7 +515,7 @@ def rounded_mount(position_mm: np.ndarray, rotation: np.ndarray) -> dict[str, An
 
 def _chosen(scene: Scene, check: SceneCheck, site: Site, prepared: Prepared) -> list[str]:
     assert check.work is not None, "a scene that was chosen has its arms at work"
-    cut = check.work.cut
+    cuts = check.work.cuts.values()
     centre = ", ".join(f"{x:.1f}" for x in scene.spec.lesion.centre_mm)
     moved = f"the given point was {site.moved_mm:.3g} mm off the surface and was moved onto it"
     segmented = prepared.lesion_mm is not None
@@ -527,9 +529,15 @@ def _chosen(scene: Scene, check: SceneCheck, site: Site, prepared: Prepared) -> 
         *([moved] if segmented or site.moved_mm > REPORTED_FROM_MM else []),
         f"lesion of {scene.spec.lesion.diameter_mm:g} mm on '{scene.spec.lesion.body}' at "
         f"[{centre}] mm",
-        f"beam {cut.standoff_mm.min():.0f} to {cut.standoff_mm.max():.0f} mm long, incidence up to "
-        f"{np.degrees(cut.incidence_rad.max()):.0f} degrees",
+        *([_beams(list(cuts))] if cuts else []),
     ]
+
+
+def _beams(cuts: list[RingSolution]) -> str:
+    """Length and incidence of the lasers' beams."""
+    low, high = min(c.standoff_mm.min() for c in cuts), max(c.standoff_mm.max() for c in cuts)
+    steepest = np.degrees(max(cut.incidence_rad.max() for cut in cuts))
+    return f"beam {low:.0f} to {high:.0f} mm long, incidence up to {steepest:.0f} degrees"
 
 
 def check_target(folder: Path, force: bool) -> None:

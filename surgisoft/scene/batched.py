@@ -1,7 +1,7 @@
 """Clearance and ray queries for many environments at once, as training needs them.
 
 `BatchedScene` gives the results of `collision.CollisionChecker` for batches of arms: on the CPU
-with Embree and compiled queries, on an accelerator with torch. Both agree with FCL to the
+with compiled queries, on an accelerator with torch. Both agree with FCL to the
 tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
 """
 
@@ -19,10 +19,26 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
-from surgisoft.scene.distance import chains_apart, chains_folded, chains_to_surface
+from surgisoft.scene.distance import (
+    chains_apart,
+    chains_folded,
+    chains_to_surface,
+    divide_steps,
+    longest_steps,
+)
 from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
-from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
+from surgisoft.scene.rays import (
+    RayHit,
+    Struck,
+    aim_rays,
+    chain_hits,
+    ray_ends,
+    rays_to_body,
+    rays_to_chains,
+    struck_of,
+)
+from surgisoft.scene.sight import hide_behind_body, hide_behind_chain
 from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
@@ -31,7 +47,7 @@ from surgisoft.scene.torch_queries import (
 )
 
 ENGINES = ("compiled", "torch")
-"""The batched engines: Embree and compiled queries, or torch alone."""
+"""The batched engines: compiled queries, or torch alone."""
 LONGEST_SEGMENT_MM = 6.0
 """Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
 MOST_PARTS = 256
@@ -73,15 +89,17 @@ class BatchedScene:
             raise unknown_name("geometry engine", engine, ENGINES)
         if engine == "compiled" and self.device.type != "cpu":
             raise InputError(f"the compiled engine runs on the CPU, not on '{self.device}'")
-        self._compiled = engine == "compiled"
-        kind = CompiledSurface if self._compiled else TorchSurface
-        self._surfaces = []
+        self.compiled = engine == "compiled"
+        kind = CompiledSurface if self.compiled else TorchSurface
+        self._surfaces, self._trees = [], []
+        self._at_home = {body.name: self._inverse(_pose_of(body)) for body in self.bodies}
         for body in self.bodies:
             tree = build_tree(body.mesh)
             margin = 5.0 * math.ceil((self.horizon_mm + thickest) / 5.0)
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
             field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
             self._surfaces.append(kind(tree, field, self.device))
+            self._trees.append(tree)
 
     def radius_mm(self, arm: str) -> float:
         """Radius of an arm by name (mm)."""
@@ -128,6 +146,8 @@ class BatchedScene:
 
         `own` names the arm that carries the beam: its segments near the tip do not block it.
         """
+        if self.compiled:
+            return self._compiled_cast(origins_mm, directions, range_mm, arms or {}, own, poses)
         shape = origins_mm.shape[:-1]
         count = shape[0]
         origins = _held(origins_mm).double().reshape(count, -1, 3)
@@ -142,6 +162,7 @@ class BatchedScene:
             turn, shift = self._inward(body, poses)
             o = origins @ turn.mT + shift[:, None]
             d = aims @ turn.mT
+            assert isinstance(surface, TorchSurface), "the compiled engine has its own loops"
             t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
             t, f = t.view_as(best), f.view_as(best)
             nearer = (f >= 0) & (t < best)
@@ -154,7 +175,7 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius, line = self.radius_mm(name), _held(line)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            t, segment = self._chain_hits(origins, aims, line, radius, gap, best)
+            t, segment = rays_to_chains_torch(origins, aims, line, radius, gap, best)
             nearer = t < best
             point = origins + t[..., None] * aims
             outward = chain_normal(point, line.double()[:, None], segment)
@@ -176,15 +197,85 @@ class BatchedScene:
             incidence_rad=torch.atan2(sine, cosine).to(dtype).reshape(shape),
         )
 
+    def _compiled_cast(self, origins_mm, directions, range_mm, arms, own, poses) -> RayHit:
+        """`cast` in a few compiled loops."""
+        shape, dtype = origins_mm.shape[:-1], origins_mm.dtype
+        each, count = math.prod(shape[1:]), math.prod(shape)
+        origins, aims, normals = (np.empty((count, 3)) for _ in range(3))
+        given = (_held(t).reshape(-1, 3).numpy() for t in (origins_mm, directions))
+        aim_rays(*given, origins, aims)
+        np.negative(aims, out=normals)
+        struck, t = torch.zeros(count, dtype=torch.int8), np.full(count, float(range_mm))
+        body, face = torch.full((2, count), -1, dtype=torch.int32)
+        found = (struck.numpy(), body.numpy(), face.numpy(), t, normals)
+        for number, (one, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            frame = (part.numpy() for part in self._inward(one, poses))
+            tree, outward = self._trees[number], surface.normals.numpy()
+            mesh = (tree.arrays, tree.order, outward, number, int(struck_of(one)))
+            rays_to_body(origins, aims, each, *frame, *mesh, *found)
+        for name, line in arms.items():
+            radius, line = self.radius_mm(name), _held(line).numpy()
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
+            before, segment = t.copy(), np.zeros(count, np.int64)
+            rays = (part.reshape(-1, each, 3) for part in (origins, aims))
+            ends = (part.reshape(-1, each) for part in (t, segment))
+            rays_to_chains(*rays, line, radius, gap, *ends)
+            chain_hits(origins, aims, each, line, kind, before, segment, *found)
+        point, normal = torch.empty((2, count, 3), dtype=dtype)
+        distance, incidence = torch.empty((2, count), dtype=dtype)
+        arrays = (part.numpy() for part in (point, normal, distance, incidence))
+        ray_ends(origins, aims, t, normals, *arrays)
+        return RayHit(
+            struck=struck.reshape(shape),
+            body=body.reshape(shape),
+            face=face.reshape(shape),
+            distance_mm=distance.reshape(shape),
+            point_mm=point.reshape(*shape, 3),
+            normal=normal.reshape(*shape, 3),
+            incidence_rad=incidence.reshape(shape),
+        )
+
+    def clear_lines(
+        self,
+        eyes_mm: torch.Tensor,
+        ends_mm: torch.Tensor,
+        distance_mm: torch.Tensor,
+        short_mm: float,
+        wanted: torch.Tensor,
+        arms: Mapping[str, torch.Tensor] | None = None,
+        own: str | None = None,
+        poses: Mapping[str, torch.Tensor] | None = None,
+    ) -> torch.Tensor:
+        """(B, M) bool: the wanted lines of sight that nothing crosses; with the compiled engine.
+
+        From eyes (B, 3) to ends (B, M, 3) mm, world frame, distance_mm (B, M) apart; what a line
+        meets in its last short_mm does not count. Arms, own and poses are those of `cast`.
+        """
+        eyes, clear = eyes_mm.contiguous().numpy(), wanted.clone()
+        ends, distance = ends_mm.numpy(), distance_mm.numpy()
+        flags = clear.numpy()
+        for name, line in (arms or {}).items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            chain = _held(line).numpy(), radius, gap
+            hide_behind_chain(eyes, ends, distance, short_mm, *chain, wanted.numpy(), flags)
+        for body, tree in zip(self.bodies, self._trees, strict=True):
+            turn, shift = (t.numpy() for t in self._inward(body, poses))
+            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree.arrays, flags)
+        return clear
+
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
         """World to body: rotations (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
         pose = (poses or {}).get(body.name)
-        pose = torch.tensor(np.array(body.pose))[None] if pose is None else pose.detach()
+        return self._at_home[body.name] if pose is None else self._inverse(pose.detach())
+
+    def _inverse(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         inward = frames.invert(pose.to(self.device, torch.float64))
         return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
-        if not self._compiled:
+        if not self.compiled:
             return chains_apart_torch(first, second, radii, self.horizon_mm)
         out = torch.empty(len(first), dtype=first.dtype)
         chains_apart(first.numpy(), second.numpy(), radii, self.horizon_mm, out.numpy())
@@ -192,35 +283,19 @@ class BatchedScene:
 
     def _folded(self, line, radius: float) -> torch.Tensor:
         gap = self_contact_gap_mm(radius)
-        if not self._compiled:
+        if not self.compiled:
             return chains_folded_torch(line, radius, gap, self.horizon_mm)
         out = torch.empty(len(line), dtype=line.dtype)
         chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
         return out
 
-    def _chain_hits(self, origins, aims, line, radius, gap, best):
-        if not self._compiled:
-            return rays_to_chains_torch(origins, aims, line, radius, gap, best)
-        distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
-        rays_to_chains(
-            origins.numpy(),
-            aims.numpy(),
-            line.numpy(),
-            radius,
-            gap,
-            distance.numpy(),
-            segment.numpy(),
-        )
-        return distance, segment
-
 
 class CompiledSurface:
-    """One body's surface on the CPU: compiled clearance queries, rays by Embree."""
+    """One body's surface on the CPU, for clearance queries."""
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree, self._field = tree, field
         self._closed = tree.mesh.is_watertight
-        self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
     def clearance(
@@ -258,12 +333,10 @@ class CompiledSurface:
         )
         return out
 
-    def first_hit(
-        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
-        distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
-        return torch.from_numpy(distance), torch.from_numpy(face)
+
+def _pose_of(body: Body) -> torch.Tensor:
+    """(1, 4, 4) body to world, where the scene puts the body."""
+    return torch.tensor(np.array(body.pose))[None]
 
 
 def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -271,13 +344,21 @@ def refined(lines: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
     The field gives tight bounds on short segments only. The new points lie on the old segments.
     """
-    steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
-    longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
+    if lines.device.type == "cpu":
+        longest = torch.zeros(lines.shape[1] - 1, dtype=lines.dtype)
+        longest_steps(lines.numpy(), longest.numpy())
+    else:
+        steps = frames.norm(lines[:, 1:] - lines[:, :-1]).nan_to_num(0.0, 0.0, 0.0)
+        longest = steps.amax(0) if len(lines) else steps.new_zeros(steps.shape[1])
     parts = (longest / LONGEST_SEGMENT_MM).ceil().clamp(1, MOST_PARTS).int().tolist()
     given = torch.zeros(sum(parts) + 1, dtype=torch.bool, device=lines.device)
     given[torch.tensor([0, *parts], device=lines.device).cumsum(0)] = True
     if max(parts) == 1:
         return lines, given
+    if lines.device.type == "cpu":
+        fine = torch.empty((len(lines), len(given), 3), dtype=lines.dtype)
+        divide_steps(lines.numpy(), np.array(parts), fine.numpy())
+        return fine, given
     pieces = [lines[:, :1]]
     for k, count in enumerate(parts):
         share = torch.arange(1, count + 1, device=lines.device, dtype=lines.dtype) / count

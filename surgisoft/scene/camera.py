@@ -16,9 +16,12 @@ import torch
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.scene.sight import points_in_picture
 
 LIFT_MM = 0.05
 """Lines of sight end this far above the surface, so that it does not hide its own points (mm)."""
+SHORT_MM = 0.1 * LIFT_MM
+"""What a line of sight meets this near to its end does not hide the point (mm)."""
 
 
 @dataclass(frozen=True)
@@ -73,17 +76,38 @@ def view(
     further keywords go to `cast`.
     """
     points, normals = _like(pose, points_mm), _like(pose, normals)
-    lib = torch if isinstance(pose, torch.Tensor) else np
-    eye, axis = pose[..., None, :3, 3], pose[..., None, :3, 2]
-    rays = points + LIFT_MM * normals - eye
+    eye, axis = pose[..., :3, 3], pose[..., :3, 2]
+    return seen_from(caster, camera, eye, axis, points, normals, arms, own, **where)
+
+
+def seen_from(
+    caster: Any,
+    camera: Camera,
+    eye_mm: Any,
+    axis: Any,
+    points_mm: Any,
+    normals: Any,
+    arms: Mapping[str, Any] | None = None,
+    own: str | None = None,
+    **where: Any,
+) -> View:
+    """Which points (..., M, 3) mm a camera at eye_mm (..., 3) along axis (..., 3) sees.
+
+    As `view`, whose poses also say how the picture is turned, which does not matter here.
+    """
+    if isinstance(eye_mm, torch.Tensor) and getattr(caster, "compiled", False):
+        return _compiled_view(caster, camera, eye_mm, axis, points_mm, normals, arms, own, where)
+    lib = torch if isinstance(eye_mm, torch.Tensor) else np
+    eye, axis = eye_mm[..., None, :], axis[..., None, :]
+    rays = points_mm + LIFT_MM * normals - eye
     distance = frames.norm(rays)
     near, far = camera.range_mm
     in_view = frames.angle_between(axis + 0.0 * rays, rays) <= 0.5 * camera.fov_rad
     in_view = in_view & (distance >= near) & (distance <= far)
     hit = caster.cast(eye + 0.0 * rays, rays, 1.01 * far, arms, own, **where)
-    clear = hit.distance_mm >= distance - 0.1 * LIFT_MM
+    clear = hit.distance_mm >= distance - SHORT_MM
     visible = in_view & clear
-    to_middle = points.mean(-2) - eye[..., 0, :]
+    to_middle = points_mm.mean(-2) - eye[..., 0, :]
     error = frames.angle_between(axis[..., 0, :] + 0.0 * to_middle, to_middle)
     reach = frames.norm(to_middle)
     return View(
@@ -92,6 +116,42 @@ def view(
         fraction=visible.mean(-1) if lib is np else visible.to(reach.dtype).mean(-1),
         axis_error_rad=error,
         axis_error_mm=reach * lib.sin(error.clip(0.0, 0.5 * math.pi)),
+        distance_mm=reach,
+    )
+
+
+def _compiled_view(caster, camera, eye, axis, points, normals, arms, own, where) -> View:
+    """`seen_from` for tensors (B, ...) on the CPU, where `caster` is a compiled `BatchedScene`."""
+    eye, axis, points, normals = (t.detach() for t in (eye, axis, points, normals))
+    count, each = len(eye), points.shape[-2]
+    points, normals = points.expand(count, each, 3), normals.expand(count, each, 3)
+    ends = torch.empty((count, each, 3), dtype=torch.float64)
+    distance = torch.empty((count, each), dtype=torch.float64)
+    wanted = torch.empty((count, each), dtype=torch.bool)
+    middle = torch.empty((count, 2), dtype=eye.dtype)
+    near, far = camera.range_mm
+    points_in_picture(
+        eye.contiguous().numpy(),
+        axis.contiguous().numpy(),
+        points.contiguous().numpy(),
+        normals.contiguous().numpy(),
+        LIFT_MM,
+        0.5 * camera.fov_rad,
+        float(near),
+        float(far),
+        ends.numpy(),
+        wanted.numpy(),
+        distance.numpy(),
+        middle.numpy(),
+    )
+    clear = caster.clear_lines(eye, ends, distance, SHORT_MM, wanted, arms, own, **where)
+    error, reach = middle.unbind(1)
+    return View(
+        visible=clear,
+        hidden=wanted & ~clear,
+        fraction=clear.to(eye.dtype).mean(-1),
+        axis_error_rad=error,
+        axis_error_mm=reach * error.clamp(0.0, 0.5 * math.pi).sin(),
         distance_mm=reach,
     )
 

@@ -1,6 +1,8 @@
-"""Check a whole scene with FCL: meshes, lesion, both arms at rest and at work, the view."""
+"""Check a whole scene with FCL: meshes, lesion, all arms at rest and at work, the view."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,14 +24,17 @@ from surgisoft.scene.lesion import (
 )
 from surgisoft.scene.mounted_arm import (
     LANDED_MM,
+    TOUCHED_MM,
     EndoscopePose,
     MountedArm,
     RingSolution,
+    TouchPose,
     look_at_lesion,
+    ring_moments,
     solve_ring,
+    touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import TOOLS
 
 REASONS = ("can be cut", "out of reach", "too steep", "beam blocked", "no clearance", "arm jumps")
 """Meaning of a ring point's code; a point gets the first that applies after the first entry."""
@@ -58,23 +63,35 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Both arms at work, point by point of the ring (M of them)."""
+    """All arms at work, by name: lasers go round the ring of M points, evenly spread over it.
 
-    reason: np.ndarray
-    """(M,) int: index into REASONS of each ring point."""
-    cut: RingSolution
-    """Inverse kinematics of the laser arm around the ring."""
-    look: EndoscopePose
-    """The endoscope arm turned to the lesion."""
+    At moment i the first laser's beam is on point i. Endoscopes look at the lesion; plain tips are
+    at rest, after they have touched it one after another.
+    """
+
+    reasons: dict[str, np.ndarray]
+    """Laser -> (M,) int: index into REASONS of each ring point."""
+    cuts: dict[str, RingSolution]
+    """Laser -> inverse kinematics around the ring."""
+    looks: dict[str, EndoscopePose]
+    """Endoscope -> the arm turned to the lesion."""
+    touches: dict[str, TouchPose]
+    """Arm with a plain tip -> the tip at the lesion."""
     clearance_mm: np.ndarray
-    """(M,) mm: smallest clearance of both arms with the beam on each point; -1 for contact."""
-    view: np.ndarray
-    """(M / VIEW_EVERY,) fraction of the ring in view with the beam on every VIEW_EVERYth point."""
+    """(M,) mm: smallest clearance of all arms at each moment; -1 for contact. (1,) without laser.
+    """
+    views: dict[str, np.ndarray]
+    """Endoscope -> (M / VIEW_EVERY,) fraction of the ring in view at every VIEW_EVERYth moment."""
 
     @property
     def covered(self) -> float:
-        """Fraction of the ring that can be cut."""
-        return float(np.mean(self.reason == 0))
+        """Fraction of the ring that the worst laser can cut; 1 without a laser."""
+        return min((float(np.mean(reason == 0)) for reason in self.reasons.values()), default=1.0)
+
+    @property
+    def viewed(self) -> float:
+        """Smallest fraction of the ring in an endoscope's view; 1 without an endoscope."""
+        return min((float(view.min()) for view in self.views.values()), default=1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +111,31 @@ class SceneCheck:
 
 def sentence(check: SceneCheck) -> str:
     """The result in one sentence."""
-    if check.good and check.work is not None:
-        return (
-            f"The scene is ready: the laser reaches {100 * check.work.covered:.0f} % of the ring, "
-            f"the endoscope sees {100 * check.work.view.min():.0f} % of it, nothing comes closer "
-            f"than {check.work.clearance_mm.min():.1f} mm."
-        )
+    work = check.work
+    if check.good and work is not None:
+        parts = [
+            f"{_each('laser', work.reasons)} reaches {100 * work.covered:.0f} % of the ring"
+            if work.reasons
+            else "",
+            f"{_each('endoscope', work.views)} sees {100 * work.viewed:.0f} % of it"
+            if work.views
+            else "",
+            f"{_each('plain tip', work.touches)} reaches the lesion" if work.touches else "",
+            f"nothing comes closer than {work.clearance_mm.min():.1f} mm",
+        ]
+        return f"The scene is ready: {', '.join(part for part in parts if part)}."
     bad = [f"{f.what}: {f.value} (needs {f.wanted})" for f in check.findings if not f.good]
     return f"The scene is not ready: {'; '.join(bad)}."
 
 
+def _each(tool: str, arms: Mapping[str, Any]) -> str:
+    """`the laser`, or `each laser` of several."""
+    return f"the {tool}" if len(arms) == 1 else f"each {tool}"
+
+
 def mounted_arms(scene: Scene, reaches: dict[str, ArmReach]) -> dict[str, MountedArm]:
-    """Both arms at their mounts, by tool."""
-    return {tool: MountedArm.at(scene.spec.mount(tool), reaches[tool]) for tool in TOOLS}
+    """All arms at their mounts, by name."""
+    return {name: MountedArm.at(mount, reaches[name]) for name, mount in scene.spec.arms.items()}
 
 
 def check_scene(
@@ -116,7 +145,7 @@ def check_scene(
 ) -> SceneCheck:
     """Check everything that a task relies on, by FCL on the meshes themselves.
 
-    `reaches` holds the arms' reach tables by tool.
+    `reaches` holds the arms' reach tables by name.
     """
     findings: tuple[Finding, ...] = (*_mesh_findings(scene), _lesion_finding(scene))
     if not findings[-1].good:
@@ -124,7 +153,8 @@ def check_scene(
     findings = (*findings, *_neighbour_findings(scene))
     checker, arms = CollisionChecker(scene.bodies), mounted_arms(scene, reaches)
     work = _work(scene, checker, arms, report)
-    report(len(work.reason) + 1, len(work.reason) + 2, "paths from rest")
+    moments = len(work.clearance_mm)
+    report(moments + 1, moments + 2, "paths from rest")
     ways = _way_finding(scene, checker, arms, work)
     return SceneCheck((*findings, *_work_findings(scene, work), ways), work)
 
@@ -132,28 +162,60 @@ def check_scene(
 def _work(
     scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], report: Progress
 ) -> Work:
-    """Move the laser once around the ring while the endoscope looks at it."""
-    limits, ring = scene.spec.limits, scene.ring
-    cut = solve_ring(arms["laser"], ring, scene.spec.laser)
-    look = look_at_lesion(arms["endoscope"], ring, scene.spec.camera)
-    radius = {tool: arms[tool].reach.radius_mm for tool in TOOLS}
-    scope = ArmShape(look.line_mm, radius["endoscope"])
-    shapes = [ArmShape(line, radius["laser"]) for line in cut.lines_mm]
-    clearance, landed = np.empty(len(shapes)), np.zeros(len(shapes), dtype=bool)
-    for i, shape in enumerate(shapes):
-        both = {"laser": shape, "endoscope": scope}
-        clearance[i] = -1.0 if checker.collisions(both) else checker.clearance(both).least_mm
-        reach_mm = max(cut.standoff_mm[i], 0.0) + 50.0
-        hit = checker.cast(cut.lines_mm[i, -1], cut.directions[i], reach_mm, both, own="laser")
-        landed[i] = bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[i]) <= LANDED_MM
-        report(i + 1, len(shapes) + 2, "ring")
+    """Move the lasers once around the ring while the endoscopes look at it."""
+    spec, ring = scene.spec, scene.ring
+    limits = spec.limits
+    cuts = {name: solve_ring(arms[name], ring, spec.laser) for name in spec.arms_with("laser")}
+    looks = {
+        name: look_at_lesion(arms[name], ring, spec.camera) for name in spec.arms_with("endoscope")
+    }
+    touches = {
+        name: touch_lesion(arms[name], ring, limits.clearance_mm) for name in spec.arms_with("tip")
+    }
+    still = {name: look.line_mm for name, look in looks.items()}
+    still |= {name: touch.way_mm[0] for name, touch in touches.items()}
+    held = {name: ArmShape(line, arms[name].reach.radius_mm) for name, line in still.items()}
+    count = len(ring.points_mm)
+    points = ring_moments(count, len(cuts))[: count if cuts else 1]
+    scenes = [
+        {
+            name: ArmShape(cuts[name].lines_mm[i], arms[name].reach.radius_mm)
+            for name, i in zip(cuts, row, strict=True)
+        }
+        | held
+        for row in points
+    ]
+    clearance = np.empty(len(scenes))
+    landed = {name: np.zeros(count, dtype=bool) for name in cuts}
+    for moment, (row, shapes) in enumerate(zip(points, scenes, strict=True)):
+        touching = checker.collisions(shapes)
+        clearance[moment] = -1.0 if touching else checker.clearance(shapes).least_mm
+        for (name, cut), i in zip(cuts.items(), row, strict=True):
+            landed[name][i] = _lands(checker, cut, i, shapes, name)
+        report(moment + 1, len(scenes) + 2, "ring")
     # The arm moves to both neighbouring points. No point of it is then farther than half a step
     # from a checked shape. A step must be short compared with the arm's thickness.
-    step = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1))
-    close = clearance < np.maximum(limits.clearance_mm, 0.5 * step)
-    tests = (~cut.in_reach, cut.steep, ~landed, close, step > 0.5 * radius["laser"])
-    reason = np.select(tests, range(1, len(REASONS)), 0)
-    return Work(reason, cut, look, clearance, _view(checker, look, shapes, scene))
+    reasons = {}
+    for k, (name, cut) in enumerate(cuts.items()):
+        near = np.empty(count)
+        near[points[:, k]] = clearance
+        step = np.maximum(cut.step_mm, np.roll(cut.step_mm, 1))
+        close = near < np.maximum(limits.clearance_mm, 0.5 * step)
+        jumps = step > 0.5 * arms[name].reach.radius_mm
+        tests = (~cut.in_reach, cut.steep, ~landed[name], close, jumps)
+        reasons[name] = np.select(tests, range(1, len(REASONS)), 0)
+    views = {name: _view(checker, name, look, scenes, scene) for name, look in looks.items()}
+    return Work(reasons, cuts, looks, touches, clearance, views)
+
+
+def _lands(
+    checker: CollisionChecker, cut: RingSolution, point: int, shapes: dict[str, ArmShape], name: str
+) -> bool:
+    """Whether a laser's beam ends at its ring point, with all arms in their shapes."""
+    reach_mm = max(cut.standoff_mm[point], 0.0) + 50.0
+    origin, aim = cut.lines_mm[point, -1], cut.directions[point]
+    hit = checker.cast(origin, aim, reach_mm, shapes, own=name)
+    return bool(hit.on_organ) and abs(hit.distance_mm - cut.standoff_mm[point]) <= LANDED_MM
 
 
 def _mesh_findings(scene: Scene) -> tuple[Finding, ...]:
@@ -209,43 +271,52 @@ def _neighbour_findings(scene: Scene) -> tuple[Finding, ...]:
 
 def _work_findings(scene: Scene, work: Work) -> tuple[Finding, ...]:
     limits, (low, high) = scene.spec.limits, scene.spec.camera.range_mm
-    lacking = [
-        f"{100 * np.mean(work.reason == code):.0f} % {REASONS[code]}"
-        for code in np.unique(work.reason[work.reason > 0])
-    ]
-    least, view_least = float(work.clearance_mm.min()), float(work.view.min())
-    return (
-        Finding(
-            "ring in the laser's reach",
-            ", ".join((f"{100 * work.covered:.0f} %", *lacking)),
-            "100 %",
-            not lacking,
-        ),
+    least, rows = float(work.clearance_mm.min()), []
+    for name, reason in work.reasons.items():
+        lacking = [
+            f"{100 * np.mean(reason == code):.0f} % {REASONS[code]}"
+            for code in np.unique(reason[reason > 0])
+        ]
+        whose = "the laser's reach" if len(work.reasons) == 1 else f"reach of {name}"
+        covered = ", ".join((f"{100 * np.mean(reason == 0):.0f} %", *lacking))
+        rows.append(Finding(f"ring in {whose}", covered, "100 %", not lacking))
+    rows.append(
         Finding(
             "clearance at work",
             f"{least:.1f} mm" if least >= 0.0 else "touches",
             f"{limits.clearance_mm:g} mm",
             least >= limits.clearance_mm,
-        ),
-        Finding(
-            "ring in view",
-            f"{100 * view_least:.0f} %",
-            f"{100 * limits.view_fraction:.0f} %",
-            view_least >= limits.view_fraction,
-        ),
-        Finding(
-            "camera to lesion",
-            f"{work.look.distance_mm:.0f} mm",
-            f"{low:g} to {high:g} mm",
-            low <= work.look.distance_mm <= high,
-        ),
+        )
     )
+    for name, look in work.looks.items():
+        seen = float(work.views[name].min())
+        several = len(work.looks) > 1
+        rows.append(
+            Finding(
+                f"ring in view of {name}" if several else "ring in view",
+                f"{100 * seen:.0f} %",
+                f"{100 * limits.view_fraction:.0f} %",
+                seen >= limits.view_fraction,
+            )
+        )
+        rows.append(
+            Finding(
+                f"{name} to lesion" if several else "camera to lesion",
+                f"{look.distance_mm:.0f} mm",
+                f"{low:g} to {high:g} mm",
+                low <= look.distance_mm <= high,
+            )
+        )
+    for name, touch in work.touches.items():
+        value = f"{touch.miss_mm:.1f} mm off its place"
+        rows.append(Finding(f"{name} at the lesion", value, f"{TOUCHED_MM:g} mm", touch.reached))
+    return tuple(rows)
 
 
 def _way_finding(
     scene: Scene, checker: CollisionChecker, arms: dict[str, MountedArm], work: Work
 ) -> Finding:
-    touching, least, half_step = _ways(checker, arms, work.cut, work.look)
+    touching, least, half_step = _ways(checker, arms, work)
     clearance = scene.spec.limits.clearance_mm
     return Finding(
         "contacts at rest and on the path",
@@ -256,46 +327,64 @@ def _way_finding(
 
 
 def _view(
-    checker: CollisionChecker, look: EndoscopePose, shapes: list[ArmShape], scene: Scene
+    checker: CollisionChecker,
+    name: str,
+    look: EndoscopePose,
+    scenes: list[dict[str, ArmShape]],
+    scene: Scene,
 ) -> np.ndarray:
-    """Fraction of ring points in view with the laser on every VIEW_EVERYth of them."""
+    """Fraction of ring points in view of an endoscope at every VIEW_EVERYth moment."""
     camera, ring = scene.spec.camera.camera(), scene.ring
     looks = (
-        view(checker, camera, look.pose, ring.points_mm, ring.normals, {"laser": shape})
-        for shape in shapes[::VIEW_EVERY]
+        view(
+            checker,
+            camera,
+            look.pose,
+            ring.points_mm,
+            ring.normals,
+            {other: shape for other, shape in shapes.items() if other != name},
+        )
+        for shapes in scenes[::VIEW_EVERY]
     )
     return np.array([one.fraction for one in looks])
 
 
-def _ways(
-    checker: CollisionChecker, arms: dict[str, MountedArm], cut: RingSolution, look: EndoscopePose
-):
-    """Contacts at rest and on the path to the lesion, endoscope first; smallest clearance (mm).
+def _ways(checker: CollisionChecker, arms: dict[str, MountedArm], work: Work):
+    """Contacts at rest and on the paths to the lesion, endoscopes first; smallest clearance.
 
-    The third result is half the largest step (mm). Between two checked shapes no point of an arm is
-    farther than that from one of them, so with a larger clearance no contact is missed.
+    Each plain tip goes back to rest before the next arm moves. The third result is half the largest
+    step (mm). Between two checked shapes no point of an arm is farther than that from one of them,
+    so with a larger clearance no contact is missed.
     """
-    scope_way = arms["endoscope"].lines(arms["endoscope"].approach(look.commands))[0]
-    laser_way = arms["laser"].lines(arms["laser"].approach(cut.centre))[0]
-    moments = [(laser_way[0], line) for line in scope_way]
-    moments += [(line, scope_way[-1]) for line in laser_way]
+    ways = {
+        name: arms[name].lines(arms[name].approach(look.commands))[0]
+        for name, look in work.looks.items()
+    }
+    ways |= {name: touch.way_mm for name, touch in work.touches.items()}
+    ways |= {
+        name: arms[name].lines(arms[name].approach(cut.centre))[0]
+        for name, cut in work.cuts.items()
+    }
+    stand = {name: way[0] for name, way in ways.items()}
+    moments = []
+    for name, way in ways.items():
+        moments += [stand | {name: line} for line in way]
+        if name not in work.touches:
+            stand[name] = way[-1]
     touching: dict[str, None] = {}
     least = np.inf
-    for laser_line, scope_line in moments:
-        both = {
-            "laser": ArmShape(laser_line, arms["laser"].reach.radius_mm),
-            "endoscope": ArmShape(scope_line, arms["endoscope"].reach.radius_mm),
-        }
-        for collision in checker.collisions(both):
+    for lines in moments:
+        shapes = {name: ArmShape(lines[name], arms[name].reach.radius_mm) for name in arms}
+        for collision in checker.collisions(shapes):
             touching[f"{collision.arm} touches {collision.other}"] = None
-        least = min(least, checker.clearance(both).least_mm)
-    steps = [np.linalg.norm(np.diff(w, axis=0), axis=-1).max() for w in (scope_way, laser_way)]
+        least = min(least, checker.clearance(shapes).least_mm)
+    steps = [np.linalg.norm(np.diff(way, axis=0), axis=-1).max() for way in ways.values()]
     return list(touching), float(least), 0.5 * float(max(steps))
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Reachability of the surface around the lesion for the laser arm."""
+    """Reachability of the surface around the lesion for one laser."""
 
     flat_mm: np.ndarray
     """(N, 2) places in the plane of the lesion (mm), its centre at (0, 0)."""
@@ -307,12 +396,17 @@ class Patch:
     """(M, 2) the ring in the same plane (mm)."""
 
 
-def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> Patch:
-    """Reach and incidence on circles about the lesion's centre, out to 1.6 of its diameter."""
+def reach_patch(
+    scene: Scene, reaches: dict[str, ArmReach], count: int = 48, name: str = "laser"
+) -> Patch:
+    """Reach and incidence on circles about the lesion's centre, out to 1.6 of its diameter.
+
+    name: of the laser arm; no other arm stands in its way.
+    """
     mesh, ring, laser = scene.organ.world_mesh, scene.ring, scene.spec.laser
-    arm = mounted_arms(scene, reaches)["laser"]
+    arm = MountedArm.at(scene.spec.mount(name), reaches[name])
     _, face = nearest_on_surface(mesh, ring.centre_mm[None])
-    engine = BatchedScene(scene.bodies, {"laser": arm.reach.radius_mm}, most_nodes=PLANNING_NODES)
+    engine = BatchedScene(scene.bodies, {name: arm.reach.radius_mm}, most_nodes=PLANNING_NODES)
     plane = frames.rotation_from_z(ring.normal)
     flat, reasons, incidences = [], [], []
     for share in PATCH_SHARES:
@@ -327,12 +421,12 @@ def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> 
             lines[:, -1],
             torch.from_numpy(cut.directions),
             laser.standoff_mm[1] + 50.0,
-            {"laser": lines},
-            own="laser",
+            {name: lines},
+            own=name,
         )
         away = np.abs(hit.distance_mm.numpy() - cut.standoff_mm)
         blocked = ~(hit.on_organ.numpy() & (away <= LANDED_MM))
-        near = engine.clearance({"laser": lines}).least_mm.numpy()
+        near = engine.clearance({name: lines}).least_mm.numpy()
         tests = (~cut.in_reach, cut.steep, blocked, near < scene.spec.limits.clearance_mm)
         reasons.append(np.select(tests, range(1, 5), 0))
         incidences.append(cut.incidence_rad)
@@ -343,3 +437,9 @@ def reach_patch(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> 
         np.concatenate(incidences),
         ((ring.points_mm - ring.centre_mm) @ plane)[:, :2],
     )
+
+
+def reach_patches(scene: Scene, reaches: dict[str, ArmReach], count: int = 48) -> dict[str, Patch]:
+    """`reach_patch` of each laser of a scene, by name."""
+    lasers = scene.spec.arms_with("laser")
+    return {name: reach_patch(scene, reaches, count, name) for name in lasers}

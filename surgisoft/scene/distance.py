@@ -102,25 +102,79 @@ def _gap(p, q):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
-def _line_bounds(line, given, values_at, lows, values, origin, cell, band, slack):
-    """Smallest field value at the points, and the smallest lower bound of any segment (mm).
+GROUP = 5
+"""Points of a centreline that one lookup in the field may rule out together (a count)."""
 
-    line: (K, 3) in the body's frame; fills values_at (K,) and the bounds lows (K - 1,). On a
-    segment of length L between field values u and v every distance is at least
-    (u + v - L) / 2 - slack.
+
+@compiled
+def _least_distance(value, band, slack, most):
+    """Lower bound (mm) of the distance where the field has a value, at most `most`.
+
+    Where the surface is nearer than band - 2 slack all eight nodes around are exact. Elsewhere a
+    node's value may be too large by twice the way to the next coarse node, which is 8 slack.
     """
-    estimate, lowest = math.inf, math.inf
+    if value <= band - 2.0 * slack:
+        return value - slack
+    return min(max(band - 2.0 * slack, value - 9.0 * slack), most)
+
+
+@compiled
+def _from_afar(
+    line, given, turn, shift, longest, values, origin, cell, band, slack, most, tree, bounds
+):
+    """Smallest field value at the points of a line (K, 3), and a lower bound of all values (mm).
+
+    One lookup in a group of points may rule out the others: where the distance is at least d, a
+    field value r away is at least d - r - slack. The distance is at least that to the body's box,
+    too. Consecutive points are no farther apart than `longest`, mm. Values of `most` and above are
+    all alike. bounds (G,) is working memory.
+    """
+    count, groups = len(line), len(bounds)
+    estimate, least = most, most
+    for g in range(groups):
+        first = g * GROUP
+        last = min(first + GROUP, count)
+        middle = min(first + GROUP // 2, count - 1)
+        p = _moved(turn, shift, line[middle])
+        reach = max(middle - first, last - 1 - middle) * longest + slack
+        bounds[g] = math.sqrt(boxes_d2(p, p, tree[2], tree[3], 0)) - reach
+        if bounds[g] >= most:
+            continue
+        value = field_at(values, origin, cell, p)
+        estimate = min(estimate, value if given[middle] else abs(value))
+        least = min(least, value)
+        bounds[g] = max(bounds[g], _least_distance(value, band, slack, most) - reach)
+    for g in range(groups):
+        if bounds[g] >= estimate and bounds[g] > 0.0:
+            least = min(least, bounds[g])
+            continue
+        first = g * GROUP
+        middle = min(first + GROUP // 2, count - 1)
+        for k in range(first, min(first + GROUP, count)):
+            if k != middle:
+                value = field_at(values, origin, cell, _moved(turn, shift, line[k]))
+                estimate = min(estimate, value if given[k] else abs(value))
+                least = min(least, value)
+    return estimate, least
+
+
+@compiled
+def _line_bounds(line, values_at, lows, values, origin, cell, band, slack):
+    """Field values at the points (K,), and lower bounds of the segments' distances (K - 1,), mm.
+
+    line: (K, 3) in the body's frame. On a segment of length L between field values u and v every
+    distance is at least (u + v - L) / 2 - slack. Returns the smallest of the bounds.
+    """
+    lowest = math.inf
     for k in range(len(line)):
         p = (line[k, 0], line[k, 1], line[k, 2])
         values_at[k] = field_at(values, origin, cell, p)
-        estimate = min(estimate, values_at[k] if given[k] else abs(values_at[k]))
         if k > 0:
             o = (line[k - 1, 0], line[k - 1, 1], line[k - 1, 2])
             ends = min(values_at[k - 1], band) + min(values_at[k], band)
             lows[k - 1] = 0.5 * (ends - _gap(o, p)) - slack
             lowest = min(lowest, lows[k - 1])
-    return estimate, lowest
+    return lowest
 
 
 @compiled
@@ -181,69 +235,146 @@ def chains_to_surface(
     count, points, _ = lines.shape
     line = np.empty((points, 3))
     values_at, lows = np.empty(points), np.empty(points - 1)
+    bounds = np.empty((points + GROUP - 1) // GROUP)
     nodes, reach = np.empty(STACK, np.int64), np.empty(STACK)
     for b in range(count):
         pose = b if len(turns) > 1 else 0
-        total = 0.0
-        for k in range(points):
-            line[k, 0], line[k, 1], line[k, 2] = _moved(turns[pose], shifts[pose], lines[b, k])
-            total += line[k, 0] + line[k, 1] + line[k, 2]
+        longest, last = 0.0, _point(lines, b, 0)
+        total = last[0] + last[1] + last[2]
+        for k in range(1, points):
+            p = _point(lines, b, k)
+            total += p[0] + p[1] + p[2]
+            x, y, z = p[0] - last[0], p[1] - last[1], p[2] - last[2]
+            longest, last = max(longest, x * x + y * y + z * z), p
         if not math.isfinite(total):
             out[b] = math.nan
             continue
-        estimate, lowest = _line_bounds(
-            line, given, values_at, lows, values, origin, cell, band, slack
+        longest = math.sqrt(longest)
+        turn, shift = turns[pose], shifts[pose]
+        estimate, least = _from_afar(
+            lines[b],
+            given,
+            turn,
+            shift,
+            longest,
+            values,
+            origin,
+            cell,
+            band,
+            slack,
+            horizon + radius,
+            tree,
+            bounds,
         )
-        if lowest - radius <= within:
-            least = min(estimate + slack, horizon + radius)
-            estimate = _exact(
-                line,
-                given,
-                least,
-                values_at,
-                lows,
-                closed,
-                values,
-                origin,
-                cell,
-                slack,
-                tree,
-                nodes,
-                reach,
-            )
+        if min(least, band) - 0.5 * longest - slack - radius <= within:
+            for k in range(points):
+                line[k, 0], line[k, 1], line[k, 2] = _moved(turn, shift, lines[b, k])
+            lowest = _line_bounds(line, values_at, lows, values, origin, cell, band, slack)
+            if lowest - radius <= within:
+                best = min(estimate + slack, horizon + radius)
+                estimate = _exact(
+                    line,
+                    given,
+                    best,
+                    values_at,
+                    lows,
+                    closed,
+                    values,
+                    origin,
+                    cell,
+                    slack,
+                    tree,
+                    nodes,
+                    reach,
+                )
         out[b] = min(estimate - radius, horizon)
 
 
 @compiled
+def longest_steps(lines, longest):
+    """Longest step (mm) from each point of lines (B, K, 3) to the next, into longest (K - 1,)."""
+    for n in range(len(lines)):
+        for k in range(len(longest)):
+            length = _gap(_point(lines, n, k), _point(lines, n, k + 1))
+            if math.isfinite(length):
+                longest[k] = max(longest[k], length)
+
+
+@compiled
+def divide_steps(lines, parts, out):
+    """Lines (B, K, 3) with the step from point k divided into parts[k], into out (B, K', 3)."""
+    for n in range(len(lines)):
+        for i in range(3):
+            out[n, 0, i] = lines[n, 0, i]
+            place = 1
+            for k in range(len(parts)):
+                a, b = lines[n, k, i], lines[n, k + 1, i]
+                for step in range(1, parts[k]):
+                    out[n, place, i] = a + (step / parts[k]) * (b - a)
+                    place += 1
+                out[n, place, i] = b
+                place += 1
+
+
+BLOCK = 4
+"""Segments of an arm that one bound rules out together (a count)."""
+
+
+@compiled
+def _blocks(lines, n, fat):
+    """How far (mm) the points of each block of segments of line n lie from its chord, into (G,)."""
+    segments = lines.shape[1] - 1
+    for g in range(len(fat)):
+        first, last = g * BLOCK, min((g + 1) * BLOCK, segments)
+        p, q = _point(lines, n, first), _point(lines, n, last)
+        far = 0.0
+        for k in range(first + 1, last):
+            o = _point(lines, n, k)
+            far = max(far, segments_d2(o, o, p, q))
+        fat[g] = math.sqrt(far)
+
+
+@compiled
 def chains_apart(first, second, radii, horizon, out):
-    """Clearance (mm) between two arms (B, K, 3), (B, M, 3) into out (B,); radii is their sum."""
+    """Clearance (mm) between two arms (B, K, 3), (B, M, 3) into out (B,); radii is their sum.
+
+    A block of segments lies within a known distance of its chord. The pair of blocks whose chords
+    are nearest goes first, and what it finds rules out most of the others.
+    """
     rows, columns = first.shape[1] - 1, second.shape[1] - 1
-    middles, halves = np.empty((columns, 3)), np.empty(columns)
+    high, wide = (rows + BLOCK - 1) // BLOCK, (columns + BLOCK - 1) // BLOCK
+    fat_one, fat_two, bounds = np.empty(high), np.empty(wide), np.empty((high, wide))
     for n in range(len(out)):
-        for j in range(columns):
-            half = 0.0
-            for i in range(3):
-                a, b = np.float64(second[n, j, i]), np.float64(second[n, j + 1, i])
-                middles[j, i] = 0.5 * (a + b)
-                half += (b - a) * (b - a)
-            halves[j] = 0.5 * math.sqrt(half)
-        best = horizon + radii
         total = first[n].sum() + second[n].sum()
-        for i in range(rows):
-            p, q = _point(first, n, i), _point(first, n, i + 1)
-            middle = (0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2]))
-            half = 0.5 * _gap(p, q)
-            for j in range(columns):
-                x, y, z = (
-                    middles[j, 0] - middle[0],
-                    middles[j, 1] - middle[1],
-                    middles[j, 2] - middle[2],
-                )
-                reach = best + half + halves[j]
-                if x * x + y * y + z * z < reach * reach:
+        if not math.isfinite(total):
+            out[n] = math.nan
+            continue
+        _blocks(first, n, fat_one)
+        _blocks(second, n, fat_two)
+        nearest, at = math.inf, 0
+        for g in range(high):
+            p = _point(first, n, g * BLOCK)
+            q = _point(first, n, min((g + 1) * BLOCK, rows))
+            for h in range(wide):
+                a = _point(second, n, h * BLOCK)
+                b = _point(second, n, min((h + 1) * BLOCK, columns))
+                apart = math.sqrt(segments_d2(p, q, a, b))
+                bounds[g, h] = apart - fat_one[g] - fat_two[h]
+                if bounds[g, h] < nearest:
+                    nearest, at = bounds[g, h], g * wide + h
+        best = horizon + radii
+        for turn in range(-1, high * wide):
+            place = at if turn < 0 else turn
+            g, h = place // wide, place % wide
+            if bounds[g, h] >= best or turn == at:
+                continue
+            for i in range(g * BLOCK, min((g + 1) * BLOCK, rows)):
+                p, q = _point(first, n, i), _point(first, n, i + 1)
+                for j in range(h * BLOCK, min((h + 1) * BLOCK, columns)):
                     d2 = segments_d2(p, q, _point(second, n, j), _point(second, n, j + 1))
-                    best = min(best, math.sqrt(d2))
-        out[n] = best - radii if math.isfinite(total) else math.nan
+                    if d2 < best * best:
+                        best = math.sqrt(d2)
+        out[n] = best - radii
 
 
 @compiled
@@ -254,19 +385,42 @@ def _point(lines, n, k):
 
 @compiled
 def chains_folded(lines, radius, gap, horizon, out):
-    """Clearance (mm) of arms (B, K, 3) to themselves beyond `gap` mm of arc, into out (B,)."""
+    """Clearance (mm) of arms (B, K, 3) to themselves beyond `gap` mm of arc, into out (B,).
+
+    For each segment the nearest one along the arm that may touch it goes first: on a smooth arm
+    that is the nearest at all, and rules out the others.
+    """
     segments = lines.shape[1] - 1
-    arc = np.zeros(segments + 1)
+    arc, first = np.zeros(segments + 1), np.empty(segments, np.int64)
     for n in range(len(out)):
         for k in range(segments):
             arc[k + 1] = arc[k] + _gap(_point(lines, n, k), _point(lines, n, k + 1))
-        best = horizon + 2.0 * radius
+        if not math.isfinite(arc[segments]):
+            out[n] = math.nan
+            continue
+        best, j = horizon + 2.0 * radius, 0
         for i in range(segments):
-            p, q = _point(lines, n, i), _point(lines, n, i + 1)
-            for j in range(i + 1, segments):
-                if arc[j] - arc[i + 1] >= gap:
-                    a, b = _point(lines, n, j), _point(lines, n, j + 1)
-                    reach = best + (arc[i + 1] - arc[i]) + (arc[j + 1] - arc[j])
-                    if _gap(p, a) < reach:
-                        best = min(best, math.sqrt(segments_d2(p, q, a, b)))
-        out[n] = best - 2.0 * radius if math.isfinite(arc[segments]) else math.nan
+            j = max(j, i + 1)
+            while j < segments and not arc[j] - arc[i + 1] >= gap:
+                j += 1
+            first[i] = j
+            if j < segments:
+                best = _nearer(lines, n, i, j, best)
+        for i in range(segments):
+            p, half = _point(lines, n, i), arc[i + 1] - arc[i]
+            for j in range(first[i] + 1, segments):
+                reach = best + half + (arc[j + 1] - arc[j])
+                a = _point(lines, n, j)
+                x, y, z = a[0] - p[0], a[1] - p[1], a[2] - p[2]
+                if x * x + y * y + z * z < reach * reach:
+                    best = _nearer(lines, n, i, j, best)
+        out[n] = best - 2.0 * radius
+
+
+@compiled
+def _nearer(lines, n, i, j, best):
+    """The distance (mm) between segments i and j of line n, or `best` where that is less."""
+    d2 = segments_d2(
+        _point(lines, n, i), _point(lines, n, i + 1), _point(lines, n, j), _point(lines, n, j + 1)
+    )
+    return math.sqrt(d2) if d2 < best * best else best

@@ -1,4 +1,4 @@
-"""The part of the organ's surface around the lesion on which the laser's dose is stored.
+"""The part of the organ's surface on which the laser's dose is stored: around a ring, or paths.
 
 The mesh's faces are far coarser than a beam, so the faces near the ring are divided into small
 triangles, each of which stores the dose at its centroid. With edges up to `SPACING_WAISTS` of the
@@ -16,6 +16,7 @@ import numpy as np
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.scene.contours import SurfacePath, inside_outline
 from surgisoft.scene.inside import buried
 from surgisoft.scene.mesh import Mesh
 
@@ -33,7 +34,10 @@ MOST_SAMPLES = 400_000
 
 @dataclass(frozen=True, eq=False)
 class DosePatch:
-    """P sample triangles around a ring of N stations; frame of the mesh it was cut from."""
+    """P sample triangles around a ring of N stations; frame of the mesh it was cut from.
+
+    Of several paths (`path_patch`) the stations follow one another, and lengths are sums.
+    """
 
     points_mm: np.ndarray
     """(P, 3) float64 mm: centroids, sorted by bucket."""
@@ -145,6 +149,138 @@ def cut_patches(
         place = (one.offset[chosen], station, zone)
         patches.append(DosePatch(*shared, *place, stations, one.length, float(spacing_mm), buckets))
     return tuple(patches)
+
+
+def path_patch(
+    mesh: Mesh,
+    paths: Sequence[SurfacePath],
+    spacing_mm: float,
+    band_mm: float = 2.0,
+    margin_mm: float = 4.0,
+    station_mm: float = 0.5,
+) -> DosePatch:
+    """The patch of paths that are all to be treated in one episode.
+
+    LESION is inside of a closed path, RING the band of width band_mm along any path, HEALTHY all
+    else up to margin_mm from the paths. With band_mm 0 there is no ring; see `area_patch` for one
+    outside of the outline only. Each path has stations of about station_mm, one path after another.
+    """
+    samples = _path_samples(mesh, paths, spacing_mm, margin_mm)
+    zone = np.where(np.abs(samples.offset) <= 0.5 * band_mm, RING, samples.side)
+    patch = samples.patch(mesh, zone, spacing_mm, station_mm)
+    missed = patch.stations - len(np.unique(patch.station[patch.zone == RING]))
+    if missed:
+        raise InputError(
+            f"dose patch: {missed} stretches of the paths have no surface below them; move them"
+        )
+    return patch
+
+
+def area_patch(
+    mesh: Mesh,
+    outlines: Sequence[SurfacePath],
+    spacing_mm: float,
+    spared_mm: float,
+    margin_mm: float = 4.0,
+    station_mm: float = 0.5,
+) -> DosePatch:
+    """The patch of closed outlines whose insides are to be treated.
+
+    LESION is inside of an outline, RING the margin up to spared_mm outside, which may be treated or
+    not, HEALTHY all else up to margin_mm beyond that.
+    """
+    for outline in outlines:
+        if not outline.closed:
+            raise InputError(f"contour '{outline.name}' is open; an area needs a closed outline")
+    samples = _path_samples(mesh, outlines, spacing_mm, spared_mm + margin_mm)
+    between = (samples.side == HEALTHY) & (samples.offset <= spared_mm)
+    zone = np.where(between, RING, samples.side)
+    return samples.patch(mesh, zone, spacing_mm, station_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class _PathSamples:
+    """Samples (P, ...) near paths: the nearest path, the place along it, and the distance."""
+
+    points: np.ndarray
+    faces: np.ndarray
+    areas: np.ndarray
+    path: np.ndarray
+    along: np.ndarray
+    offset: np.ndarray
+    side: np.ndarray
+    """LESION inside of a closed path, else HEALTHY."""
+    lengths: tuple[float, ...]
+
+    def patch(self, mesh: Mesh, zone: np.ndarray, spacing: float, station: float) -> DosePatch:
+        """The patch with these zones (P,), sorted by bucket."""
+        order, buckets = _fill_buckets(self.points, max(2.0 * spacing, 0.5))
+        counts = np.array([max(4, round(length / station)) for length in self.lengths])
+        first = np.cumsum(counts) - counts
+        share = self.along / np.array(self.lengths)[self.path]
+        place = np.minimum((share * counts[self.path]).astype(np.int64), counts[self.path] - 1)
+        return DosePatch(
+            self.points[order],
+            np.array(mesh.face_normals[self.faces[order]]),
+            self.areas[order],
+            self.faces[order],
+            self.offset[order],
+            (first[self.path] + place)[order],
+            zone[order].astype(np.int8),
+            int(counts.sum()),
+            float(sum(self.lengths)),
+            float(spacing),
+            buckets,
+        )
+
+
+def _path_samples(
+    mesh: Mesh, paths: Sequence[SurfacePath], spacing: float, margin: float
+) -> _PathSamples:
+    """Samples inside the paths and within a margin (mm) of them."""
+    if not (spacing > 0.0 and margin > 0.0 and paths):
+        raise InputError(
+            f"dose patch: {len(paths)} paths, spacing {spacing} mm, margin {margin} mm; expected "
+            "at least one path and lengths above 0"
+        )
+    every = np.concatenate([path.points_mm for path in paths])
+    centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    reach = float(np.linalg.norm(every - centre, axis=1).max()) + margin
+    near = _faces_near(mesh, every, reach, centre)
+    points, faces, areas = _exposed(mesh, near, spacing, reach, centre)
+    best = np.full(len(points), np.inf)
+    owner, along = np.zeros(len(points), np.int64), np.zeros(len(points))
+    offset, inside = np.zeros(len(points)), np.zeros(len(points), dtype=bool)
+    for number, path in enumerate(paths):
+        line, normals = path.points_mm, path.normals
+        if path.closed:
+            line, normals = (np.vstack((each, each[:1])) for each in (line, normals))
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        arc, away, side = (np.empty(len(points)) for _ in range(3))
+        _nearest_on_line(points, line, normals, steps, arc, away, side)
+        below = normals[np.searchsorted(np.cumsum(steps), arc).clip(max=len(line) - 1)]
+        facing = frames.dot(mesh.face_normals[faces], below) > LEAST_FACING
+        within = np.zeros(len(points), dtype=bool)
+        if path.closed:
+            within = inside_outline(mesh, path.points_mm, points) & facing
+        inside |= within
+        nearer = (away < best) & facing
+        best, owner = np.where(nearer, away, best), np.where(nearer, number, owner)
+        along = np.where(nearer, arc, along)
+        offset = np.where(nearer, np.where(within, -away, away), offset)
+    kept = (best <= margin) | inside
+    if not kept.any():
+        raise InputError("dose patch: the paths lie nowhere near the organ's surface")
+    return _PathSamples(
+        points[kept],
+        faces[kept],
+        areas[kept],
+        owner[kept],
+        along[kept],
+        offset[kept],
+        np.where(inside, LESION, HEALTHY)[kept],
+        tuple(path.length_mm for path in paths),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,22 +408,23 @@ def _ring_coordinates(points, ring, normals, centre, steps):
 
     Negative is the side on which the centre lies, seen along the ring's normal there.
     """
+    ring, normals = (np.vstack((each, each[:1])) for each in (ring, normals))
     along, offset, side = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
-    _nearest_on_ring(points, ring, normals, steps, along, offset, side)
+    _nearest_on_line(points, ring, normals, steps, along, offset, side)
     at_centre = [np.empty(1) for _ in range(3)]
-    _nearest_on_ring(centre[None], ring, normals, steps, *at_centre)
+    _nearest_on_line(centre[None], ring, normals, steps, *at_centre)
     inward = 1.0 if at_centre[2][0] >= 0.0 else -1.0
     return along, np.where(side * inward > 0.0, -offset, offset)
 
 
 @compiled
-def _nearest_on_ring(points, ring, normals, steps, along, offset, side):
-    """Nearest point of the closed polyline: its arc length, the distance, and on which side."""
-    count = len(ring)
+def _nearest_on_line(points, ring, normals, steps, along, offset, side):
+    """Nearest point of the polyline: its arc length, the distance, and on which side."""
+    count = len(ring) - 1
     for p in range(len(points)):
         best, arc = np.inf, 0.0
         for m in range(count):
-            k = (m + 1) % count
+            k = m + 1
             ex, ey, ez = ring[k, 0] - ring[m, 0], ring[k, 1] - ring[m, 1], ring[k, 2] - ring[m, 2]
             x, y, z = (
                 points[p, 0] - ring[m, 0],

@@ -50,7 +50,13 @@ class Scene:
     @cached_property
     def content_hash(self) -> str:
         """sha256 in hex over the file's values and every mesh; comments do not count."""
-        digest = hashlib.sha256(tomli_w.dumps(to_table(self.spec)).encode())
+        table = to_table(self.spec)
+        for mount in table["mounts"]:
+            if not mount["name"]:
+                del mount["name"]  # scenes of before arms had names keep their hash
+        if not table["contours"]:
+            del table["contours"]
+        digest = hashlib.sha256(tomli_w.dumps(table).encode())
         for body in self.bodies:
             digest.update(body.mesh.content_hash.encode())
         return digest.hexdigest()

@@ -99,7 +99,7 @@ def circle_on(
     flat = centre_mm + radius * (
         np.cos(angle)[:, None] * side[:, 0] + np.sin(angle)[:, None] * side[:, 1]
     )
-    heights, faces = _drop(mesh, flat, centre_mm, normal, diameter_mm)
+    heights, faces = dropped(mesh, flat, centre_mm, normal, diameter_mm)
     if np.any(faces < 0):
         return None
     points = flat + heights[:, None] * normal
@@ -111,8 +111,14 @@ def circle_on(
     return Ring(np.asarray(centre_mm), normal, points, normals, faces)
 
 
-def _drop(mesh, flat, centre, normal, diameter):
-    """Height (M,) over the plane and face (M,) where lines along the normal meet the surface."""
+def dropped(
+    mesh: Mesh, flat: np.ndarray, centre: np.ndarray, normal: np.ndarray, diameter: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height (M,) mm over the plane and face (M,) where lines along the normal meet the surface.
+
+    flat (M, 3) mm lies in the plane through centre (3,) across the unit normal (3,), within half of
+    the diameter. Of several places the nearest to the plane counts; face -1 where there is none.
+    """
     corners = mesh.triangles_mm
     local = (corners - centre) @ frames.rotation_from_z(normal)
     plane = (flat - centre) @ frames.rotation_from_z(normal)

@@ -1,4 +1,4 @@
-"""An arm at its mount: the laser arm around the ring, the endoscope arm turned to the lesion.
+"""An arm at its mount: a laser around the ring, an endoscope turned to the lesion, a tip at it.
 
 The search of mounts evaluates thousands of mounts with these functions and the batched engine;
 `check` confirms the chosen ones with FCL. Everything is in the world frame.
@@ -10,13 +10,20 @@ import numpy as np
 
 from surgisoft.scene import frames
 from surgisoft.scene.lesion import Ring
-from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim
+from surgisoft.scene.reach import ArmReach, nearest_commands, solve_aim, solve_touch
 from surgisoft.scene.spec import CameraSpec, LaserSpec, MountSpec
 
 LANDED_MM = 0.3
 """The beam hits a point of the surface if it ends this near (mm): half the laser's spot."""
 APPROACH_STEPS = 24
 """Steps in which the path from rest to the lesion is checked."""
+TOUCH_STEPS = 96
+"""Steps in which the path of a plain tip is checked, which ends close to the organ."""
+TOUCH_GAP_MM = 0.5
+"""A plain tip has reached the lesion where its skin is this far beyond the scene's least clearance
+from the surface (mm): the last stretch is the contact itself."""
+TOUCHED_MM = 0.5
+"""Largest distance of a tip from the place to which it is sent (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +51,9 @@ class MountedArm:
         """World points (M, 3) mm in the base frame."""
         return frames.apply(frames.invert(self.pose), points_mm)
 
-    def approach(self, commands: np.ndarray) -> np.ndarray:
-        """Commands (APPROACH_STEPS, P) in a straight line from rest to `commands` (P,)."""
-        share = np.linspace(0.0, 1.0, APPROACH_STEPS)[:, None]
+    def approach(self, commands: np.ndarray, steps: int = APPROACH_STEPS) -> np.ndarray:
+        """Commands (steps, P) in a straight line from rest to `commands` (P,)."""
+        share = np.linspace(0.0, 1.0, steps)[:, None]
         return (1.0 - share) * self.reach.rest + share * commands
 
 
@@ -108,6 +115,12 @@ def solve_ring(arm: MountedArm, ring: Ring, laser: LaserSpec) -> RingSolution:
     )
 
 
+def ring_moments(count: int, lasers: int) -> np.ndarray:
+    """(count, lasers) int: the ring point of each laser at each moment, evenly spread."""
+    first = count * np.arange(lasers) // max(lasers, 1)
+    return (np.arange(count)[:, None] + first) % count
+
+
 @dataclass(frozen=True, eq=False)
 class EndoscopePose:
     """The endoscope arm turned to the lesion."""
@@ -140,3 +153,29 @@ def look_at_lesion(arm: MountedArm, ring: Ring, camera: CameraSpec) -> Endoscope
         float(np.linalg.norm(towards)),
         float(frames.angle_between(direction[0], towards)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class TouchPose:
+    """An arm with a plain tip at the lesion's centre, just before contact."""
+
+    commands: np.ndarray
+    """(P,) commands with the tip at its place, or nearest to it."""
+    way_mm: np.ndarray
+    """(TOUCH_STEPS, K, 3) centrelines from rest to there, world frame, shaft included."""
+    miss_mm: float
+    """Distance of the tip from its place (mm)."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the tip comes to its place."""
+        return self.miss_mm <= TOUCHED_MM
+
+
+def touch_lesion(arm: MountedArm, ring: Ring, clearance_mm: float) -> TouchPose:
+    """Solve an arm so that its tip is at the lesion's centre, `clearance_mm` and a gap above it."""
+    above = arm.reach.radius_mm + clearance_mm + TOUCH_GAP_MM
+    target = arm.inward((ring.centre_mm + above * ring.normal)[None])
+    commands, miss = solve_touch(arm.reach, target)
+    way, _ = arm.lines(arm.approach(commands[0], TOUCH_STEPS))
+    return TouchPose(commands[0], way, float(miss[0]))

@@ -1,12 +1,15 @@
-"""Search for the mounts of both arms: the laser covers the ring, the endoscope sees it, no contact.
+"""Search for the mounts of all arms, without contact: lasers cover the ring, endoscopes see it.
 
 Candidates are drawn from how the arm stands at work: the beam's direction and length, how much the
 arm is bent, and to which side. The batched engine evaluates the candidates of each arm alone; then
-the best of both arms are paired.
+the best of all arms are combined. Endoscopes go to work first, then each plain tip touches the
+lesion and withdraws, then the lasers cut, evenly spread over the ring.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,15 +23,19 @@ from surgisoft.scene.distance import chains_apart
 from surgisoft.scene.lesion import Ring
 from surgisoft.scene.mounted_arm import (
     LANDED_MM,
+    TOUCH_GAP_MM,
     EndoscopePose,
     MountedArm,
     RingSolution,
+    TouchPose,
     look_at_lesion,
     placed,
+    ring_moments,
     solve_ring,
+    touch_lesion,
 )
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec
+from surgisoft.scene.spec import CameraSpec, LaserSpec, LimitsSpec, MountSpec
 
 BENDS_RAD = np.radians([0.0, 25.0, 50.0])
 """How far the arm is bent when it looks at the lesion's centre (rad)."""
@@ -76,6 +83,30 @@ COMFORT_MM = 10.0
 """Clearance beyond this does not improve the score (mm)."""
 
 
+class Site(Protocol):
+    """A mount of an arm, evaluated without the other arms."""
+
+    @property
+    def arm(self) -> MountedArm:
+        """Reach, pose and shaft."""
+
+    @property
+    def score(self) -> float:
+        """Higher is better."""
+
+    @property
+    def way_mm(self) -> np.ndarray:
+        """(N, K, 3) mm: centrelines from rest to work."""
+
+    @property
+    def stays_mm(self) -> np.ndarray:
+        """(K, 3) mm: centreline while the arms that go to work later do so."""
+
+    @property
+    def work_mm(self) -> np.ndarray:
+        """(M, K, 3) mm: centrelines at work."""
+
+
 @dataclass(frozen=True, eq=False)
 class LaserSite:
     """A laser mount, evaluated on the ring."""
@@ -95,6 +126,21 @@ class LaserSite:
     score: float
     """Higher is better."""
 
+    @cached_property
+    def way_mm(self) -> np.ndarray:
+        """(N, K, 3) mm: centrelines from rest to the beam on the lesion's centre."""
+        return self.arm.lines(self.arm.approach(self.cut.centre))[0]
+
+    @property
+    def stays_mm(self) -> np.ndarray:
+        """(K, 3) mm: the beam on the lesion's centre."""
+        return self.way_mm[-1]
+
+    @property
+    def work_mm(self) -> np.ndarray:
+        """(M, K, 3) mm: around the ring."""
+        return self.cut.lines_mm
+
 
 @dataclass(frozen=True, eq=False)
 class EndoscopeSite:
@@ -110,6 +156,52 @@ class EndoscopeSite:
     """Smallest clearance at rest, on the path and at the lesion (mm)."""
     score: float
     """Higher is better."""
+
+    @cached_property
+    def way_mm(self) -> np.ndarray:
+        """(N, K, 3) mm: centrelines from rest to the camera on the lesion's centre."""
+        return self.arm.lines(self.arm.approach(self.look.commands))[0]
+
+    @property
+    def stays_mm(self) -> np.ndarray:
+        """(K, 3) mm: the camera on the lesion's centre."""
+        return self.look.line_mm
+
+    @property
+    def work_mm(self) -> np.ndarray:
+        """(1, K, 3) mm: the camera on the lesion's centre."""
+        return self.look.line_mm[None]
+
+
+@dataclass(frozen=True, eq=False)
+class TipSite:
+    """A mount of an arm with a plain tip, evaluated without the other arms."""
+
+    arm: MountedArm
+    """Reach, pose and shaft."""
+    touch: TouchPose
+    """The tip at the lesion."""
+    least_mm: float
+    """Smallest clearance at rest and on the path (mm)."""
+    good: bool
+    """Whether the tip reaches the lesion with the clearance."""
+    score: float
+    """Higher is better."""
+
+    @property
+    def way_mm(self) -> np.ndarray:
+        """(N, K, 3) mm: centrelines from rest to the lesion."""
+        return self.touch.way_mm
+
+    @property
+    def stays_mm(self) -> np.ndarray:
+        """(K, 3) mm: at rest, where the tip withdraws after the touch."""
+        return self.touch.way_mm[0]
+
+    @property
+    def work_mm(self) -> np.ndarray:
+        """(1, K, 3) mm: at rest, while the lasers work."""
+        return self.touch.way_mm[:1]
 
 
 def directions_around(normal: np.ndarray, tilts_rad: Iterable[float], turns: int) -> np.ndarray:
@@ -157,6 +249,7 @@ def mount_poses(
 
 def laser_sites(
     engine: BatchedScene,
+    name: str,
     reach: ArmReach,
     ring: Ring,
     laser: LaserSpec,
@@ -170,12 +263,15 @@ def laser_sites(
     distances = low + (high - low) * np.array([0.4, 0.6, 0.8])
     outward = directions_around(ring.normal, tilts, 10)
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
-    poses = _standing(engine, "laser", reach, poses, shaft_mm, limits, ring)
+    poses = _standing(engine, name, reach, poses, shaft_mm, limits, ring)
 
     def evaluate(pose: np.ndarray) -> LaserSite:
-        return _evaluate_laser(engine, MountedArm(reach, pose, shaft_mm), ring, laser, limits)
+        return _evaluate_laser(engine, name, MountedArm(reach, pose, shaft_mm), ring, laser, limits)
 
-    return _best_first(evaluate, poses, ring, lambda site: site.good.all(), report, "laser mounts")
+    def sufficient(site: LaserSite) -> bool:
+        return bool(site.good.all())
+
+    return _best_first(evaluate, poses, ring, sufficient, report, f"{name} mounts")
 
 
 def _best_first(evaluate, poses, ring: Ring, sufficient, report: Progress, note: str) -> list:
@@ -225,19 +321,21 @@ def _standing(engine, tool, reach, poses, shaft_mm, limits, ring) -> np.ndarray:
     return poses[kept]
 
 
-def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limits: LimitsSpec):
+def _evaluate_laser(
+    engine, name: str, arm: MountedArm, ring: Ring, laser: LaserSpec, limits: LimitsSpec
+):
     cut = solve_ring(arm, ring, laser)
     way, _ = arm.lines(arm.approach(cut.centre))
     lines = torch.from_numpy(np.concatenate((cut.lines_mm, way)))
-    found = engine.clearance({"laser": lines})
+    found = engine.clearance({name: lines})
     clearance = torch.minimum(found.bodies_mm.amin((1, 2)), found.self_mm.amin(1)).numpy()
     count = len(ring.points_mm)
     hit = engine.cast(
         torch.from_numpy(cut.lines_mm[:, -1]),
         torch.from_numpy(cut.directions),
         laser.standoff_mm[1] + 50.0,
-        {"laser": torch.from_numpy(cut.lines_mm)},
-        own="laser",
+        {name: torch.from_numpy(cut.lines_mm)},
+        own=name,
     )
     landed = hit.on_organ.numpy() & (np.abs(hit.distance_mm.numpy() - cut.standoff_mm) <= LANDED_MM)
     needed = np.maximum(limits.clearance_mm, 0.5 * np.maximum(cut.step_mm, np.roll(cut.step_mm, 1)))
@@ -262,6 +360,7 @@ def _evaluate_laser(engine, arm: MountedArm, ring: Ring, laser: LaserSpec, limit
 
 def endoscope_sites(
     engine: BatchedScene,
+    name: str,
     reach: ArmReach,
     ring: Ring,
     camera: CameraSpec,
@@ -276,15 +375,16 @@ def endoscope_sites(
     distances = nearest + (farthest - nearest) * np.array([0.15, 0.4, 0.75])
     outward = directions_around(ring.normal, np.radians([0.0, 20.0, 40.0, 60.0]), 12)
     poses = mount_poses(reach, ring.centre_mm, outward, distances)
-    poses = _standing(engine, "endoscope", reach, poses, shaft_mm, limits, ring)
+    poses = _standing(engine, name, reach, poses, shaft_mm, limits, ring)
 
     def evaluate(pose: np.ndarray) -> EndoscopeSite:
-        return _evaluate_endoscope(engine, MountedArm(reach, pose, shaft_mm), ring, camera, limits)
+        arm = MountedArm(reach, pose, shaft_mm)
+        return _evaluate_endoscope(engine, name, arm, ring, camera, limits)
 
     def sufficient(site: EndoscopeSite) -> bool:
         return sees(site, limits)
 
-    return _best_first(evaluate, poses, ring, sufficient, report, "endoscope mounts")
+    return _best_first(evaluate, poses, ring, sufficient, report, f"{name} mounts")
 
 
 def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
@@ -295,11 +395,11 @@ def sees(site: EndoscopeSite, limits: LimitsSpec) -> bool:
 
 
 def _evaluate_endoscope(
-    engine, arm: MountedArm, ring: Ring, camera: CameraSpec, limits: LimitsSpec
+    engine, name: str, arm: MountedArm, ring: Ring, camera: CameraSpec, limits: LimitsSpec
 ):
     look = look_at_lesion(arm, ring, camera)
     way, _ = arm.lines(arm.approach(look.commands))
-    found = engine.clearance({"endoscope": torch.from_numpy(way)})
+    found = engine.clearance({name: torch.from_numpy(way)})
     least = float(min(found.bodies_mm.min(), found.self_mm.min()))
     needed = max(limits.clearance_mm, 0.5 * np.linalg.norm(np.diff(way, axis=0), axis=-1).max())
     pose = torch.from_numpy(look.pose[None])
@@ -317,34 +417,83 @@ def _evaluate_endoscope(
     return EndoscopeSite(arm, look, visible, least, float(score))
 
 
-LASERS, LOOKS = 12, 40
-"""Number of the best laser and endoscope mounts that are paired."""
+def tip_sites(
+    engine: BatchedScene,
+    name: str,
+    reach: ArmReach,
+    ring: Ring,
+    limits: LimitsSpec,
+    shaft_mm: float,
+    report: Progress,
+) -> list[TipSite]:
+    """Mounts of an arm with a plain tip that touches the lesion's centre, best first."""
+    outward = directions_around(ring.normal, np.radians([0.0, 20.0, 40.0, 60.0]), 12)
+    above = np.array([reach.radius_mm + limits.clearance_mm + TOUCH_GAP_MM])
+    poses = mount_poses(reach, ring.centre_mm, outward, above)
+    poses = _standing(engine, name, reach, poses, shaft_mm, limits, ring)
+
+    def evaluate(pose: np.ndarray) -> TipSite:
+        return _evaluate_tip(engine, name, MountedArm(reach, pose, shaft_mm), ring, limits)
+
+    def sufficient(site: TipSite) -> bool:
+        return site.good
+
+    return _best_first(evaluate, poses, ring, sufficient, report, f"{name} mounts")
+
+
+def _evaluate_tip(engine, name: str, arm: MountedArm, ring: Ring, limits: LimitsSpec) -> TipSite:
+    touch = touch_lesion(arm, ring, limits.clearance_mm)
+    found = engine.clearance({name: torch.from_numpy(touch.way_mm)})
+    least = float(min(found.bodies_mm.min(), found.self_mm.min()))
+    step = np.linalg.norm(np.diff(touch.way_mm, axis=0), axis=-1).max()
+    good = touch.reached and least >= max(limits.clearance_mm, 0.5 * step)
+    base = frames.normalise(arm.pose[:3, 3] - ring.centre_mm)
+    spare = np.min(np.abs(touch.commands - arm.reach.bounds) / arm.reach.span)
+    score = (
+        WEIGHTS.covered * good
+        + WEIGHTS.clearance * min(max(least, -COMFORT_MM), COMFORT_MM) / COMFORT_MM
+        + WEIGHTS.above * base[2]
+        + WEIGHTS.spare * spare
+        - min(touch.miss_mm, COMFORT_MM)
+    )
+    return TipSite(arm, touch, least, good, float(score))
+
+
+COMBINED = {"laser": 12, "endoscope": 40, "tip": 12}
+"""Number of the best mounts of each of two arms that are combined, by tool."""
+COMBINED_OF_MANY = 40
+"""Number of the best mounts of each arm that are combined where a scene has more than two: with 12
+of each laser, no combination of two lasers, endoscope and tip was found on a ball of 60 mm."""
+PARTIAL = 5000
+"""Most combinations of the first arms to which the next arm is added."""
 PORTS_MM = 100.0
 """Distance of two ports in an abdominal wall; a larger one does not improve the score (mm)."""
+ARRANGEMENTS = 5
+"""Number of arrangements that are handed over to be checked."""
+MOVES = ("endoscope", "tip", "laser")
+"""Order in which the arms go to work, by tool."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shortfall:
-    """Why no pair of mounts was found, and how close the best came."""
+    """Why no arrangement of mounts was found, and how close the best came."""
 
     sentence: str
     """The reason, as printed for the user."""
     covered: float
-    """Fraction of the ring that the best laser mount can cut."""
+    """Fraction of the ring that the best mount of the worst laser can cut; 1 without a laser."""
     viewed: float
-    """Fraction of the ring that the best endoscope mount sees."""
+    """Fraction of the ring that the best mount of the worst endoscope sees; 1 without one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Mounts for both arms."""
+class Arrangement:
+    """Mounts for all arms."""
 
-    laser: LaserSite
-    """The laser's."""
-    look: EndoscopeSite
-    """The endoscope's."""
+    sites: dict[str, Site]
+    """Each arm's mount by its name."""
     view: float
-    """Smallest fraction of the ring in view while the laser goes round."""
+    """Smallest fraction of the ring in an endoscope's view while the lasers go round."""
     score: float
     """Higher is better."""
 
@@ -359,37 +508,78 @@ def arms_apart_mm(first: np.ndarray, second: np.ndarray, radii_mm: float) -> np.
 def find_mounts(
     engine: BatchedScene,
     reaches: dict[str, ArmReach],
+    mounts: dict[str, MountSpec],
     ring: Ring,
     laser: LaserSpec,
     camera: CameraSpec,
     limits: LimitsSpec,
-    shafts_mm: dict[str, float],
     report: Progress = silent,
-) -> tuple[list[Pair], Shortfall | None]:
-    """Pairs of mounts, best first; or no pair, and the reason.
+) -> tuple[list[Arrangement], Shortfall | None]:
+    """Arrangements of mounts, best first; or none, and the reason.
 
-    The ring may be coarse here; `check` confirms the chosen pair on all its points.
+    mounts: each arm's tool and shaft, by its name as in `reaches`; their places are not used. The
+    ring may be coarse here; `check` confirms the chosen arrangement on all its points.
     """
-    lasers = laser_sites(engine, reaches["laser"], ring, laser, limits, shafts_mm["laser"], report)
-    looks = endoscope_sites(
-        engine, reaches["endoscope"], ring, camera, limits, shafts_mm["endoscope"], report
+    evaluated: dict[tuple, list] = {}
+    sites: dict[str, list] = {}
+    for name, mount in mounts.items():
+        reach, shaft_mm = reaches[name], mount.shaft_mm
+        alike = (mount.tool, mount.arm, reach.radius_mm, shaft_mm)
+        if alike not in evaluated:
+            found: list
+            if mount.tool == "laser":
+                found = laser_sites(engine, name, reach, ring, laser, limits, shaft_mm, report)
+            elif mount.tool == "endoscope":
+                found = endoscope_sites(engine, name, reach, ring, camera, limits, shaft_mm, report)
+            else:
+                found = tip_sites(engine, name, reach, ring, limits, shaft_mm, report)
+            evaluated[alike] = found
+        sites[name] = evaluated[alike]
+    tools = {name: mount.tool for name, mount in mounts.items()}
+    lasers, looks = (
+        [each for name, each in sites.items() if tools[name] == tool]
+        for tool in ("laser", "endoscope")
     )
-    whole = [site for site in lasers if site.good.all()]
-    wide = [site for site in looks if sees(site, limits)]
-    covered, viewed = float(lasers[0].good.mean()), float(looks[0].visible.mean())
-    if not whole:
-        return [], Shortfall(_laser_shortfall(lasers[0], laser, limits), covered, viewed)
-    if not wide:
-        return [], Shortfall(_endoscope_shortfall(looks[0], limits), covered, viewed)
-    pairs = _together(engine, _spread(whole, LASERS), _spread(wide, LOOKS), ring, camera, limits)
-    if not pairs:
+    covered = min((float(each[0].good.mean()) for each in lasers), default=1.0)
+    viewed = min((float(each[0].visible.mean()) for each in looks), default=1.0)
+    good = {
+        name: [site for site in each if _suffices(site, limits)] for name, each in sites.items()
+    }
+    for name, each in good.items():
+        if not each:
+            best = sites[name][0]
+            if isinstance(best, LaserSite):
+                sentence = _laser_shortfall(best, laser, limits)
+            elif isinstance(best, EndoscopeSite):
+                sentence = _endoscope_shortfall(best, limits)
+            else:
+                sentence = _tip_shortfall(best, limits)
+            return [], Shortfall(sentence, covered, viewed)
+    few = len(mounts) <= 2
+    best_of = {
+        name: _spread(each, COMBINED[tools[name]] if few else COMBINED_OF_MANY)
+        for name, each in good.items()
+    }
+    arrangements = _together(engine, best_of, tools, ring, camera, limits)
+    if not arrangements:
+        who = "two of them" if len(mounts) == 2 else "combination of them"
+        room = "both arms" if len(mounts) == 2 else "all arms"
         sentence = (
-            "each arm finds a mount, but no two of them leave room for both arms "
+            f"each arm finds a mount, but no {who} leave{'s' * (len(mounts) > 2)} room for {room} "
             f"({limits.clearance_mm:g} mm apart) with {100 * limits.view_fraction:.0f} % of the "
             "ring in view"
         )
         return [], Shortfall(sentence, covered, viewed)
-    return pairs, None
+    return arrangements, None
+
+
+def _suffices(site: LaserSite | EndoscopeSite | TipSite, limits: LimitsSpec) -> bool:
+    """Whether the mount is good enough for its arm without the others."""
+    if isinstance(site, LaserSite):
+        return bool(site.good.all())
+    if isinstance(site, EndoscopeSite):
+        return sees(site, limits)
+    return site.good
 
 
 def _spread(sites: list, count: int) -> list:
@@ -404,35 +594,80 @@ def _spread(sites: list, count: int) -> list:
     return chosen
 
 
-def _together(engine, lasers, looks, ring, camera, limits) -> list[Pair]:
-    """Pairs whose arms keep their clearance and the ring in view, best first."""
-    pairs = []
-    for laser in lasers:
-        work = np.concatenate(
-            (laser.arm.lines(laser.arm.approach(laser.cut.centre))[0], laser.cut.lines_mm)
-        )
-        for look in looks:
-            radii = laser.arm.reach.radius_mm + look.arm.reach.radius_mm
-            way = look.arm.lines(look.arm.approach(look.look.commands))[0]
-            turned = arms_apart_mm(work, np.tile(look.look.line_mm, (len(work), 1, 1)), radii)
-            resting = arms_apart_mm(np.tile(work[:1], (len(way), 1, 1)), way, radii)
-            apart = float(min(turned.min(), resting.min()))
-            steps = [np.linalg.norm(np.diff(a, axis=0), axis=-1).max() for a in (work, way)]
-            if apart < max(limits.clearance_mm, 0.5 * max(steps)):
-                continue
-            score = laser.score + look.score
-            score += WEIGHTS.clearance * min(apart, COMFORT_MM) / COMFORT_MM
-            score += WEIGHTS.ports * min(_ports_apart_mm(laser.arm, look.arm), PORTS_MM) / PORTS_MM
-            pairs.append(Pair(laser, look, float(look.visible.mean()), score))
-    pairs.sort(key=lambda pair: -pair.score)
-    seen_pairs = []
-    for pair in pairs:
-        fraction = least_view(engine, pair.look.look, pair.laser.cut.lines_mm, ring, camera)
-        if fraction >= limits.view_fraction:
-            seen_pairs.append(replace(pair, view=fraction))
-        if len(seen_pairs) == 5:
+def _together(
+    engine, sites: dict[str, list], tools: dict[str, str], ring, camera, limits
+) -> list[Arrangement]:
+    """Combinations whose arms keep their clearance and the ring in view, best first."""
+    lasers = [name for name, tool in tools.items() if tool == "laser"]
+    moments = dict(zip(lasers, ring_moments(len(ring.points_mm), len(lasers)).T, strict=True))
+    apart: dict[tuple, float | None] = {}
+
+    def gain(one: tuple[str, int], other: tuple[str, int]) -> float | None:
+        """What a pair of mounts adds to the score; None where the two arms come too close."""
+        if (one, other) not in apart:
+            first, second = sites[one[0]][one[1]], sites[other[0]][other[1]]
+            apart[one, other] = _pair_score(
+                (one[0], tools[one[0]], first), (other[0], tools[other[0]], second), moments, limits
+            )
+        return apart[one, other]
+
+    partial: list[tuple[float, tuple[tuple[str, int], ...]]] = [(0.0, ())]
+    for name, each in sites.items():
+        longer = []
+        for score, chosen in partial:
+            for k, site in enumerate(each):
+                total: float | None = score + site.score
+                for before in chosen:
+                    more = gain(before, (name, k))
+                    total = None if total is None or more is None else total + more
+                    if total is None:
+                        break
+                if total is not None:
+                    longer.append((total, (*chosen, (name, k))))
+        longer.sort(key=lambda one: -one[0])
+        partial = longer[:PARTIAL]
+    found = []
+    for score, chosen in partial:
+        arranged = {name: sites[name][k] for name, k in chosen}
+        least = least_view(engine, arranged, moments, ring, camera)
+        if least >= limits.view_fraction:
+            found.append(Arrangement(arranged, least, score))
+        if len(found) == ARRANGEMENTS:
             break
-    return seen_pairs
+    return found
+
+
+def _pair_score(one, other, moments: dict[str, np.ndarray], limits: LimitsSpec) -> float | None:
+    """Score of two arms (name, tool, site) beside each other; None where they come too close."""
+    (a, first_tool, first), (b, second_tool, second) = sorted(
+        (one, other), key=lambda arm: MOVES.index(arm[1])
+    )
+    radii = first.arm.reach.radius_mm + second.arm.reach.radius_mm
+    work = np.concatenate((second.way_mm, second.work_mm))
+    steps = [first.way_mm, work]
+    if first_tool == second_tool == "laser":
+        rings = first.work_mm[moments[a]], second.work_mm[moments[b]]
+        shapes = [(first.stays_mm, second.way_mm), rings]
+        steps += rings
+    else:
+        shapes = [(first.stays_mm, work)]
+    shapes.append((first.way_mm, second.way_mm[0]))
+    away = min(_least_apart_mm(x, y, radii) for x, y in shapes)
+    step = max(np.linalg.norm(np.diff(lines, axis=0), axis=-1).max() for lines in steps)
+    if away < max(limits.clearance_mm, 0.5 * step):
+        return None
+    score = WEIGHTS.clearance * min(away, COMFORT_MM) / COMFORT_MM
+    ports = min(_ports_apart_mm(first.arm, second.arm), PORTS_MM)
+    return score + WEIGHTS.ports * ports / PORTS_MM
+
+
+def _least_apart_mm(first: np.ndarray, second: np.ndarray, radii_mm: float) -> float:
+    """Smallest skin distance (mm) of centrelines in step; (K, 3) stands for one that rests."""
+    count = max(len(lines) for lines in (first, second) if lines.ndim == 3)
+    first, second = (
+        np.tile(lines, (count, 1, 1)) if lines.ndim == 2 else lines for lines in (first, second)
+    )
+    return float(arms_apart_mm(first, second, radii_mm).min())
 
 
 def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
@@ -446,16 +681,28 @@ def _ports_apart_mm(first: MountedArm, second: MountedArm) -> float:
 
 def least_view(
     engine: BatchedScene,
-    look: EndoscopePose,
-    laser_lines_mm: np.ndarray,
+    sites: dict[str, Site],
+    moments: dict[str, np.ndarray],
     ring: Ring,
     camera: CameraSpec,
 ) -> float:
-    """Smallest fraction of the ring in view with the laser arm at each of its centrelines."""
-    poses = torch.from_numpy(np.tile(look.pose, (len(laser_lines_mm), 1, 1)))
-    arms = {"laser": torch.from_numpy(laser_lines_mm)}
-    views = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, arms)
-    return float(views.fraction.min())
+    """Smallest fraction of the ring in an endoscope's view while the lasers go round; 1 without."""
+    count = len(ring.points_mm) if moments else 1
+    lines = {
+        name: site.work_mm[moments[name]]
+        if name in moments
+        else np.tile(site.stays_mm, (count, 1, 1))
+        for name, site in sites.items()
+    }
+    least = 1.0
+    for name, site in sites.items():
+        if not isinstance(site, EndoscopeSite):
+            continue
+        others = {key: torch.from_numpy(line) for key, line in lines.items() if key != name}
+        poses = torch.from_numpy(np.tile(site.look.pose, (count, 1, 1)))
+        seen = view(engine, camera.camera(), poses, ring.points_mm, ring.normals, others)
+        least = min(least, float(seen.fraction.min()))
+    return least
 
 
 def _laser_shortfall(best: LaserSite, laser: LaserSpec, limits: LimitsSpec) -> str:
@@ -480,4 +727,12 @@ def _endoscope_shortfall(best: EndoscopeSite, limits: LimitsSpec) -> str:
     return (
         f"no mount lets the endoscope see {100 * limits.view_fraction:.0f} % of the ring: the best "
         f"sees {100 * best.visible.mean():.0f} % with {best.least_mm:.1f} mm of clearance"
+    )
+
+
+def _tip_shortfall(best: TipSite, limits: LimitsSpec) -> str:
+    return (
+        f"no mount lets the plain tip touch the lesion: the best comes within "
+        f"{best.touch.miss_mm:.1f} mm of it with {best.least_mm:.1f} mm of clearance, "
+        f"{limits.clearance_mm:g} mm required"
     )

@@ -197,3 +197,31 @@ def nearest_commands(
         near = np.flatnonzero(miss <= miss.min() + 2.0)
         chosen[i] = near[np.argmin(from_rest[near])]
     return reach.commands[chosen].copy()
+
+
+def solve_touch(reach: ArmReach, targets_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse kinematics of the tip's place: commands (M, P), and the tip's distances (M,) mm.
+
+    Targets (M, 3) mm are in the base frame. Damped Gauss-Newton from the nearest sampled tip, as in
+    `solve_aim`.
+    """
+    away = np.linalg.norm(reach.centreline_mm[:, -1] - targets_mm[:, None], axis=-1)
+    commands = reach.commands[away.argmin(axis=1)].copy()
+    step = 1e-3 * reach.span
+    miss = reach.tips(commands)[0] - targets_mm
+    for _ in range(ROUNDS):
+        if np.linalg.norm(miss, axis=1).max() <= AIMED_MM:
+            break
+        inward = np.where(commands + step > reach.bounds[1], -step, step)
+        moved = commands[:, None, :] + inward[:, :, None] * np.eye(commands.shape[1])
+        tips = reach.tips(moved.reshape(-1, commands.shape[1]))[0].reshape(*moved.shape[:2], 3)
+        slope = (tips - targets_mm[:, None] - miss[:, None]) / (inward / reach.span)[:, :, None]
+        change = _smallest_change(np.swapaxes(slope, 1, 2), miss)
+        length = np.linalg.norm(change, axis=1, keepdims=True)
+        change = change * np.minimum(1.0, 0.25 / np.maximum(length, 1e-12))
+        tried = np.clip(commands + change * reach.span, *reach.bounds)
+        left = reach.tips(tried)[0] - targets_mm
+        better = np.linalg.norm(left, axis=1) < np.linalg.norm(miss, axis=1)
+        commands = np.where(better[:, None], tried, commands)
+        miss = np.where(better[:, None], left, miss)
+    return commands, np.linalg.norm(miss, axis=1)

@@ -82,10 +82,9 @@ class Renderer:
     ) -> np.ndarray:
         """(height, width, 3) uint8 picture from pose (4, 4).
 
-        `own` carries the camera; beam_mm (2, 3) mm is the visible beam's ends, beam_radius_mm the
-        half-width of its glow; `paint` maps a
-        body's name to a function of (faces (N,), points (N, 3) mm world, colours (N, 3)) that
-        returns new linear colours.
+        `own` carries the camera; beam_mm (2, 3) or (L, 2, 3) mm are the ends of the visible beams,
+        beam_radius_mm the half-width of their glow; `paint` maps a body's name to a function of
+        (faces (N,), points (N, 3) mm world, colours (N, 3)) that returns new linear colours.
         """
         pose = np.asarray(pose, dtype=np.float64)
         origin = pose[:3, 3]
@@ -104,13 +103,10 @@ class Renderer:
         for name, shape in (arms or {}).items():
             gap = self_contact_gap_mm(shape.radius_mm) if name == own else -1.0
             self._draw_arm(shape, gap, origins, rays, distance, colour, normal)
-        beam = (
-            np.zeros(len(rays))
-            if beam_mm is None
-            else _glow(
-                origin, rays, distance, np.asarray(beam_mm, dtype=np.float64), beam_radius_mm
-            )
-        )
+        beams = np.zeros((0, 2, 3)) if beam_mm is None else np.asarray(beam_mm, dtype=np.float64)
+        beam = np.zeros(len(rays))
+        for ends in beams.reshape(-1, 2, 3):
+            beam = np.maximum(beam, _glow(origin, rays, distance, ends, beam_radius_mm))
         return self._developed(rays, distance, normal, colour, beam)
 
     def _paint(self, name: str, recolour: Callable, face, points, colour) -> None:

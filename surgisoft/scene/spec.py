@@ -4,8 +4,10 @@ Lengths are in mm, times in s. Angles are in degrees in the file, where the fiel
 `_deg`, else in radians. World frame: z up. An arm's base frame: z along the arm at rest.
 """
 
+import csv
 import re
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -13,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Rule, Where, from_table, read_toml, to_table, write_toml
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.mesh import ROLES
@@ -26,18 +28,27 @@ PHANTOM = SCENES / "phantom_liver"
 
 
 def packaged_scene(path: str | Path) -> Path:
-    """The folder of the packaged scene of that name; any other path unchanged.
+    """The folder of the packaged scene of that name, or a scene file in it; other paths unchanged.
 
     A file or folder of that name in the working directory has precedence.
     """
     path = Path(path)
-    named = len(path.parts) == 1 and not path.exists()
-    return SCENES / path if named and (SCENES / path / "scene.toml").is_file() else path
+    if path.exists() or path.is_absolute() or ".." in path.parts:
+        return path
+    there = SCENES / path
+    return there if spec_file(there).is_file() else path
+
+
+def spec_file(path: Path) -> Path:
+    """The scene file in a folder, or the file itself."""
+    return path if path.suffix == ".toml" else path / FILE
 
 
 FORMAT = 1
 FILE = "scene.toml"
-TOOLS = ("laser", "endoscope")
+TOOLS = ("laser", "endoscope", "tip")
+"""Tools of an arm: the laser's beam, the endoscope's camera, a plain tip that pushes and touches.
+The order is that of the arms in a world, whatever their order in the file."""
 
 
 def _one_of(known: tuple[str, ...]) -> Rule:
@@ -79,6 +90,10 @@ Name = Annotated[
         lambda text: re.fullmatch(r"[A-Za-z0-9_-]{1,64}", text) is not None,
     ),
 ]
+_NAME_OR_EMPTY = Rule(
+    "a name of letters, digits, '_' and '-' (at most 64), or nothing",
+    lambda text: re.fullmatch(r"[A-Za-z0-9_-]{0,64}", text) is not None,
+)
 MeshPath = Annotated[
     str, Rule("a file inside the scene's folder, such as 'liver.stl'", _is_inside_path)
 ]
@@ -119,12 +134,72 @@ class LesionSpec:
     """Closed path on the surface to cut in place of the circle, world frame (mm); empty: circle."""
 
 
+CLOSED_POINTS, OPEN_POINTS = 3, 2
+"""Least number of points of a closed and of an open contour."""
+
+
+@dataclass(frozen=True)
+class ContourSpec:
+    """A path on the organ, by points on its surface or as a circle."""
+
+    name: Name
+    """Name of the contour, unique among them."""
+    points_mm: tuple[Point, ...] = ()
+    """Points on the organ's surface, in order, world frame (mm)."""
+    file: str = ""
+    """CSV with the columns x, y, z (mm, world frame), beside this file, in place of `points_mm`."""
+    centre_mm: tuple[Coordinate, ...] = ()
+    """Centre of a circle on the surface, world frame (mm), in place of points."""
+    diameter_mm: Length = 20.0
+    """Diameter of that circle (mm)."""
+    closed: bool = True
+    """Whether the last point is followed by the first."""
+    margin_mm: Distance = 0.0
+    """The path is the outline grown outwards by this (mm); closed contours only."""
+
+    def checked(self, where: Where) -> "ContourSpec":
+        """The contour with the points of its file; an InputError where fields do not fit."""
+        given = [bool(self.points_mm), bool(self.file), bool(self.centre_mm)]
+        if sum(given) != 1:
+            raise where.error(
+                f"{sum(given)} of points_mm, file and centre_mm are given", "one of them"
+            )
+        if self.centre_mm and len(self.centre_mm) != 3:
+            raise (where / "centre_mm").error(f"got {len(self.centre_mm)} numbers", "3, in mm")
+        if not self.closed and (self.margin_mm or self.centre_mm):
+            came = "margin_mm" if self.margin_mm else "centre_mm"
+            raise (where / came).error("got it for an open contour", "it for a closed one only")
+        points = self.points_mm
+        if self.file:
+            points = _points_of(where.path.parent / self.file, where / "file")
+        least = CLOSED_POINTS if self.closed else OPEN_POINTS
+        if not self.centre_mm and len(points) < least:
+            raise (where / "points_mm").error(f"got {len(points)} points", f"at least {least}")
+        return replace(self, points_mm=points, file="")
+
+
+def _points_of(path: Path, where: Where) -> tuple[tuple[float, float, float], ...]:
+    """The columns x, y and z of a CSV file, mm."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+        points = [(float(row["x"]), float(row["y"]), float(row["z"])) for row in rows]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not such a file"
+        raise where.error(
+            f"{path} cannot be read ({reason})", "a CSV file with the columns x, y, z in mm"
+        ) from None
+    if not np.isfinite(points).all():
+        raise where.error(f"{path} has a coordinate that is not finite", "numbers in mm")
+    return tuple(points)
+
+
 @dataclass(frozen=True)
 class MountSpec:
     """The mount of one arm, and the tool that the arm carries."""
 
     tool: Annotated[str, _one_of(TOOLS)]
-    """`laser` or `endoscope`; a scene has one of each."""
+    """`laser`, `endoscope`, or `tip`, a plain tip for pushing and touching."""
     position_mm: Point
     """Centre of the arm's base, world frame (mm)."""
     direction: Direction
@@ -139,6 +214,8 @@ class MountSpec:
     """Outer diameter of the arm (mm)."""
     shaft_mm: Distance = 100.0
     """Straight rigid shaft behind the base, as thick as the arm (mm); 0: none."""
+    name: Annotated[str, _NAME_OR_EMPTY] = ""
+    """Name of the arm, unique in the scene; empty: its tool, numbered where several carry it."""
 
     def pose(self) -> np.ndarray:
         """Base frame to world frame, (4, 4) homogeneous, mm.
@@ -187,7 +264,7 @@ class LimitsSpec:
     """Limits that hold for every task in this scene."""
 
     clearance_mm: Distance = 1.0
-    """Smallest distance between an arm's skin and any body or the other arm (mm)."""
+    """Smallest distance between an arm's skin and any body or other arm (mm)."""
     time_s: Annotated[float, Rule("a time above 0 s", lambda t: 0.0 < t <= 1e6)] = 60.0
     """Time for the whole ring (s)."""
     view_fraction: Annotated[float, _between(0.0, 1.0, "")] = 0.95
@@ -205,7 +282,7 @@ class SceneSpec:
     lesion: LesionSpec
     """The lesion on one organ."""
     mounts: tuple[MountSpec, ...]
-    """The two mounts: one laser, one endoscope."""
+    """The mounts of the arms, at least one."""
     laser: LaserSpec = field(default_factory=LaserSpec)
     """The laser's beam."""
     camera: CameraSpec = field(default_factory=CameraSpec)
@@ -216,14 +293,48 @@ class SceneSpec:
     """Free text."""
     format: Annotated[int, Rule(f"{FORMAT}", lambda number: number == FORMAT)] = FORMAT
     """Version of this file format."""
+    contours: tuple[ContourSpec, ...] = ()
+    """Paths on the lesion's organ that a task may follow, in this order."""
 
-    def mount(self, tool: str) -> MountSpec:
-        """The mount that carries `tool`."""
-        return next(mount for mount in self.mounts if mount.tool == tool)
+    @property
+    def arms(self) -> dict[str, MountSpec]:
+        """Each mount by its arm's name: by tool in the order of `TOOLS`, then by name.
+
+        The order of the mounts in the file has no influence on the order of the arms.
+        """
+        named = dict(zip(arm_names(self.mounts), self.mounts, strict=True))
+        ordered = sorted(named, key=lambda name: arm_rank(named[name].tool, name))
+        return {name: named[name] for name in ordered}
+
+    def mount(self, name: str) -> MountSpec:
+        """The mount of the arm of that name."""
+        arms = self.arms
+        if name not in arms:
+            raise unknown_name("arm", name, arms)
+        return arms[name]
+
+    def arms_with(self, tool: str) -> tuple[str, ...]:
+        """Names of the arms that carry `tool`, in the order of `arms`."""
+        return tuple(name for name, mount in self.arms.items() if mount.tool == tool)
 
     def body(self, name: str) -> BodySpec:
         """The body of that name."""
         return next(body for body in self.bodies if body.name == name)
+
+
+def arm_names(mounts: Sequence[MountSpec]) -> tuple[str, ...]:
+    """Name of each mount's arm: its own, else its tool, numbered from 1 where several carry it."""
+    tools = [mount.tool for mount in mounts]
+    return tuple(
+        mount.name or (tool if tools.count(tool) == 1 else f"{tool}_{tools[: i + 1].count(tool)}")
+        for i, (mount, tool) in enumerate(zip(mounts, tools, strict=True))
+    )
+
+
+def arm_rank(tool: str, name: str) -> tuple:
+    """Key that sorts arms by tool, then by name, with numbers by their value."""
+    parts = re.split(r"(\d+)", name)
+    return TOOLS.index(tool), [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
 
 def spec_path(path: str | Path) -> Path:
@@ -265,6 +376,12 @@ def _check_whole(spec: SceneSpec, where: Where) -> None:
                 f"a second body '{body.name}'", "names that differ"
             )
         seen.add(body.name)
+    contours = [contour.name for contour in spec.contours]
+    for i, name in enumerate(contours):
+        if name in contours[:i]:
+            raise (where / "contours" / i / "name").error(
+                f"a second contour '{name}'", "names that differ"
+            )
     organs = [body.name for body in spec.bodies if body.role == "organ"]
     if not organs:
         raise (where / "bodies").error("no body has the role 'organ'", "at least one organ")
@@ -276,9 +393,11 @@ def _check_whole(spec: SceneSpec, where: Where) -> None:
         raise (where / "lesion" / "path_mm").error(
             f"got {len(spec.lesion.path_mm)} points", "no point (a circle) or at least 3"
         )
-    tools = sorted(mount.tool for mount in spec.mounts)
-    if tools != sorted(TOOLS):
-        raise (where / "mounts").error(
-            f"got {len(tools)} mounts with tools {', '.join(tools) or '(none)'}",
-            "two mounts: one laser, one endoscope",
-        )
+    if not spec.mounts:
+        raise (where / "mounts").error("got no mount", "at least one arm")
+    names = arm_names(spec.mounts)
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise (where / "mounts" / i / "name").error(
+                f"a second arm '{name}'", "names that differ"
+            )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
+from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.random_streams import joined, streams
@@ -60,6 +61,7 @@ class BatchedEnv:
         """
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}, expected 1 or more")
+        keep_freed_memory()
         self.task, self.num_envs, self.device = task, num_envs, task.world.device
         self.agents = tuple(task.agents)
         self._episodes = Episodes(task, donate=True)

@@ -4,36 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.base import Task, TaskState
-from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks import laser_work
+from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.laser_work import LaserTask
 from surgisoft.tasks.supervision import NEVER, Condition, ExperimentTask, Row
-
-
-class LaserTask(Task, Protocol):
-    """A task in a scene whose laser burns towards a target while the endoscope sees it."""
-
-    config: Any
-    """Its configuration."""
-    spec: Any
-    """The scene's file."""
-    pointing: dict[str, Pointing]
-    """Inverse kinematics of each arm's axis, by the arm's name."""
-
-    def fires(self, state: TaskState) -> Tensor:
-        """(B,) bool: the beam is near its target and meets the organ, and the endoscope sees."""
-
-    def advance(
-        self, state: TaskState, actions: Mapping[str, Tensor], fired: Tensor | None = None
-    ) -> TaskState:
-        """Advance one step with the beam on where `fired` (B,) is set; None: where `fires`."""
-
-    def measured_error_mm(self, state: TaskState) -> Tensor:
-        """(B,) mm: distance of the measured beam from its target."""
 
 
 def _view(state: TaskState) -> Any:
@@ -80,7 +59,7 @@ class LaserSupervision:
 
     def action_through(self, agent: str, state: TaskState, target_mm: Tensor) -> Tensor:
         """(B, m) kPa: inverse kinematics of the arm's axis through targets (B, 3) mm."""
-        return self.task.pointing[agent].action(state.world.arms[agent], target_mm)
+        return laser_work.pointing(self.task)[agent].action(state.world.arms[agent], target_mm)
 
 
 def _centred(task: LaserTask, state: TaskState, within: float) -> Tensor:
@@ -89,10 +68,11 @@ def _centred(task: LaserTask, state: TaskState, within: float) -> Tensor:
 
 
 def _aimed(task: LaserTask, state: TaskState, within: float) -> Tensor:
-    return task.measured_error_mm(state) <= within
+    return laser_work.measured_error_mm(task, state) <= within
 
 
-def _cut(task: LaserTask, state: TaskState, within: float) -> Tensor:
+def completed(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    """(B,) bool: the measure `completion` is at least `within`."""
     return task.measures(state)["completion"] >= within
 
 
@@ -124,7 +104,7 @@ LASER_EXPERIMENT = ExperimentTask(
     conditions={
         "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
         "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
-        "cut": Condition("this share of the ring is cut (0..1)", 1.0, _cut),
+        "cut": Condition("this share of the ring is cut (0..1)", 1.0, completed),
         "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),
         "never": NEVER,
     },

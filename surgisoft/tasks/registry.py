@@ -15,8 +15,10 @@ import torch
 
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.base import Task, TaskSpec
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
+from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
 from surgisoft.tasks.keyhole import KEYHOLE
 from surgisoft.tasks.laser_plane import LASER_PLANE
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
@@ -29,6 +31,8 @@ TASKS: dict[str, TaskSpec] = {
     "laser_plane": LASER_PLANE,
     "keyhole": KEYHOLE,
     "circle_ablation": CIRCLE_ABLATION,
+    "contour_ablation": CONTOUR_ABLATION,
+    "area_ablation": AREA_ABLATION,
 }
 """Every task by name."""
 

@@ -85,7 +85,7 @@ def test_nothing_around_needs_no_referee():
 
 def with_hit(state, **fields):
     scene = state.world.scene
-    scene = replace(scene, hit=replace(scene.hit, **fields))
+    scene = replace(scene, hits={"laser": replace(scene.hit, **fields)})
     return replace(state, world=replace(state.world, scene=scene))
 
 

@@ -35,7 +35,7 @@ def test_cameras_hold_the_arm_to_its_path(task):
     """Robot 1 is not the one that the model was fitted to."""
     errors = {}
     for cameras in (True, False):
-        played = rollout(on_rig(task, RigConfig(seed=1, cameras=cameras)), Scripted(), 2, seed=0)
+        played = rollout(on_rig(task, RigConfig(seed=1, cameras=cameras)), Scripted(), 1, seed=0)
         errors[cameras] = played.mean("error_mm").max().item()
     assert errors[True] < 0.3
     assert errors[False] > 3 * errors[True]
@@ -200,6 +200,31 @@ def test_a_real_bench_runs_one_episode_after_the_other_and_is_scored_by_measurem
         ).measured_arms
         == ()
     )
+
+
+class Swapped(OwnRig):
+    """The bench with the tubes of chambers 1 and 2 exchanged."""
+
+    def command(self, pressures):
+        super().command(np.asarray(pressures)[[1, 0, 2]])
+
+
+def test_preflight_finds_swapped_tubes_before_the_first_episode():
+    short = TrackConfig(FollowConfig(loop_s=0.4, approach_s=0.1))
+    request = {"task": "track_circle", "episodes": 1, "config": short}
+    for rig, swapped in ((OwnRig, False), (Swapped, True)):
+        config = RigConfig(rigs=("bench",), settle_s=0.05, preflight=True)
+        moved = on_rig(track_circle(short), config, lambda *_, rig=rig: rig("x"))
+        (bench,) = real_benches(moved).values()
+        if swapped:
+            with pytest.raises(InputError, match="chamber 1 moves the arm as 2"), at_benches(moved):
+                pytest.fail("no episode begins")
+        else:
+            with at_benches(moved):
+                assert bench.rig.commands, "each chamber was tried"
+        assert (bench.rig.vents > 0, bench.rig.closes) == (True, 1), "left vented and given back"
+    with pytest.raises(InputError, match="no arm of track_circle is on one"):
+        evaluate("random", rig=RigConfig(preflight=True), **request)
 
 
 def test_a_lost_key_point_of_a_real_bench_is_estimated():

@@ -1,5 +1,7 @@
 """The control study: runs that are there are taken, and the tables say what was measured."""
 
+import shutil
+
 import pytest
 
 from benchmarks.control import study as control
@@ -114,6 +116,7 @@ def test_two_processes_train_together_and_are_taken_once_they_are_done(tmp_path,
         trained_by_two(place, "track_square", 100_000, nothing)
 
 
-def test_two_processes_that_fail_say_where_to_look(tmp_path):
+def test_two_processes_that_fail_say_where_to_look(tmp_path, monkeypatch):
+    monkeypatch.setattr(two_processes.sys, "executable", shutil.which("false"))
     with pytest.raises(InputError, match=r"ended early, see .*whole\.log"):
         trained_by_two(tmp_path / "whole", "no_task", 100_000, nothing)

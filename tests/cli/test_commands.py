@@ -226,6 +226,30 @@ def test_files_are_written_before_the_output_is_printed(lab, tmp_path, monkeypat
     assert all(path.exists() for path in files)
 
 
+def test_several_models_on_the_same_recording(lab, tmp_path, capsys):
+    """The table, the page and the numbers hold each of them; models stand before recordings."""
+    arm, test, file = str(lab / "arm"), str(lab / "test.parquet"), tmp_path / "c.json"
+    options = ["--json", str(file), "--report", str(tmp_path / "page")]
+    assert run(["compare", arm, "default", test, *options]) == 0
+    out = capsys.readouterr().out
+    values = json.loads(file.read_text())
+    assert [each["model"] for each in values["models"]] == ["arm", "default"]
+    assert values["models"][0]["rmse_mm"] == values["rmse_mm"]
+    assert values["models"][1]["rmse_mm"] != values["rmse_mm"]
+    assert f"default  {values['models'][1]['rmse_mm']:10.4f}" in out
+    page = (tmp_path / "page" / "report.html").read_text()
+    assert "1/report.html" in page
+    assert "arm has the smallest error" in page
+    assert (tmp_path / "page" / "2" / "report.html").is_file()
+    for wrong, said in (
+        (["compare", arm, test, "default"], "give all models first"),
+        (["compare", arm, "default"], "models only"),
+        (["compare", arm, test, "--error-scale", "1"], "add --replay"),
+    ):
+        assert run(wrong) == 2
+        assert said in capsys.readouterr().err
+
+
 def test_compare_prints_the_next_command(lab, tmp_path, capsys):
     file = tmp_path / "c.json"
     arguments = ["compare", str(lab / "arm"), str(lab / "test.parquet"), "--json", str(file)]

@@ -12,6 +12,7 @@ from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import load_recording, save_recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.callables import named
+from tests.replay.reading import entities
 from tests.test_your_model import blocks
 
 
@@ -116,7 +117,10 @@ def test_an_amended_callable_is_a_model_folder(capsys, tmp_path):
     """Written, refused without the callable's name, then compared and trained on."""
     new = tmp_path / "amended"
     amend = f"amend my_arm.py:arm --effect payload --data bench.parquet -o {new} --anyway"
-    assert run(amend.split()) in (0, 1)
+    assert run([*amend.split(), "--replay", str(tmp_path / "both.rrd")]) in (0, 1)
+    assert {"/model1", "/model2"} <= {
+        "/" + name.split("/")[1] for name in entities(tmp_path / "both.rrd")
+    }
     assert "--model-code my_arm.py:arm" in capsys.readouterr().out
     named.NAMED.clear()
     train = f"train --task track_circle --arm {new} --envs 8 --steps 64 -o {tmp_path / 'run'}"

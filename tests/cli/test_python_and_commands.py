@@ -96,9 +96,19 @@ def test_a_turned_bench_gives_one_result_everywhere(lab, capsys):
 def test_improve_gives_one_result(lab):
     improved = improve(lab / "arm", lab / "turned.parquet", 1)
     command = ["improve", str(lab / "arm"), str(lab / "turned.parquet"), "--max-effects", "1"]
-    found = of_command(lab, *command, "-o", str(lab / "better"), "--force")
+    page = ["--report", str(lab / "story"), "--replay", str(lab / "story.rrd")]
+    found = of_command(lab, *command, "-o", str(lab / "better"), "--force", *page)
     assert as_written(improved) == found
     assert any("35 degrees" in note for note in improved.notes)
+    text = (lab / "story" / "report.html").read_text()
+    told = ["What was measured", "Where the model failed", "What was missing", "What it is worth"]
+    places = [text.index(f"<h2>{part}") for part in [*told, "What is left, and what to record"]]
+    assert places == sorted(places)
+    first = improved.diagnoses[0].ranking[0]
+    assert f"{first.effect} alone leaves {first.heldout_rmse_mm:.3f} mm" in text
+    assert ("<td>added</td>" in text) == bool(improved.steps)
+    for name in ("story/bodies.png", "story.rrd"):
+        assert (lab / name).stat().st_size > 10_000
 
 
 def test_the_next_experiment_asks_what_diagnose_asks(lab):

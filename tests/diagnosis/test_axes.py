@@ -67,6 +67,27 @@ def test_the_axis_of_the_cause_comes_first(name):
     assert first.ci95[0] > 0.05
 
 
+def test_a_chart_of_an_axis_shows_its_share_and_the_slope_of_its_cause():
+    """A gain of chamber 1 of 0.15 mm/kPa at the tip; the bands' falls add up to the share."""
+    pressure = walk(ROWS, seed=4)
+    problem = problem_of(still_model(), [recording(0.15 * (pressure[:, 0] - 5), pressure)])
+    found = {each.axis: each for each in shares(problem)}
+    total = np.square(problem.table.error_mm).mean()
+    for name in ("pressure", "lag", "past actuation"):
+        for profile in found[name].profiles:
+            falls = np.square(profile.without_mm) - np.square(profile.left_mm)
+            fall = np.average(falls, weights=profile.rows)
+            assert fall / total == pytest.approx(found[name].share, abs=0.03), profile.column
+    one, other = found["pressure"].profiles[:2]
+    assert (one.column, other.column) == ("p1", "p2")
+    assert np.polyfit(one.middle, one.shift_mm, 1)[0] == pytest.approx(0.15, rel=0.05)
+    assert np.ptp(other.shift_mm) < 0.5 * np.ptp(one.shift_mm)
+    assert all(
+        low <= mean <= high
+        for mean, (low, high) in zip(one.shift_mm, one.shift_ci95_mm, strict=True)
+    )
+
+
 def test_softening_goes_with_the_largest_actuation_so_far():
     """Fifteen runs, each up to another level: the largest so far starts afresh in each."""
     run = np.repeat(np.arange(15), 150)

@@ -192,6 +192,6 @@ def test_json_is_plain_and_pictures_are_pictures(tmp_path):
     values = json.loads(json.dumps(result.to_json()))
     assert {"rmse_mm", "per_key_point_mm", "tip_rmse_mm", "floor_mm", "samples"} <= set(values)
     assert values["rmse_mm"] == pytest.approx(values["floor_mm"], rel=0.1)
-    for path in draw_all(rest, still_model().backbone(), "kPa", tmp_path / "pictures"):
+    for path in draw_all(rest, "kPa", tmp_path / "pictures"):
         assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
         assert path.stat().st_size > 10_000

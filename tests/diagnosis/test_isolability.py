@@ -74,6 +74,21 @@ def test_moments_are_the_products_under_the_dense_covariance():
     np.testing.assert_allclose(gram, expected, rtol=2e-3)
 
 
+def test_a_model_that_is_far_off_leaves_what_its_error_cannot_imitate():
+    """One slow sweep beside a large validated error: finite, less left of every sensitivity."""
+    rng = np.random.default_rng(0)
+    x, d = np.linspace(-1, 1, 2000)[:, None] * np.ones(3), np.ones((2000, 3))
+    columns = rng.normal(size=(2000, 3, 3, 2))
+    left = []
+    for off in (0.1, 100.0):
+        uncertainty = Uncertainty(
+            np.full(3, 0.07), np.full(3, off), np.full(3, 1e-3), 0.05, inducing_points(3)
+        )
+        left.append(np.diag(Moments.of(columns, x, d, uncertainty, 100.0).gram()))
+    assert np.isfinite(left[1]).all()
+    assert (left[1] < left[0]).all()
+
+
 def test_moments_of_two_experiments_share_the_surrogates_error():
     """Rows one after another in one experiment or in two: the same, as the error is the same."""
     columns, x, d, uncertainty = small_case(rows=60)

@@ -48,7 +48,7 @@ def _with(state, fraction=None, clearance=None):
     scene = state.world.scene
     ones = torch.ones_like(scene.view.fraction)
     if fraction is not None:
-        scene = replace(scene, view=replace(scene.view, fraction=fraction * ones))
+        scene = replace(scene, views={"endoscope": replace(scene.view, fraction=fraction * ones)})
     if clearance is not None:
         room = SimpleNamespace(least_mm=clearance * ones, collides=clearance * ones < 0.0)
         scene = replace(scene, clearance=room)
@@ -175,7 +175,7 @@ def test_a_schedule_is_followed_and_waypoints_are_aimed_at(cutting, base, spec, 
     file = tmp_path / "press.csv"
     file.write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1.0,5,0,0\n")
     hand, play = Schedule(file, 3), Episodes(task)
-    point = task.base.centre_mm(state)[0]
+    point = task.base.watched_mm(state)[0]
     way = Waypoints([(0.0, *point.tolist())])
     for _ in range(12):
         actions = {

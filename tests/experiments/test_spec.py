@@ -119,7 +119,9 @@ def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
     assert (spec.together, changed.together) == (3, 3)
     found = settings(changed)
     assert rig_config(found[1], Where(tmp_path), spec.of.agents).rigs == ("virtual:seed=3",)
-    real = with_rigs(spec, ("laser=tests.rig.own_rig:OwnRig:port=x",))
+    real = with_rigs(spec, ("laser=tests.rig.own_rig:OwnRig:port=x",), preflight=True)
+    of_rig = rig_config(settings(real)[1], Where(tmp_path), spec.of.agents)
+    assert of_rig.preflight
     assert real.together == 1, "one bench runs one episode after the other"
     save_experiment(real, tmp_path / "saved.toml")
     assert load_experiment(tmp_path / "saved.toml") == real

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from surgisoft.error_scale import bar_length, error_scale
 from surgisoft.errors import InputError
-from surgisoft.replay.comparison import MOST_ROWS, continued, write_comparison
-from tests.replay.reading import column
+from surgisoft.replay.comparison import MOST_ROWS, write_comparison
+from surgisoft.tasks.episodes.parts import Event
+from surgisoft.time_axis import continued, pauses, with_gaps
+from tests.replay.reading import column, entities
 
 
 def made_up(rows=50):
@@ -24,8 +27,8 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     t_s, measured, predicted = made_up()
     pressure = np.column_stack((t_s, 2.0 * t_s))
     replay = write_comparison(t_s, measured, predicted, "m on r", tmp_path / "c.rrd", pressure)
-    origins = column(replay.path, "/errors/arrows", "Arrows3D:origins")
-    vectors = column(replay.path, "/errors/arrows", "Arrows3D:vectors")
+    origins = column(replay.path, "/model1/errors/arrows", "Arrows3D:origins")
+    vectors = column(replay.path, "/model1/errors/arrows", "Arrows3D:vectors")
     assert 9 not in origins
     assert len(origins) == 49
     assert len(origins[7]) == 3
@@ -33,7 +36,7 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     assert stretch.min() == pytest.approx(stretch.max(), rel=1e-3)
     assert 1.0 <= stretch.mean() <= 50.0
     np.testing.assert_allclose(origins[3], measured[3], atol=1e-4)
-    errors = column(replay.path, "/plots/error/k2", "Scalars:scalars")
+    errors = column(replay.path, "/plots/error/model1/k2", "Scalars:scalars")
     truth = np.linalg.norm((predicted - measured)[:, 2], axis=1)
     assert sorted(set(range(50)) - set(errors)) == [7, 9]
     for row, value in errors.items():
@@ -43,6 +46,48 @@ def test_errors_are_arrows_from_measured_to_predicted(tmp_path):
     bodies = column(replay.path, "/measured/body", "LineStrips3D:strips")
     assert sorted(set(range(50)) - set(bodies)) == [7, 9]
     np.testing.assert_allclose(np.array(bodies[0][0])[[0, -1]], measured[0][[0, -1]], atol=1e-4)
+
+
+def test_several_models_have_one_scale(tmp_path):
+    """The model with a tenth of the error is drawn with a tenth of the arrows, and darker."""
+    t_s, measured, predicted = made_up()
+    better = measured + 0.1 * (predicted - measured)
+    models = {"old": predicted, "new": better}
+    events = [Event(2.0, "warning", "worst")]
+    path = tmp_path / "two.rrd"
+    write_comparison(t_s, measured, models, "both", path, seen="words", events=events)
+    arrows = [column(path, f"/model{i}/errors/arrows", "Arrows3D:vectors") for i in (1, 2)]
+    np.testing.assert_allclose(arrows[1][3], 0.1 * np.array(arrows[0][3]), atol=1e-4)
+    shades = [column(path, f"/model{i}/errors/points", "Points3D:colors")[3][-1] for i in (1, 2)]
+    red = [shade >> 24 for shade in shades]
+    assert red[0] > red[1]
+    assert {"/seen", "/legend", "/events", "/bars"} <= entities(path)
+    tips = column(path, "/plots/tip/model2", "Scalars:scalars")
+    assert tips[3][0] == pytest.approx(np.linalg.norm(better[3, -1] - measured[3, -1]))
+    texts = column(path, "/events", "TextLog:text", "time")
+    assert list(texts) == [2 * 10**9]
+    assert "worst" in texts[2 * 10**9][0]
+
+
+def test_the_scale_is_that_of_the_worst_model_in_round_numbers():
+    body = np.zeros((40, 2, 3))
+    body[:, 1, 2] = 70.0
+    body[:, 1, 0] = np.linspace(-60, 60, 40)
+    small, large = np.full((40, 2), 0.13), np.full((40, 2), 0.9)
+    both = error_scale(body, [small, large])
+    assert (both.large_mm, both.stretch) == (1.0, 20.0)
+    assert both == error_scale(body, [large])
+    assert error_scale(body, [small]).large_mm == 0.2
+    assert error_scale(body, [small, large], 3.0).large_mm == 3.0
+    assert [bar_length(x) for x in (0.99, 1.0, 4.9, 17.5, 70.0)] == [0.5, 1.0, 2.0, 10.0, 50.0]
+
+
+def test_no_line_crosses_a_pause():
+    time_s = np.array([0.0, 0.1, 0.2, 9.0, 9.1])
+    assert pauses(time_s).tolist() == [2]
+    times, values = with_gaps(time_s, np.arange(5.0))
+    assert times.tolist() == [0.0, 0.1, 0.2, 0.2, 9.0, 9.1]
+    np.testing.assert_array_equal(values, [0, 1, 2, np.nan, 3, 4])
 
 
 def test_runs_follow_one_another_in_time():
@@ -56,7 +101,7 @@ def test_long_comparisons_are_thinned_and_one_key_point_will_do(tmp_path):
     measured = np.random.default_rng(0).normal(size=(rows, 1, 3))
     path = tmp_path / "one.rrd"
     write_comparison(np.arange(rows), measured, 0.0 * measured, "one", path)
-    errors = column(path, "/plots/error/k0", "Scalars:scalars", "time")
+    errors = column(path, "/plots/error/model1/k0", "Scalars:scalars", "time")
     assert len(errors) == MOST_ROWS
     assert max(errors) == (rows - 1) * 10**9
     assert path.stat().st_size < 2e6

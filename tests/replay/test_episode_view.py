@@ -22,7 +22,7 @@ from surgisoft.replay.colours import (
     ROLE_COLOURS,
     tissue_colours,
 )
-from surgisoft.replay.endoscope import CAMERA, CONE, PIXELS
+from surgisoft.replay.endoscope import PIXELS, camera_entity, cone_entity
 from surgisoft.replay.episode_view import legend, write_replay
 from surgisoft.replay.plots import plots_of
 from surgisoft.replay.surfaces import dosed_surface
@@ -105,11 +105,11 @@ def test_bodies_beam_and_camera_stand_where_the_log_says(log, replay):
         np.testing.assert_allclose(beam[row][0][1], log.beam.end_mm[row], atol=1e-4)
         assert (radii[row][0] > 0.2) == log.beam.on[row]
     tips = log.arms["endoscope"].line_mm[:, -1]
-    for entity in (CAMERA, CONE):
+    for entity in (camera_entity("endoscope"), cone_entity("endoscope")):
         eyes = column(replay.path, entity, "Transform3D:translation")
         found = np.array([eyes[row][0] for row in range(log.rows)])
         np.testing.assert_allclose(found, tips, atol=1e-4)
-    rim = np.array(column(replay.path, CONE, "LineStrips3D:strips")[-1][0])
+    rim = np.array(column(replay.path, cone_entity("endoscope"), "LineStrips3D:strips")[-1][0])
     slope = np.hypot(rim[:, 0], rim[:, 1]) / rim[:, 2]
     np.testing.assert_allclose(slope, np.tan(0.5 * log.camera.fov_rad), rtol=1e-5)
     events = column(replay.path, "/events", "TextLog:text", "time")
@@ -170,7 +170,7 @@ def test_fine_triangles_are_the_faces_that_they_replace(log):
 
 
 def test_endoscope_pictures_are_few_and_show_the_organ(log, replay):
-    files = column(replay.path, f"{CAMERA}/picture", "EncodedImage:blob")
+    files = column(replay.path, "/endoscope/camera/picture", "EncodedImage:blob")
     assert 2.0 <= len(files) / log.time_s[-1] <= 3.0
     picture = Image.open(io.BytesIO(bytes(files[max(files)][0])))
     assert picture.size == (PIXELS, PIXELS)
@@ -310,9 +310,12 @@ def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):
     (text,) = column(replay.path, "/legend", "TextDocument:text")[-1]
     assert "beam; thick" in text
     assert "olive green" in text
+    assert log.events[-1].text in text
+    (scale,) = column(replay.path, "/dose_scale", "EncodedImage:blob")[-1]
+    assert bytes(scale).startswith(b"\x89PNG")
     assert "white points" not in text
-    lone = legend(replace(log, beam=None, camera=None, dose=None, bodies=(), on="rig"))
-    assert "beam" not in lone
+    lone = legend(replace(log, beams={}, cameras={}, dose=None, bodies=(), on="rig"))
+    assert "green line" not in lone
     assert "white points" in lone
 
 

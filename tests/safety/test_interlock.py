@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.interlock import TIGHT_MM, Audit, attack, laser_tasks, varied
@@ -122,6 +122,8 @@ def start(phased):
 
 
 @settings(deadline=None)
+@example(flaws=[{}, {"sight": False}, {"collides": True}, {"failed": True}], room=0.0)
+@example(flaws=[{}, {"clearance": math.nan}, {"fires": False}, {"reason": 1}], room=0.0)
 @given(flaws=st.lists(ROW, min_size=4, max_size=4), room=st.floats(0.0, 100.0))
 def test_the_beam_needs_every_condition_at_once(phased, start, flaws, room):
     """Phase, no abort, sight, clearance, no contact, finite arms, and the task itself."""

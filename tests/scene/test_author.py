@@ -81,7 +81,7 @@ def test_every_ring_point_is_hit_by_an_arm_that_touches_nothing(made):
     assert verdict.work.covered == 1.0
     organ = scene.organ.world_mesh
     tree = trimesh.Trimesh(organ.vertices_mm, organ.faces, process=False)
-    cut, ring = verdict.work.cut, scene.ring
+    cut, ring = verdict.work.cuts["laser"], scene.ring
     assert len(ring.points_mm) == 72
     tips = cut.lines_mm[:, -1]
     hits, ray, _ = tree.ray.intersects_location(tips, cut.directions, multiple_hits=False)
@@ -180,7 +180,10 @@ def test_a_lesion_out_of_reach_is_told_why(made, tmp_path):
     verdict = check_scene(open_scene(folder), reaches_of(scene))
     assert not verdict.good
     assert verdict.work.covered == 0.0
-    assert {REASONS[code] for code in verdict.work.reason} <= {"out of reach", "beam blocked"}
+    assert {REASONS[code] for code in verdict.work.reasons["laser"]} <= {
+        "out of reach",
+        "beam blocked",
+    }
 
 
 def test_a_lesion_off_the_organ_is_a_verdict(made, tmp_path, capsys):
@@ -304,7 +307,9 @@ BAD = [
     (("ball.ply", "--label", "1:organ"), "--label is given for meshes"),
     (("ball.ply", "--label", "1"), "expected LABEL:ROLE[:NAME]"),
     (("ball.ply", "--margin", "-1"), "--margin is -1"),
-    (("ball.ply", "--arm", "scope=default"), "unknown tool 'scope'"),
+    (("ball.ply", "--arm", "scope=default"), "unknown arm 'scope'"),
+    (("ball.ply", "--arms", "laser,knife"), "unknown tool 'knife'"),
+    (("ball.ply", "--arms", "laser,laser", "--arm", "laser_3=default"), "unknown arm 'laser_3'"),
     (("ball.ply", "--arm", "laser=default,laser=default"), "two arms for the laser"),
     (("ball.ply", "--arm", "nowhere"), "no arm model there"),
     (("ball.ply", "--unit", "m"), "would be 1.2e+05 mm across; organs measure 20 to 600 mm"),

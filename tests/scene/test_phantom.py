@@ -96,6 +96,6 @@ def test_the_scene_is_ready(scene):
     verdict = check_scene(scene, reaches_of(scene))
     assert verdict.good
     assert verdict.work.covered == 1.0
-    assert verdict.work.view.min() == 1.0
+    assert verdict.work.viewed == 1.0
     assert scene.spec.lesion.diameter_mm == 20.0
     assert [(m.length_mm, m.diameter_mm) for m in scene.spec.mounts] == [(70.0, 15.0)] * 2

@@ -14,6 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene.mesh import ROLES
 from surgisoft.scene.spec import (
     FILE,
+    TOOLS,
     BodySpec,
     CameraSpec,
     LaserSpec,
@@ -63,8 +64,9 @@ def specs(draw):
             draw(LENGTHS),
             draw(LENGTHS),
             draw(numbers(0, 1e4)),
+            draw(st.sampled_from(["", f"arm-{i}"])),
         )
-        for tool in draw(st.permutations(["laser", "endoscope"]))
+        for i, tool in enumerate(draw(st.lists(st.sampled_from(TOOLS), min_size=1, max_size=4)))
     )
     return SceneSpec(
         draw(NAMES),
@@ -124,8 +126,9 @@ BAD = [
     ("lesion.diameter_mm", "diameter_mm = 20.0", "diameter_mm = -20", "above 0 mm"),
     ("lesion.diameter_mm", "diameter_mm = 20.0", "diameter_mm = nan", "finite number"),
     ("lesion.path_mm", "path_mm = []", "path_mm = [[0, 0, 0]]", "at least 3"),
-    ("mounts", 'tool = "endoscope"', 'tool = "laser"', "one laser, one endoscope"),
-    ("mounts[1].tool", 'tool = "endoscope"', 'tool = "knife"', "one of laser, endoscope"),
+    ("mounts[1].name", 'name = ""\n\n[laser]', 'name = "laser"\n\n[laser]', "names that differ"),
+    ("mounts[1].name", 'name = ""\n\n[laser]', 'name = "a b"\n\n[laser]', "letters, digits"),
+    ("mounts[1].tool", 'tool = "endoscope"', 'tool = "knife"', "one of laser, endoscope, tip"),
     ("mounts[0].direction", "[0.0, 0.0, -1.0]", "[0.0, 0.0, 0.0]", "not all zero"),
     ("mounts[0].length_mm", "length_mm = 70.0", "length_mm = true", "above 0 mm"),
     ("mounts[0].arm", 'arm = "default"', 'arm = ""', "arm model"),

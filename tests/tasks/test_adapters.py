@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from functools import lru_cache
 
 import gymnasium
 import numpy as np
@@ -17,7 +18,7 @@ from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker, ExactScene
 from surgisoft.scene.spec import PHANTOM
-from surgisoft.tasks.parallel import parallel_env
+from surgisoft.tasks.parallel import SurgicalEnv, parallel_env
 from surgisoft.tasks.path_following import FollowConfig
 from surgisoft.tasks.registry import TASKS
 from surgisoft.tasks.single import BatchedEnv, SingleEnv
@@ -28,24 +29,29 @@ every_task = pytest.mark.parametrize("name", TASKS)
 one_arm = pytest.mark.parametrize("name", ONE_AGENT)
 
 
+@lru_cache
+def exact(name):
+    """The task that `parallel_env` builds; it holds no state, so that one serves several tests."""
+    return parallel_env(name).task
+
+
 @every_task
 def test_pettingzoo_api(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parallel_api_test(parallel_env(name), num_cycles=300)
+        parallel_api_test(SurgicalEnv(exact(name)), num_cycles=150)
 
 
 @every_task
 def test_pettingzoo_seeds(name):
-    parallel_seed_test(lambda: parallel_env(name), num_cycles=50)
+    parallel_seed_test(lambda: SurgicalEnv(exact(name)), num_cycles=50)
 
 
 @every_task
 def test_pettingzoo_runs_alike_for_many_steps(name):
     """The library's own seed test stops after one step."""
 
-    def run():
-        env = surgisoft.parallel_env(name)
+    def run(env):
         rng, heard = np.random.default_rng(0), []
         for seed in (7, None):
             env.reset(seed=seed)
@@ -57,7 +63,8 @@ def test_pettingzoo_runs_alike_for_many_steps(name):
             heard.append((env.state(),))
         return heard
 
-    for one, other in zip(run(), run(), strict=True):
+    runs = run(surgisoft.parallel_env(name)), run(SurgicalEnv(exact(name)))
+    for one, other in zip(*runs, strict=True):
         for a, b in zip(one, other, strict=True):
             assert np.array_equal(a, b)
 

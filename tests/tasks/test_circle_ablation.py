@@ -11,8 +11,10 @@ import torch
 import trimesh
 
 from surgisoft.errors import InputError
+from surgisoft.tasks import laser_work
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.laser_work import safety
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
@@ -86,16 +88,14 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
     scene, goal = state.world.scene, state.goal
     if what == "view":
         low = replace(scene.view, fraction=torch.tensor([0.94]))
-        scene = replace(scene, view=low)
+        scene = replace(scene, views={"endoscope": low})
     elif what == "blocked":
-        scene = replace(scene, hit=replace(scene.hit, struck=torch.tensor([4])))
+        scene = replace(scene, hits={"laser": replace(scene.hit, struck=torch.tensor([4]))})
     elif what in ("close", "contact", "nothing known"):
-        least = {"close": quick.spec.limits.clearance_mm - 1e-3, "contact": 50.0}.get(
-            what, math.nan
-        )
+        least = {"close": quick.spec.limits.clearance_mm - 1e-3, "contact": 50.0}
         touch = torch.tensor([what == "contact"])
-        close = SimpleNamespace(least_mm=torch.tensor([least]), collides=touch)
-        scene = replace(scene, clearance=close)
+        close = torch.tensor([least.get(what, math.nan)])
+        scene = replace(scene, clearance=SimpleNamespace(least_mm=close, collides=touch))
     else:
         goal = replace(goal, done=goal.done + 3)
     changed = replace(state, goal=goal, world=replace(state.world, scene=scene))
@@ -140,6 +140,8 @@ def test_a_collision_ends_the_episode_and_is_no_success(quick):
     state = replace(state, world=replace(state.world, scene=hit))
     assert quick.ended(state).tolist() == [False, True]
     assert quick.measures(state)["success"].tolist() == [0.0, 0.0]
+    whole = torch.tensor([True, True])
+    assert safety(state, whole)["success"].tolist() == [1.0, 0.0]
     for terms in quick.rewards(state).values():
         assert terms["contact"].tolist() == [0.0, -1.0]
 
@@ -235,10 +237,10 @@ def test_the_gate_follows_what_is_measured_and_never_the_true_beam(quick, cut):
 
     arm = quick.world.arms["laser"]
     truly_off = with_laser(replace(arm.posed(laser, tilted), seen_mm=laser.points_mm))
-    assert (quick.beam_error_mm(truly_off) > 2.0).all()
+    assert (laser_work.beam_error_mm(quick, truly_off) > 2.0).all()
     assert quick.fires(truly_off).all()
     seen_off = with_laser(replace(laser, seen_mm=tilted))
-    assert (quick.beam_error_mm(seen_off) < 0.5).all()
+    assert (laser_work.beam_error_mm(quick, seen_off) < 0.5).all()
     assert not quick.fires(seen_off).any()
 
 
@@ -246,7 +248,7 @@ def test_the_pointing_error_is_measured_with_the_beam_off_too(quick, cut):
     """No gate truncates it; it leaves out the approach alone."""
     states, outcomes = cut
     measured = torch.stack([o.measures["pointing_error_mm"] for o in outcomes])
-    true = torch.stack([quick.beam_error_mm(state) for state in states[1:]])
+    true = torch.stack([laser_work.beam_error_mm(quick, state) for state in states[1:]])
     begins = round(quick.config.approach_s / quick.dt_s)
     assert measured[: begins - 1].isnan().all()
     torch.testing.assert_close(measured[begins + 1 :], true[begins + 1 :])
@@ -265,7 +267,7 @@ def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
     reward = quick.rewards(replace(state, goal=replace(state.goal, fired=on)))
     for agent in quick.agents:
         assert reward[agent]["cut"].tolist() == [1.0, 0.0]
-    error = quick.beam_error_mm(state)
+    error = laser_work.beam_error_mm(quick, state)
     torch.testing.assert_close(reward["laser"]["far"], 10.0 / (10.0 + error))
     torch.testing.assert_close(reward["laser"]["aim"], torch.exp(-error))
     torch.testing.assert_close(reward["laser"]["fine"], torch.exp(-error / 0.1))
@@ -274,7 +276,7 @@ def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
         axis_error_mm=torch.tensor([0.0, 10.0]),
         fraction=torch.tensor([0.25, 1.0]),
     )
-    looks = quick.rewards(with_scene(state, view=view))["endoscope"]
+    looks = quick.rewards(with_scene(state, views={"endoscope": view}))["endoscope"]
     assert looks["look"].tolist() == [1.0, 0.5]
     assert looks["view"].tolist() == [0.25, 1.0]
 
@@ -297,7 +299,7 @@ def test_an_arm_in_front_of_the_camera_or_the_beam_hides_what_is_behind(quick, c
     assert (world.scene.view.fraction == 1.0).all()
     assert world.scene.hit.on_organ.all()
     for tool, other in (("endoscope", "laser"), ("laser", "endoscope")):
-        tip, target = world.arms[tool].tip_mm, quick.centre_mm(state)
+        tip, target = world.arms[tool].tip_mm, quick.watched_mm(state)
         if tool == "laser":
             target = world.scene.hit.point_mm
         towards = torch.nn.functional.normalize(target - tip, dim=1)

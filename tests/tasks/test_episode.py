@@ -203,8 +203,10 @@ def made_up(**series) -> EpisodeLog:
 
 def test_events_by_hand():
     log = made_up(
-        beam=BeamLog(np.array([0, 0, 20, 20, 0, 0.0]), np.zeros((6, 3)), np.ones(6, bool)),
-        view_fraction=np.array([0.0, 1.0, 1.0, 0.5, 0.5, 1.0]),
+        beams={
+            "laser": BeamLog(np.array([0, 0, 20, 20, 0, 0.0]), np.zeros((6, 3)), np.ones(6, bool))
+        },
+        views={"endoscope": np.array([0.0, 1.0, 1.0, 0.5, 0.5, 1.0])},
         clearance_mm=np.array([5.0, 5.0, 0.5, -0.1, 0.5, 2.0]),
         measures={"completion": np.array([0, 0, 0.5, 1, 1, 1]), "success": np.zeros(6)},
     )

@@ -67,6 +67,28 @@ def changed(values, index, value):
     return values
 
 
+def test_an_episode_of_the_first_format_opens(members, tmp_path):
+    """The former tables: one `beam`, `camera` and `view_fraction`; arms without their tools."""
+    table = json.loads(array(members["table.npy"]).tobytes())
+    log = table["log"]["table"]
+    table["format"] = "surgisoft episode 1"
+    for arm in log["arms"]["table"].values():
+        del arm["table"]["tool"]
+    log["beam"] = log.pop("beams")["table"]["laser"]
+    log["camera"] = log.pop("cameras")["table"]["endoscope"]
+    log["view_fraction"] = log.pop("views")["table"]["endoscope"]
+    text = packed(np.frombuffer(json.dumps(table).encode(), np.uint8))
+    old = load_episode(written(tmp_path, members | {"table.npy": text}))
+    new = load_episode(written(tmp_path, members))
+    assert {name: arm.tool for name, arm in old.arms.items()} == {
+        "laser": "laser",
+        "endoscope": "endoscope",
+    }
+    np.testing.assert_array_equal(old.beams["laser"].end_mm, new.beams["laser"].end_mm)
+    np.testing.assert_array_equal(old.view_fraction, new.views["endoscope"])
+    assert old.cameras["endoscope"].fov_rad == new.camera.fov_rad
+
+
 DAMAGE = {
     "/time_s": (lambda a: a[:-1], r"'targets_mm' of the log has shape \(4, 1, 3\), expected \(3"),
     "/targets_mm": (lambda a: a[..., :2], "'targets_mm' of the log has shape"),
@@ -80,7 +102,10 @@ DAMAGE = {
     "/dose/rows": (lambda a: a + 100, "rows that the log does not have"),
     "/dose/station": (lambda a: a + 10**6, "stations that are not on its ring"),
     "/bodies/0/faces": (lambda a: changed(a, 0, 10**6), "faces without their vertices"),
-    "/beam/hits_organ": (lambda a: a.astype(float), "'hits_organ' of the beam holds float64"),
+    "/beams/laser/hits_organ": (
+        lambda a: a.astype(float),
+        "'hits_organ' of the beam of 'laser' holds",
+    ),
 }
 
 
@@ -122,7 +147,12 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(members, tmp_path):
         (("log", "table", "agents"), ["nobody"], "its agents are none of its arms"),
         (("log", "table", "dose", "table", "body"), "spleen", "a body that is not in it"),
         (("log", "table", "limits", "table"), {}, "a view without its limit"),
-        (("log", "table", "camera", "table", "range_mm"), [5.0, 1.0], "range is impossible"),
+        (
+            ("log", "table", "cameras", "table", "endoscope", "table", "range_mm"),
+            [5.0, 1.0],
+            "range is impossible",
+        ),
+        (("log", "table", "arms", "table", "laser", "table", "tool"), "knife", "unknown tool"),
         (("log", "table", "dt_s"), 10**400, "'dt_s' of the log is no number"),
         (("format",), "\x1b[2J", r"format text '\\x1b\[2J', expected"),
     ],

@@ -148,12 +148,14 @@ class Moments:
         mixed = weight * (mix.astype(np.float32) @ flat.reshape(points, -1))
         mixed = mixed.reshape(points, 3, rows, count)
         features = weight * uncertainty.features(x, d).astype(np.float32)
+        # In double precision, or it is not positive definite beside a large model discrepancy.
+        exact = features.astype(float)
         plain = np.stack([sum(c.T @ c for c in output) for output in mixed])
         cross = np.stack([[features.T @ output[axis] for output in mixed] for axis in range(3)])
         return cls(
             plain.astype(float),
             cross.astype(float),
-            (features.T @ features).astype(float),
+            exact.T @ exact,
             ratio,
             seconds,
         )

@@ -1,20 +1,38 @@
 """The pages of an amendment and of an improvement."""
 
+import inspect
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from surgisoft.diagnosis.amend import Amendment, Track
+from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
-from surgisoft.diagnosis.improve import Improvement, Round
-from surgisoft.report import Facts, Page, Picture, Section, Table, Text
+from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
+from surgisoft.diagnosis.pages.pictures import bodies, save
+from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.report import (
+    Command,
+    Facts,
+    Page,
+    Part,
+    Picture,
+    Section,
+    Share,
+    Table,
+    Text,
+    write_page,
+)
 from surgisoft.report.charts import BLUE, GREEN, RED, chart, drawing
 from surgisoft.report.style import MUTED
+from surgisoft.surrogate.effects import known_effects
+from surgisoft.time_axis import with_gaps
 
 HOW = (
     "The parameters were fitted through the whole model to the training part of the recordings, "
-    "with the model discrepancy beside them. The errors on top are those on the held-out part, "
-    "the last quarter of each recording, which was evaluated once.\n\n"
+    "with the model discrepancy beside them. The errors on top are those on the held-out part "
+    "(the last quarter of each recording, of four runs or more the last ones), evaluated once.\n\n"
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
     "correlated errors."
 )
@@ -81,13 +99,11 @@ def track_chart(track: Track, caption: str) -> Picture:
     """The error of both models over time; runs and recordings stand one after another."""
     from matplotlib import pyplot as plt
 
-    steps = np.diff(track.time_s, prepend=track.time_s[:1])
-    usual = float(np.median(steps[~track.start])) if (~track.start).any() else 1.0
-    along = np.cumsum(np.where(track.start, usual, np.maximum(steps, 0.0)))
-    width = max(1, len(along) // POINTS)
-    count = len(along) // width * width
+    width = max(1, len(track.time_s) // POINTS)
+    count = len(track.time_s) // width * width
+    time_s = track.time_s[:count].reshape(-1, width)[:, 0]
     with drawing():
-        figure, axis = plt.subplots(figsize=(7.2, 2.6))
+        figure, axis = plt.subplots(figsize=(7.2, 2.8))
         for values, colour, label in (
             (track.before_mm, RED, "before"),
             (track.after_mm, BLUE, "after"),
@@ -96,16 +112,26 @@ def track_chart(track: Track, caption: str) -> Picture:
             seen = np.isfinite(square)
             with np.errstate(invalid="ignore"):
                 mean = np.sqrt(np.nansum(square, 1) / np.where(seen.any(1), seen.sum(1), np.nan))
-            axis.plot(along[:count].reshape(-1, width).mean(1), mean, c=colour, lw=1, label=label)
+            axis.plot(*with_gaps(time_s, mean), c=colour, lw=1, label=label)
         axis.set_xlabel("time [s]")
         axis.set_ylabel("error [mm]")
         axis.set_ylim(bottom=0)
-        axis.legend()
+        figure.legend(loc="outside lower center", ncols=2)
         return chart(figure, caption, caption)
 
 
-def improve_page(result: Improvement, title: str, about: str) -> Page:
-    """The page of an improvement."""
+def improve_page(
+    result: Improvement,
+    title: str,
+    about: str,
+    measured: ResidualTable | None = None,
+    drawn: Path | None = None,
+) -> Page:
+    """The page of an improvement, which tells a colleague the whole story.
+
+    measured: residuals of the given model, from which the page says what was measured. drawn: a
+    picture of the bodies before and after.
+    """
     fall = result.held_out
     facts = Facts(
         [
@@ -117,19 +143,188 @@ def improve_page(result: Improvement, title: str, about: str) -> Page:
         ]
     )
     training, held_out = result.tracks
-    parts = [facts]
+    parts: list[Part] = [facts]
+    if measured is not None:
+        parts.append(_measured(measured))
+    failed: list[Part] = []
+    if drawn is not None:
+        alt = "The body before and after, measured and predicted, with one scale of the errors"
+        failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620))
+    failed += [
+        track_chart(held_out, "Error on the held-out part: not used in any round"),
+        track_chart(training, "Error on the training part: diagnosed and fitted on it"),
+    ]
+    parts.append(Section("Where the model failed", failed))
+    if result.diagnoses:
+        parts.append(_missing(result))
+    worth: list[Part] = []
     if result.steps:
-        parts.append(waterfall_picture(fall.before, result.steps, fall.floor))
-    parts.append(Section("Rounds", [_rounds(result.rounds)]))
+        worth.append(waterfall_picture(fall.before, result.steps, fall.floor))
+    parts.append(
+        Section("What it is worth", [*worth, Text(_worth(result)), _rounds(result.rounds)])
+    )
     if result.parameters:
         parts.append(Section("Parameters", [parameter_table(result.parameters)]))
-    charts = [
-        track_chart(held_out, "Held-out part: not used in any round"),
-        track_chart(training, "Training part: diagnosed and fitted on it"),
-    ]
-    parts += [Section("Error over time", charts), Section("How to read this", [Text(HOW)])]
+    if result.diagnoses:
+        parts.append(_left(result))
+    parts.append(Section("How to read this", [Text(HOW)]))
     tone = "good" if result.claimed else "warn"
     return Page(title=title, verdict=result.sentence, about=about, tone=tone, parts=parts)
+
+
+def write_improve_report(
+    result: Improvement, tables: dict[str, ResidualTable], folder: Path, title: str
+) -> list[Path]:
+    """Write the report of an improvement to a folder; returns its files, the page first.
+
+    tables: residuals `before` and `after`, on the same recordings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = []
+    before = tables["before"]
+    if before.spec.key_points > 1:
+        # The held-out part, as in the numbers on top; without a step both bodies are the same.
+        shown = {name: table.only("held_out") for name, table in tables.items()}
+        figure = bodies(shown if result.steps else {"before": shown["before"]}, title)
+        drawn.append(save(figure, folder / "bodies.png"))
+    picture = drawn[0] if drawn else None
+    page = improve_page(result, title, result.model.summary(), before, picture)
+    files = [write_page(page, folder / "report.html"), *drawn]
+    if result.steps:
+        fall, path = result.held_out, folder / "waterfall.png"
+        files.append(write_waterfall(fall.before, result.steps, fall.floor, path))
+    return files
+
+
+def _measured(table: ResidualTable) -> Section:
+    """What the recordings hold."""
+    spec, rows = table.spec, []
+    for number, name in enumerate(table.names):
+        own = table.recording == number
+        pressure = table.pressure[own]
+        time_s = table.t_s[own]
+        timed = bool(table.timed[own].any())
+        rows.append(
+            (
+                name,
+                f"{own.sum():,}",
+                f"{(time_s[-1] - time_s[0]) / 60:.1f} min" if timed else "steady-state samples",
+                f"{len(np.unique(table.run[own]))}",
+                f"{np.nanmin(pressure):.3g} .. {np.nanmax(pressure):.3g} {spec.unit}",
+                f"{100 * table.held_out[own].mean():.0f} %",
+            )
+        )
+    header = ["recording", "rows", "duration", "runs", "actuation", "held out"]
+    text = (
+        f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded. The "
+        f"noise of a key point is {table.floor.rmse_mm:.3f} mm ({table.floor.source}); no model "
+        "can have a smaller error."
+        if table.floor.rmse_mm is not None
+        else f"{spec.chambers} chambers and {spec.key_points} key points of one arm were recorded."
+    )
+    return Section("What was measured", [Text(text), Table(header, rows)])
+
+
+MOST_WORDS = 6
+"""Effects of the ranking that the page lists; the page of the diagnosis has all."""
+
+
+def effect_words(name: str) -> str:
+    """What an effect is, in one sentence: the first of its docstring."""
+    found = known_effects().get(name)
+    return (inspect.getdoc(found) or "").split("\n")[0] if found is not None else ""
+
+
+def _missing(result: Improvement) -> Section:
+    """The ranking of the first diagnosis in words."""
+    first = result.diagnoses[0]
+    added = [name for name, _ in result.steps]
+    rows = [
+        (
+            each.effect,
+            effect_words(each.effect),
+            f"{each.heldout_rmse_mm:.3f} mm",
+            Share(each.gain_alone),
+            "added" if each.effect in added else _why_not(each.effect, first),
+        )
+        for each in first.ranking[:MOST_WORDS]
+    ]
+    sentence = first.verdict.sentence
+    words = [f"{sentence[:1].upper()}{sentence[1:]}."]
+    if first.ranking and rows:
+        words.append(_ranking_words(first, added))
+    header = ["effect", "what it is", "error left with it alone", "explains alone", "result"]
+    table = [Table(header, rows)] if rows else []
+    return Section("What was missing", [Text("\n\n".join(words)), *table])
+
+
+def _ranking_words(first: Diagnosis, added: Sequence[str]) -> str:
+    """The first few of the ranking in a sentence."""
+    best, *others = first.ranking
+    text = (
+        f"{best.effect} alone leaves {best.heldout_rmse_mm:.3f} mm of "
+        f"{first.error_mm.before:.3f} mm on held-out blocks"
+    )
+    if others:
+        text += f"; the next best, {others[0].effect}, {others[0].heldout_rmse_mm:.3f} mm"
+    more = [name for name in added if name not in (best.effect, NETWORK)]
+    if more:
+        text += f". Added too, in later rounds or beside it: {', '.join(more)}"
+    return text + "."
+
+
+def _why_not(name: str, first: Diagnosis) -> str:
+    if name in first.ambiguous_with:
+        return "explains as much"
+    row = next(each for each in first.ranking if each.effect == name)
+    return "explains nothing" if row.gain_alone <= 0.0 else f"confidence {row.confidence:.2f}"
+
+
+def _worth(result: Improvement) -> str:
+    fall = result.held_out
+    if not result.steps:
+        return "Nothing was added, so the error is what it was."
+    room = fall.before**2 - fall.floor**2
+    share = (fall.before**2 - fall.after**2) / room if room > 0 else float("nan")
+    times = fall.after / fall.floor if fall.floor > 0 else float("nan")
+    return (
+        f"The steps remove {100 * share:.0f} % of the squared error above the noise floor. What is "
+        f"left is {times:.1f} times the floor."
+    )
+
+
+def _left(result: Improvement) -> Section:
+    """What is left after the last round, and what to record next."""
+    last = result.diagnoses[-1]
+    end = result.rounds[-1]
+    parts: list[Part] = [Text(f"{end.sentence[:1].upper()}{end.sentence[1:]}.")]
+    if last.axis:
+        parts.append(Text(f"The remaining error depends most on {last.axis}."))
+    wrong = [each for each in result.parameters if not each.plausible]
+    if wrong:
+        names = ", ".join(f"{each.name} of {each.effect}" for each in wrong)
+        text = (
+            f"Outside its plausible range, so not known from these recordings: {names}. The error "
+            "falls with it, but its value is no measurement."
+        )
+        parts.append(Text(text))
+    if last.next_experiment:
+        plan = last.next_experiment
+        pairs = ", ".join(" from ".join(pair) for pair in plan.separates) or "none for certain"
+        text = f"Record next: {plan.name}, {plan.minutes:g} minutes; it distinguishes {pairs}."
+        parts.append(Text(text))
+    if last.next_command and not (result.steps and "amend" in last.next_command):
+        command = last.next_command.format(model="NEW", data="REC", before="")
+        parts.append(Command(command))
+    if last.not_testable:
+        rows = [(each.effect, each.reason) for each in last.not_testable]
+        text = (
+            "These recordings cannot show the following effects. To test one, record what it needs:"
+        )
+        parts += [Text(text), Table(["effect", "why it could not be tested"], rows)]
+    elif not last.next_experiment and not last.next_command:
+        parts.append(Text("No further recording is asked for: every effect could be tested."))
+    return Section("What is left, and what to record next", parts)
 
 
 def _rounds(rounds: tuple[Round, ...]) -> Table:

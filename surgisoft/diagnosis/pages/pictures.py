@@ -8,26 +8,28 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.residuals import ResidualTable
-from surgisoft.surrogate.backbone import Backbone
+from surgisoft.error_scale import error_scale
+from surgisoft.palette import MEASURED_ON_LIGHT, RED, model_colour
+from surgisoft.time_axis import with_gaps
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
 
-MEASURED, PREDICTED = "#222222", "#d1495b"
+MEASURED, PREDICTED = MEASURED_ON_LIGHT, RED
 LOOP_ROWS = 160
 """Most rows that one picture of loops shows; more would hide each other."""
 LADDER_ROWS = 400
 """Rows of the ladder's picture, in which one chamber moves alone."""
 POSTURES = 7
 """Bodies that the picture in space shows."""
+ERROR_COLOURS = "viridis"
+"""Matplotlib's colour map of errors; the replay's is after it."""
 
 
-def draw_all(
-    table: ResidualTable, backbone: Backbone | None, unit: str, folder: Path, title: str = ""
-) -> list[Path]:
+def draw_all(table: ResidualTable, unit: str, folder: Path, title: str = "") -> list[Path]:
     """Write loops.png, body.png and error.png into a folder; returns their paths.
 
-    Without a backbone (an arm of one key point) there is no body to draw.
+    An arm of one key point has no body to draw.
     """
     folder.mkdir(parents=True, exist_ok=True)
     drawn = []
@@ -36,8 +38,8 @@ def draw_all(
         radius = table.model.error_radius(torch.from_numpy(table.pressure))[:, -1].numpy()
     error = error_over_time(table, title, radius)
     figures = [("loops", loops(table, unit, title)), ("error", error)]
-    if backbone is not None:
-        figures.insert(1, ("body", body(table, backbone, title)))
+    if table.spec.key_points > 1:
+        figures.insert(1, ("body", bodies({"predicted": table}, title)))
     for name, figure in figures:
         drawn.append(save(figure, folder / f"{name}.png"))
     return drawn
@@ -168,35 +170,79 @@ def _main_direction(points: np.ndarray) -> np.ndarray:
     return np.linalg.svd(centred, full_matrices=False)[2][0]
 
 
-def body(table: ResidualTable, backbone: Backbone, title: str = ""):
-    """A few postures in space: measured key points, predicted ones and their backbone."""
-    whole = np.flatnonzero(~np.isnan(table.measured_mm).any(axis=(1, 2)))
-    figure = plt.figure(figsize=(6.5, 6.2), layout="constrained")
-    axis = figure.add_subplot(projection="3d")
-    for number, row in enumerate(_spread(table.measured_mm[whole, -1])):
-        row = whole[row]
-        points = torch.tensor(table.predicted_mm[row], dtype=torch.float32)
-        line = backbone.centreline(points).numpy()
-        first = number == 0
-        axis.plot(*line.T, c=PREDICTED, lw=2, label="predicted backbone" if first else None)
-        axis.scatter(*points.numpy().T, c=PREDICTED, s=14)
-        axis.scatter(
-            *table.measured_mm[row].T,
-            facecolors="none",
-            edgecolors=MEASURED,
-            s=55,
-            label="measured key points" if first else None,
-        )
-    axis.set_xlabel("x [mm]")
-    axis.set_ylabel("y [mm]")
-    axis.set_zlabel("z [mm]")
-    axis.set_aspect("equal")
+def bodies(tables: dict[str, ResidualTable], title: str = ""):
+    """Postures in space, measured and as each model predicts them, with magnified errors.
+
+    One column for each model, the same postures and one scale of the errors in all of them. Each
+    error is an arrow from the measured key point towards the predicted one. The postures are far
+    apart and among those of larger error.
+    """
+    first = next(iter(tables.values()))
+    scale = error_scale(first.measured_mm, [table.error_mm for table in tables.values()])
+    rows = _worse_rows(tables)
+    count = len(tables)
+    figure = plt.figure(figsize=(5.4 * count + 0.6, 6.0), layout="constrained")
+    figure.suptitle(title or "Body, measured and predicted")
+    colours = plt.get_cmap(ERROR_COLOURS)
+    panels = []
+    for number, (name, table) in enumerate(tables.items()):
+        axis = figure.add_subplot(1, count, number + 1, projection="3d")
+        panels.append(axis)
+        line = table.model.backbone() if table.spec.key_points > 1 else None
+        for place, row in enumerate(rows):
+            label = name if place == 0 else None
+            measured, predicted = table.measured_mm[row], table.predicted_mm[row]
+            for points, colour, wide, what in (
+                (measured, MEASURED, 2.6, "measured" if place == 0 else None),
+                (predicted, model_colour(number), 1.4, label),
+            ):
+                drawn = points
+                if line is not None:
+                    drawn = line.centreline(torch.tensor(points, dtype=torch.float32)).numpy()
+                axis.plot(*drawn.T, c=colour, lw=wide, label=what)
+            error = table.error_mm[row]
+            shade = colours(np.clip(error / scale.large_mm, 0.0, 1.0))
+            axis.scatter(*measured.T, c=shade, s=22, depthshade=False)
+            for start, move, tint in zip(measured, predicted - measured, shade, strict=True):
+                end = start + scale.stretch * move
+                axis.plot(*np.stack((start, end)).T, c=tint, lw=2.2)
+        axis.set_xlabel("x [mm]")
+        axis.set_ylabel("y [mm]")
+        axis.set_zlabel("z [mm]")
+        known = table.error_mm[~np.isnan(table.error_mm)]
+        rms = np.sqrt(np.square(known).mean())
+        axis.set_title(f"{name}: error {rms:.3g} mm")
+        if len(rows):
+            axis.legend(frameon=False, loc="upper left")
+    _same_box(panels)
+    norm = mpl.colors.Normalize(0.0, scale.large_mm)
+    bar = figure.colorbar(
+        mpl.cm.ScalarMappable(norm, colours), ax=panels, shrink=0.6, location="bottom", aspect=40
+    )
+    bar.set_label(f"error of a key point [mm]; lines of errors are {scale.stretch:g} times as long")
     # The label of z stands outside the axes' own box.
-    figure.get_layout_engine().set(rect=(0.0, 0.0, 0.94, 1.0))
-    if len(whole):
-        axis.legend(frameon=False, loc="upper left")
-    axis.set_title(title or "Body, measured and predicted")
+    figure.get_layout_engine().set(rect=(0.0, 0.0, 0.97, 1.0))
     return figure
+
+
+def _worse_rows(tables: dict[str, ResidualTable]) -> np.ndarray:
+    """Rows of complete postures that are far apart, of the half with the larger error."""
+    measured = next(iter(tables.values())).measured_mm
+    whole = np.flatnonzero(~np.isnan(measured).any(axis=(1, 2)))
+    if not len(whole):
+        return whole
+    error = np.max([table.error_mm[whole].max(axis=1) for table in tables.values()], axis=0)
+    worse = whole[error >= np.median(error)]
+    return worse[_spread(measured[worse, -1])]
+
+
+def _same_box(panels) -> None:
+    """Give all panels in space the same limits, with equal axes."""
+    limits = [np.array([getattr(panel, f"get_{axis}lim")() for panel in panels]) for axis in "xyz"]
+    for panel in panels:
+        for axis, values in zip("xyz", limits, strict=True):
+            getattr(panel, f"set_{axis}lim")(values[:, 0].min(), values[:, 1].max())
+        panel.set_aspect("equal")
 
 
 def _spread(tips: np.ndarray) -> list[int]:
@@ -212,8 +258,9 @@ def _spread(tips: np.ndarray) -> list[int]:
 
 
 def error_over_time(table: ResidualTable, title: str = "", radius: np.ndarray | None = None):
-    """Tip and mean error over the rows, runs marked, and the distribution per key point.
+    """Tip and mean error over time, pauses left blank, and the distribution per key point.
 
+    Time is that of `ResidualTable.along_s`, as in the table of worst moments and in the replay.
     radius: (N,) of the tip's 95 % prediction interval, mm, drawn as a band; None: not known.
     """
     error = table.error_mm
@@ -222,21 +269,40 @@ def error_over_time(table: ResidualTable, title: str = "", radius: np.ndarray | 
     )
     # Rows that lack a key point are left out: a mean over the others jumps to the base's error.
     whole = np.flatnonzero(~np.isnan(error).any(axis=1))
-    left.plot(whole, error[whole, -1], c=PREDICTED, lw=0.6, label="tip")
+    time_s = table.along_s[whole]
+    left.plot(*with_gaps(time_s, error[whole, -1]), c=PREDICTED, lw=0.6, label="tip")
     if radius is not None:
         band = {"color": PREDICTED, "alpha": 0.15, "lw": 0}
-        left.fill_between(whole, 0, radius[whole], label="tip, 95 % interval", **band)
+        edge = with_gaps(time_s, radius[whole])
+        left.fill_between(edge[0], 0, edge[1], label="tip, 95 % interval", **band)
     mean = error[whole].mean(axis=1)
-    left.plot(whole, mean, c=MEASURED, lw=0.6, label="mean of the key points")
-    for edge in np.flatnonzero(np.diff(table.run)):
-        left.axvline(edge + 0.5, c="#bbbbbb", lw=0.6)
-    left.set_xlabel("row (runs are divided by lines)")
+    left.plot(*with_gaps(time_s, mean), c=MEASURED, lw=0.6, label="mean of the key points")
+    mark_recordings(left, table)
+    left.set_xlabel("time [s]" + (", recordings one after another" if len(table.names) > 1 else ""))
     left.set_ylabel("error [mm]")
     left.set_ylim(bottom=0)
-    left.legend(frameon=False)
     left.set_title(title or "Error over the recording")
     columns = [column[~np.isnan(column)] for column in error.T]
     right.boxplot(columns, showfliers=False, tick_labels=[f"k{k}" for k in range(len(columns))])
     right.set_ylabel("error [mm]")
     right.set_title("by key point")
+    figure.legend(frameon=False, loc="outside lower left", ncols=3)
     return figure
+
+
+def mark_recordings(axis, table: ResidualTable) -> None:
+    """Lines where the next recording begins, with its name, and a shade over the held-out part."""
+    for edge in np.flatnonzero(np.diff(table.recording)) + 1:
+        time_s = table.along_s[edge]
+        axis.axvline(time_s, c="#888888", lw=0.8, ls=":")
+        name = table.names[table.recording[edge]]
+        axis.annotate(
+            name,
+            (time_s, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, -3),
+            textcoords="offset points",
+            va="top",
+            fontsize=7,
+            color="#888888",
+        )

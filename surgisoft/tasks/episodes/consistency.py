@@ -18,6 +18,7 @@ from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.episodes.parts import (
     LEVELS,
     ROLES,
+    TOOLS,
     ArmLog,
     BeamLog,
     BodyLog,
@@ -35,8 +36,9 @@ SHAPES: dict[type, dict[str, tuple[Shape, str]]] = {
         "targets_mm": (("T", "k", 3), "f"),
         "actuals_mm": (("T", "k", 3), "f"),
         "path_mm": (("M", 3), "f"),
+        "path_starts": (("J",), "i"),
+        "path_closed": (("J",), "b"),
         "clearance_mm": (("T",), "f"),
-        "view_fraction": (("T",), "f"),
     },
     ArmLog: {
         "command_kPa": (("T", "m"), "f"),
@@ -74,6 +76,7 @@ SHAPES: dict[type, dict[str, tuple[Shape, str]]] = {
 
 TEXTS = {
     EpisodeLog: ("task", "driver", "on"),
+    ArmLog: ("tool",),
     DoseLog: ("body",),
     BodyLog: ("name", "role"),
     Event: ("level", "text"),
@@ -135,10 +138,22 @@ def _contradictions(log: EpisodeLog, rows: int):
         yield "its agents are none of its arms"
     if not log.arms:
         yield "it has no arms"
+    if (log.path_starts is None) != (log.path_closed is None):
+        yield "its paths have no beginnings or no ends"
+    elif log.path_starts is not None:
+        starts = log.path_starts
+        if (
+            not len(starts)
+            or starts[0] != 0
+            or (np.diff(starts, append=len(log.path_mm)) < 1).any()
+        ):
+            yield "its paths do not begin one after the other"
     for name, arm in log.arms.items():
         yield from _of_part(f"arm '{name}'", arm, rows)
         if min(arm.points_mm.shape[1], arm.line_mm.shape[1] - 2, arm.command_kPa.shape[1]) < 1:
             yield f"arm '{name}' has no body"
+        if arm.tool not in ("", *TOOLS):
+            yield f"arm '{name}' has an unknown tool '{arm.tool}'"
         if not (0.0 < arm.radius_mm < LARGEST_MM and 0.0 <= arm.shaft_mm < LARGEST_MM):
             yield f"arm '{name}' has a radius or a shaft of an impossible size"
     yield from _numbers_by_name("measures", log.measures, rows)
@@ -147,14 +162,18 @@ def _contradictions(log: EpisodeLog, rows: int):
         yield from _numbers_by_name(f"rewards of '{agent}'", terms, rows)
     if not _is_table(log.limits) or not all(map(_is_finite, log.limits.values())):
         yield "its limits are no numbers"
-    if log.beam is not None:
-        yield from _of_part("the beam", log.beam, rows)
-        if "laser" not in log.arms:
-            yield "it has a beam without the arm 'laser'"
-    if log.view_fraction is not None and "view_fraction" not in log.limits:
+    for parts, what in ((log.beams, "beam"), (log.cameras, "camera"), (log.views, "view")):
+        yield from _not_a_table(f"{what}s", parts)
+        for name in parts:
+            if name not in log.arms:
+                yield f"it has a {what} without the arm '{name}'"
+    for name, beam in log.beams.items():
+        yield from _of_part(f"the beam of '{name}'", beam, rows)
+    yield from _numbers_by_name("views", log.views, rows)
+    if log.views and "view_fraction" not in log.limits:
         yield "it has a view without its limit"
-    if log.camera is not None:
-        yield from _of_camera(log.camera)
+    for camera in log.cameras.values():
+        yield from _of_camera(camera)
     names = [body.name for body in log.bodies]
     for body in log.bodies:
         yield from _of_part(f"body '{body.name}'", body, rows)

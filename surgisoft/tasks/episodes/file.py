@@ -29,8 +29,10 @@ _HEADERS: dict[tuple[int, int], Any] = {
 }
 SUFFIX = ".npz"
 """Suffix of the file of an episode."""
-FORMAT = "surgisoft episode 1"
+FORMAT = "surgisoft episode 2"
 """Name and version of the file format."""
+FIRST_FORMAT = "surgisoft episode 1"
+"""Former format, of one laser named `laser` and one endoscope named `endoscope`."""
 
 
 def save_episode(log: EpisodeLog, path: str | Path) -> None:
@@ -61,9 +63,10 @@ def load_episode(path: str | Path) -> EpisodeLog:
         raise InputError(f"{path}: cannot be read as .npz ({error}); {wanted}") from None
     try:
         table = json.loads(arrays.pop("table").tobytes())
-        if table["format"] != FORMAT:
+        if table["format"] not in (FORMAT, FIRST_FORMAT):
             raise InputError(f"{path}: format {describe(table['format'])}, expected '{FORMAT}'")
-        log = _log(_joined(table["log"], arrays))
+        joined = _joined(table["log"], arrays)
+        log = _log(_present(joined) if table["format"] == FIRST_FORMAT else joined)
     except InputError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError):
@@ -132,10 +135,23 @@ def _joined(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return value
 
 
+def _present(table: dict[str, Any]) -> dict[str, Any]:
+    """The table of a log of the former format as one of the present format."""
+    beam, camera, view = (table.pop(name) for name in ("beam", "camera", "view_fraction"))
+    table["beams"] = {} if beam is None else {"laser": beam}
+    table["cameras"] = {} if camera is None else {"endoscope": camera}
+    table["views"] = {} if view is None else {"endoscope": view}
+    if beam is not None:
+        for name, arm in table["arms"].items():
+            arm["tool"] = name if name in ("laser", "endoscope") else ""
+    return table
+
+
 def _log(table: dict[str, Any]) -> EpisodeLog:
     table["arms"] = {name: ArmLog(**arm) for name, arm in table["arms"].items()}
-    for name, kind in (("beam", BeamLog), ("camera", CameraLog), ("dose", DoseLog)):
-        table[name] = None if table[name] is None else kind(**table[name])
+    for name, kind in (("beams", BeamLog), ("cameras", CameraLog)):
+        table[name] = {arm: kind(**part) for arm, part in table[name].items()}
+    table["dose"] = None if table["dose"] is None else DoseLog(**table["dose"])
     table["bodies"] = tuple(BodyLog(**body) for body in table["bodies"])
     table["events"] = tuple(Event(**event) for event in table["events"])
     return EpisodeLog(**table)

@@ -7,7 +7,7 @@ stands alone: the scene's bodies, the dose's triangles and the camera are in it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from surgisoft.tasks.episodes.parts import (
     DoseLog,
     Event,
 )
-from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
+from surgisoft.tasks.world.scene import SceneEngine
 
 NO_DIAMETER_MM = 15.0
 """Outer diameter (mm) of an arm where neither scene nor model states it: the paper's arm."""
@@ -57,32 +57,74 @@ class EpisodeLog:
     actuals_mm: np.ndarray
     """(T, k, 3) mm: actual place of the task's points."""
     path_mm: np.ndarray
-    """(M, 3) mm: the closed path that is asked for; (0, 3) where there is none but the targets."""
+    """(M, 3) mm: the paths that are asked for; (0, 3) where there is none but the targets."""
     measures: dict[str, np.ndarray]
     """The task's measures: name with unit -> (T,); nan where one does not apply."""
     rewards: dict[str, dict[str, np.ndarray]]
     """agent -> reward term -> (T,); nan in row 0."""
     limits: dict[str, float]
     """The scene's limits: `clearance_mm`, `view_fraction`, `time_s`; empty without a scene."""
-    beam: BeamLog | None = None
-    """The laser's beam."""
-    camera: CameraLog | None = None
-    """The endoscope's camera."""
+    beams: dict[str, BeamLog] = field(default_factory=dict)
+    """Each laser's beam by the arm's name."""
+    cameras: dict[str, CameraLog] = field(default_factory=dict)
+    """Each endoscope's camera by the arm's name."""
     clearance_mm: np.ndarray | None = None
-    """(T,) mm: least distance of any arm from a body or the other arm."""
-    view_fraction: np.ndarray | None = None
-    """(T,) 0..1: share of the ring that the endoscope sees."""
+    """(T,) mm: least distance of any arm from a body or another arm."""
+    views: dict[str, np.ndarray] = field(default_factory=dict)
+    """Endoscope's name -> (T,) 0..1: share of the ring that it sees."""
     dose: DoseLog | None = None
     """Dose map of the organ around the ring."""
     bodies: tuple[BodyLog, ...] = ()
     """The bodies of the scene."""
     events: tuple[Event, ...] = ()
     """Events of the episode, in order of time."""
+    path_starts: np.ndarray | None = None
+    """(J,) int: number of the first point of each path in `path_mm`; None: one path."""
+    path_closed: np.ndarray | None = None
+    """(J,) bool: whether the last point of a path is followed by its first; None: it is."""
+
+    @property
+    def one_ring(self) -> bool:
+        """Whether one closed path is asked for."""
+        return self.path_closed is None or self.path_closed.tolist() == [True]
+
+    @property
+    def paths_mm(self) -> list[np.ndarray]:
+        """The paths that are asked for, (N, 3) mm each; of a closed one the first point is last."""
+        starts = [0] if self.path_starts is None else self.path_starts.tolist()
+        closed = [True] * len(starts) if self.path_closed is None else self.path_closed.tolist()
+        pieces = np.split(self.path_mm, starts[1:])
+        return [
+            np.vstack((piece, piece[:1])) if back else piece
+            for piece, back in zip(pieces, closed, strict=True)
+            if len(piece)
+        ]
 
     @property
     def rows(self) -> int:
         """Number T of rows."""
         return len(self.time_s)
+
+    @property
+    def beam(self) -> BeamLog | None:
+        """The beam of the first laser; None without one."""
+        return next(iter(self.beams.values()), None)
+
+    @property
+    def camera(self) -> CameraLog | None:
+        """The camera of the first endoscope; None without one."""
+        return next(iter(self.cameras.values()), None)
+
+    @property
+    def view_fraction(self) -> np.ndarray | None:
+        """(T,) 0..1: share of the ring that the first endoscope sees; None without one."""
+        return next(iter(self.views.values()), None)
+
+    @property
+    def burning(self) -> np.ndarray | None:
+        """(T,) bool: some beam burnt in the step before; None without a laser."""
+        on = [beam.on for beam in self.beams.values()]
+        return np.any(on, axis=0) if on else None
 
     @property
     def target_mm(self) -> np.ndarray:
@@ -172,7 +214,7 @@ class EpisodeRecorder:
             arms={name: self._arm(name, rows) for name in task.world.arms},
             targets_mm=rows["targets"],
             actuals_mm=rows["actuals"],
-            path_mm=self._path(near),
+            **self._paths(near),
             measures=_below(rows, "measures/"),
             rewards={agent: _below(rows, f"rewards/{agent}/") for agent in task.agents},
             limits={} if near is None else _limits(near),
@@ -201,12 +243,13 @@ class EpisodeRecorder:
         near = state.world.scene
         if near.clearance is not None:
             row["clearance"] = near.clearance.least_mm
-        if near.hit is not None:
-            row |= {"end": near.hit.point_mm, "hits": near.hit.on_organ}
-        if near.view is not None:
-            row["view"] = near.view.fraction
+        for name, hit in near.hits.items():
+            row |= {f"end/{name}": hit.point_mm, f"hits/{name}": hit.on_organ}
+        row |= {f"view/{name}": view.fraction for name, view in near.views.items()}
         if near.dose is not None:
-            row["delivered"] = near.dose.delivered_j
+            delivered = near.dose.delivered_j
+            delivered = delivered.reshape(len(delivered), -1).unbind(1)
+            row |= {f"delivered/{n}": j for n, j in zip(near.hits, delivered, strict=True)}
             self._add_dose(self._of(near.dose.dose))
         self._rows.append({name: self._of(value) for name, value in row.items()})
 
@@ -237,27 +280,42 @@ class EpisodeRecorder:
             mount=self._mounts[name],
             radius_mm=float(radius),
             shaft_mm=float(-arm.shaft[0, 2]) if len(arm.shaft) else 0.0,
+            tool=self._tool(name),
         )
+
+    def _tool(self, name: str) -> str:
+        """The tool of an arm; empty without a scene."""
+        around = self.task.world.scene
+        return around.spec.mount(name).tool if isinstance(around, SceneEngine) else ""
 
     def _scene_fields(self, near: SceneEngine, rows: Mapping[str, np.ndarray]) -> dict:
         """The log's fields that only a scene has."""
-        burnt = np.diff(rows["delivered"], prepend=rows["delivered"][:1])
-        beam = BeamLog(burnt / self.task.world.config.dt_s, rows["end"], rows["hits"])
         camera = CameraLog(near.camera.fov_rad, tuple(map(float, near.camera.range_mm)))
         return {
-            "beam": beam,
-            "camera": camera if ENDOSCOPE in self.task.world.arms else None,
+            "beams": {name: self._beam_log(name, rows) for name in near.lasers},
+            "cameras": dict.fromkeys(near.endoscopes, camera),
             "clearance_mm": rows["clearance"],
-            "view_fraction": rows["view"],
-            "dose": self._dose_log(near),
+            "views": _below(rows, "view/"),
+            "dose": self._dose_log(near) if near.lasers else None,
             "bodies": tuple(_body(body) for body in near.geometry.bodies),
         }
 
-    def _path(self, near: SceneEngine | None) -> np.ndarray:
-        """(M, 3) mm: the ring's path of this episode's lesion."""
+    def _beam_log(self, name: str, rows: Mapping[str, np.ndarray]) -> BeamLog:
+        """The beam of one laser."""
+        delivered = rows[f"delivered/{name}"]
+        burnt = np.diff(delivered, prepend=delivered[:1])
+        power = burnt / self.task.world.config.dt_s
+        return BeamLog(power, rows[f"end/{name}"], rows[f"hits/{name}"])
+
+    def _paths(self, near: SceneEngine | None) -> dict[str, np.ndarray]:
+        """The paths of this episode's lesion, as fields of the log."""
         if near is None:
-            return np.zeros((0, 3), np.float32)
-        return near.paths_mm[self._lesion].detach().cpu().numpy().copy()
+            return {"path_mm": np.zeros((0, 3), np.float32)}
+        return {
+            "path_mm": near.paths_mm[self._lesion].detach().cpu().numpy().copy(),
+            "path_starts": np.array([each.first for each in near.stretches]),
+            "path_closed": np.array([each.closed for each in near.stretches]),
+        }
 
     def _dose_log(self, near: SceneEngine) -> DoseLog:
         ablation, patch = near.ablation, near.ablation.patches[self._lesion]
@@ -316,11 +374,15 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
     """
     found: list[Event] = []
     found.append(Event(0.0, "info", f"{log.task} by {log.driver} in {log.on}, seed {log.seed}"))
-    if log.beam is not None:
-        found += _changes(log, log.beam.on, ("info", "beam on"), ("info", "beam off"))
-    if log.view_fraction is not None:
-        seen = log.view_fraction >= log.limits["view_fraction"]
-        found += _changes(log, seen, ("info", "lesion in sight"), ("warning", "lesion lost"))
+    for name, beam in log.beams.items():
+        whose = f" of {name}" if len(log.beams) > 1 else ""
+        words = ("info", f"beam{whose} on"), ("info", f"beam{whose} off")
+        found += _changes(log, beam.on, *words)
+    for name, view in log.views.items():
+        seen = view >= log.limits["view_fraction"]
+        by = f" by {name}" if len(log.views) > 1 else ""
+        words = ("info", f"lesion in sight{by}"), ("warning", f"lesion lost{by}")
+        found += _changes(log, seen, *words)
     if log.clearance_mm is not None:
         if "clearance_mm" in log.limits:
             least = log.limits["clearance_mm"]
@@ -335,7 +397,8 @@ def find_events(log: EpisodeLog, ending: str = "") -> tuple[Event, ...]:
         found += _changes(log, folded, ("error", "an arm touches itself"), ("info", "arm unfolded"))
     completion = log.measures.get("completion")
     if completion is not None and len(whole := np.flatnonzero(completion >= 1.0)):
-        found.append(Event(float(log.time_s[whole[0]]), "info", "ring cut all around"))
+        text = "ring cut all around" if log.one_ring else "all is treated"
+        found.append(Event(float(log.time_s[whole[0]]), "info", text))
     if ending:
         found.append(Event(float(log.time_s[-1]), *_end(log, ending)))
     return tuple(sorted(found, key=lambda event: event.time_s))

@@ -13,6 +13,8 @@ LEVELS = ("info", "warning", "error")
 """How grave an event is."""
 ROLES = ("organ", "keep-out", "support")
 """Roles of bodies, as in a scene."""
+TOOLS = ("laser", "endoscope", "tip")
+"""Tools of arms, as in a scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,13 @@ class ArmLog:
     """Radius of the body, mm."""
     shaft_mm: float
     """Length of the rigid shaft behind the base, mm; 0: none."""
+    tool: str = ""
+    """Tool of the arm, as in a scene; empty where there is no scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class BeamLog:
-    """The laser's beam; it leaves the laser arm's tip along its direction."""
+    """A laser's beam; it leaves the laser arm's tip along its direction."""
 
     power_w: np.ndarray
     """(T,) W: mean power that reached the organ in the step before; 0 while the beam is off."""
@@ -72,7 +76,7 @@ class BeamLog:
 
 @dataclass(frozen=True, eq=False)
 class CameraLog:
-    """The camera in the endoscope's tip; it looks along the tip's direction."""
+    """The camera in an endoscope's tip; it looks along the tip's direction."""
 
     fov_rad: float
     """Full cone angle of the round field of view, rad."""

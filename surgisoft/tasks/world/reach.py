@@ -1,6 +1,6 @@
 """Reach tables of a scene's arms: centrelines of the arm models as plain geometry."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from surgisoft.config import Where, read_toml
-from surgisoft.errors import InputError
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.reach import ArmReach
-from surgisoft.scene.spec import FILE, TOOLS, MountSpec
+from surgisoft.scene.spec import FILE, TOOLS, MountSpec, arm_names, arm_rank
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.checkpoint import default_arm, load_model
 from surgisoft.surrogate.reach import model_table
@@ -34,40 +34,56 @@ def reach_of(mount: MountSpec, folder: Path | None = None, where: Where | None =
     return ArmReach(axes, lines, directions, np.array(spec.rest), 0.5 * mount.diameter_mm)
 
 
-def blank_mounts(models: Mapping[str, str] | None = None) -> dict[str, MountSpec]:
-    """Mounts without a place yet for each tool, with the length and diameter of its arm model.
+def blank_mounts(
+    tools: Sequence[str] = ("laser", "endoscope"), models: Mapping[str, str] | None = None
+) -> dict[str, MountSpec]:
+    """Mounts without a place yet by their arms' names, with the size of each arm's model.
 
-    models: the arm model of a tool, `default` or a fitted model's folder; a tool that is left out
-    has the default arm. Raises InputError where a folder holds no model, or one without a length.
+    tools: the tool of each arm; where several arms carry one they are `laser_1`, `laser_2`, ...
+    models: the arm model, `default` or a fitted model's folder, of an arm by its name, or of all
+    arms with a tool by the tool; an arm that is left out has the default one. Raises InputError
+    where a folder holds no model, or one without a length.
     """
+    if not tools:
+        raise InputError(f"no arm is given; expected at least one of {', '.join(TOOLS)}")
+    for tool in tools:
+        if tool not in TOOLS:
+            raise unknown_name("tool", tool, TOOLS)
+    plain = [MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)) for tool in tools]
+    named, models = dict(zip(arm_names(plain), plain, strict=True)), models or {}
+    for key in models:
+        if key not in named and key not in tools:
+            raise unknown_name("arm", key, named)
     mounts = {}
-    for tool in TOOLS:
-        name = (models or {}).get(tool, "default")
-        mount = MountSpec(tool, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-        if name != "default":
-            spec = load_model(name).spec
+    for name in sorted(named, key=lambda name: arm_rank(named[name].tool, name)):
+        mount = named[name]
+        mount = mount if name == mount.tool else replace(mount, name=name)
+        model = models.get(name, models.get(mount.tool, "default"))
+        if model != "default":
+            spec = load_model(model).spec
             if spec.length_mm is None:
                 raise InputError(
-                    f"{name}: the arm model states no length; fit it to recordings whose sidecar "
+                    f"{model}: the arm model states no length; fit it to recordings whose sidecar "
                     "has length_mm"
                 )
             mount = replace(
                 mount,
-                arm=str(Path(name).absolute()),
+                arm=str(Path(model).absolute()),
                 length_mm=spec.length_mm,
                 diameter_mm=spec.diameter_mm or mount.diameter_mm,
             )
-        mounts[tool] = mount
+        mounts[name] = mount
     return mounts
 
 
 def reaches_of(scene: Scene) -> dict[str, ArmReach]:
-    """The reach tables of both arms of a scene, by tool."""
+    """The reach tables of all arms of a scene, by name."""
     path = scene.folder / FILE
     where = read_toml(path)[1] if path.is_file() else Where(path)
+    names = arm_names(scene.spec.mounts)
     return {
-        mount.tool: reach_of(mount, scene.folder, where / "mounts" / i)
-        for i, mount in enumerate(scene.spec.mounts)
+        name: reach_of(mount, scene.folder, where / "mounts" / i)
+        for i, (name, mount) in enumerate(zip(names, scene.spec.mounts, strict=True))
     }
 
 

@@ -3,65 +3,90 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from surgisoft.errors import unknown_name
-from surgisoft.scene import frames
+from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.camera import View, view
+from surgisoft.scene.camera import View, seen_from
 from surgisoft.scene.capsules import BatchClearance
 from surgisoft.scene.collision import ExactScene
-from surgisoft.scene.dose_patch import SPACING_WAISTS, cut_patches
 from surgisoft.scene.folder import Scene
-from surgisoft.scene.lesion import lesions_like
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.spec import PHANTOM as PHANTOM
 from surgisoft.tasks.world.arm import ArmPart, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.treatment import Plan, rings
 
 GEOMETRIES = ("batched", "fcl")
 """Collision engines: `batched` for training, `fcl` exact."""
 LASER, ENDOSCOPE = "laser", "endoscope"
-"""Names of the arm that carries the beam and of the one that carries the camera."""
+"""Tools of the arms that carry a beam and of those that carry a camera; where one arm of a scene
+carries the tool, the arm has its name."""
 BEAM_BEYOND_MM = 50.0
 """The beam is followed this far beyond the laser's largest working distance (mm)."""
-PATH_POINTS = 360
-"""Points of the ring's path that the laser follows."""
 NOT_RANDOMISED = Randomisation()
 """Default: the scene's own lesion only."""
 
 
+Power = float | Tensor | Mapping[str, float | Tensor]
+"""Power of the beams, W: a number or (B,) for every laser, or one of them for each laser by name;
+a laser that is left out is off."""
+Item = TypeVar("Item")
+
+
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """The scene's state in B environments; None for what a world does not have."""
+    """The scene's state in B environments; None or empty for what a world does not have."""
 
     clearance: BatchClearance | None = None
     """Signed clearances of every arm, mm."""
-    hit: RayHit | None = None
-    """Where the beam ends, (B,)."""
+    hits: dict[str, RayHit] = field(default_factory=dict)
+    """Where each laser's beam ends, (B,), by the arm's name."""
     dose: AblationState | None = None
     """Dose map of the tissue."""
-    view: View | None = None
-    """What the endoscope sees of the ring, (B,)."""
+    views: dict[str, View] = field(default_factory=dict)
+    """What each endoscope sees of the ring, (B,), by the arm's name."""
     lesion: Tensor | None = None
     """(B,) int64: number of the episode's lesion among those laid out."""
+    watched: Tensor | None = None
+    """(B,) int64: number of the points that the endoscopes have to see from the next step on; a
+    task sets it where its target moves, and it begins with the lesion's number."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
 
+    @property
+    def hit(self) -> RayHit:
+        """Where the beam of the scene's only laser ends, (B,)."""
+        return only(self.hits, "laser")
 
-def measured_view(fraction: Tensor) -> SceneState:
-    """A scene of which only the share (B,) of the ring that the endoscope sees is known."""
+    @property
+    def view(self) -> View:
+        """What the scene's only endoscope sees of the ring, (B,)."""
+        return only(self.views, "endoscope")
+
+
+def only(by_arm: Mapping[str, Item], tool: str) -> Item:
+    """The entry of the only arm that carries a tool; an InputError where it is not one arm."""
+    if len(by_arm) != 1:
+        names = ", ".join(by_arm) or "none"
+        raise InputError(f"arms with the tool '{tool}': {names}; expected one, or an arm's name")
+    return next(iter(by_arm.values()))
+
+
+def measured_view(fraction: Tensor, endoscope: str = ENDOSCOPE) -> SceneState:
+    """A scene of which only the share (B,) of the ring that an endoscope sees is known."""
     unknown = torch.full_like(fraction, torch.nan)
     points = unknown[:, None].isfinite()
-    return SceneState(view=View(points, points, fraction, unknown, unknown, unknown))
+    return SceneState(views={endoscope: View(points, points, fraction, *3 * (unknown,))})
 
 
 def measured_clearance(least_mm: Tensor) -> SceneState:
@@ -92,9 +117,11 @@ class SceneEngineConfig:
 class SceneEngine:
     """Computes the state of a scene from the arms in it; built once, holds no state.
 
-    `spec` is the scene's file. `paths_mm` (K, 360, 3) mm, world frame, are the closed paths of the
-    rings around its K lesions, `centres_mm` (K, 3) mm their centres; `path_mm` and `centre_mm` are
-    those of the first. `collision` is the engine of clearance and of the beam's hit.
+    `spec` is the scene's file. `paths_mm` (K, M, 3) mm, world frame, are the points that the beam
+    follows around its K lesions, `stretches` the paths of which they consist, `centres_mm` (K, 3)
+    mm their centres; `path_mm` and `centre_mm` are those of the first. `looks_mm` (W, V, 3) mm are
+    what endoscopes have to see. `collision` is the engine of clearance and of the beams' hits.
+    `lasers` and `endoscopes` are the names of the arms with these tools.
     """
 
     def __init__(
@@ -104,33 +131,43 @@ class SceneEngine:
         device: str | torch.device = "cpu",
         engine: str | None = None,
         vary: Randomisation = NOT_RANDOMISED,
+        plan: Plan | None = None,
     ):
-        """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere."""
+        """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere.
+
+        plan: what is to be treated; None: rings around the scene's lesion (`treatment.rings`).
+        """
         config, spec, self.device = config or SceneEngineConfig(), scene.spec, torch.device(device)
-        radii = {mount.tool: 0.5 * mount.diameter_mm for mount in spec.mounts}
+        radii = {name: 0.5 * mount.diameter_mm for name, mount in spec.arms.items()}
+        self.lasers, self.endoscopes = spec.arms_with(LASER), spec.arms_with(ENDOSCOPE)
         self.geometry = BatchedScene(scene.bodies, radii, device, engine=engine)
         self.collision = collision_engine(config.geometry, self.geometry)
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
-        mesh, waist = scene.organ.world_mesh, 0.5 * spec.laser.spot_mm
-        place = (vary.lesions, vary.lesion_mm, vary.lesion_size)
-        scenes = [scene.with_lesion(one) for one in lesions_like(mesh, spec.lesion, *place)]
-        rings = [(one.ring.points_mm, one.ring.normals, one.ring.centre_mm) for one in scenes]
-        patches = cut_patches(mesh, rings, SPACING_WAISTS * waist, config.band_mm)
-        tissue = Tissue(spec.laser.absorption_per_mm)
-        self.ablation = AblationMap(patches, waist, tissue, config.depth_mm, device)
-        looks = [one.ring_of(count=config.view_points) for one in scenes]
-        paths = [one.ring_of(count=PATH_POINTS).points_mm for one in scenes]
+        treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
+        self.work_camera = self.camera
+        if treated.field_rad is not None:
+            narrow = min(treated.field_rad, self.camera.fov_rad)
+            self.work_camera = replace(self.camera, fov_rad=narrow)
+        self.ablation = AblationMap(
+            treated.patches,
+            0.5 * treated.spot_mm,
+            Tissue(spec.laser.absorption_per_mm),
+            config.depth_mm if treated.depth_mm is None else treated.depth_mm,
+            device,
+            exact_lesion=treated.exact_lesion,
+        )
 
-        def held(arrays) -> Tensor:
-            return torch.tensor(np.stack(arrays), dtype=torch.float32, device=self.device)
+        def held(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=self.device)
 
-        self.spec, self.lesions = spec, len(scenes)
-        self.paths_mm, self.centres_mm = held(paths), held([centre for _, _, centre in rings])
+        self.spec, self.lesions = spec, len(treated.patches)
+        self.stretches = treated.stretches
+        self.paths_mm, self.centres_mm = held(treated.paths_mm), held(treated.centres_mm)
+        self.path_normals = held(treated.normals)
         self.path_mm, self.centre_mm = self.paths_mm[0], self.centres_mm[0]
-        self.rings_mm = held([look.points_mm for look in looks])
-        self.ring_normals = held([look.normals for look in looks])
+        self.looks_mm, self.look_normals = held(treated.looks_mm), held(treated.look_normals)
 
     def start(self, stream: Stream, parts: Mapping[str, ArmPart]) -> tuple[Stream, SceneState]:
         """Draw a lesion for each random number stream; the scene with untouched tissue."""
@@ -138,22 +175,26 @@ class SceneEngine:
         if self.lesions > 1:
             stream, draw = stream.uniform(0.0, float(self.lesions))
             lesion = draw.long().clamp(max=self.lesions - 1)
-        scene = self._look(parts, lesion)
-        dose = self.ablation.start(*self._beam(scene, parts), lesion)
+        scene = self._look(parts, lesion, lesion)
+        if not self.lasers:
+            return stream, scene
+        dose = self.ablation.start(*self._beams(scene, parts), lesion)
         return stream, replace(scene, dose=dose)
 
     def step(
         self,
         scene: SceneState,
         parts: Mapping[str, ArmPart],
-        power_w: float | Tensor,
+        power_w: Power,
         dt_s: float,
     ) -> SceneState:
-        """The scene after the arms moved and the beam swept with `power_w` (B,) W for dt_s."""
-        after = self._look(parts, scene.lesion)
-        beam = self._beam(after, parts)
+        """The scene after the arms moved and the beams swept with `power_w` for dt_s."""
+        after = self._look(parts, scene.lesion, scene.watched)
+        if scene.dose is None:
+            return replace(after, donated=scene.donated)
+        beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
         in_place = scene.donated and overwritable(scene.dose.dose)
-        dose = self.ablation.advance(scene.dose, *beam, power_w, dt_s, in_place)
+        dose = self.ablation.advance(scene.dose, *beams, power, dt_s, in_place)
         return replace(after, dose=dose, donated=scene.donated)
 
     def fresh_dose(
@@ -164,27 +205,53 @@ class SceneEngine:
         parts: Mapping[str, ArmPart],
     ) -> AblationState:
         """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
-        beam = self._beam(scene, parts)
+        beams = self._beams(scene, parts)
         in_place = scene.donated and overwritable(dose.dose)
-        return self.ablation.reset(dose, mask, *beam, in_place, scene.lesion)
+        return self.ablation.reset(dose, mask, *beams, in_place, scene.lesion)
 
-    def aimed(self, parts: Mapping[str, ArmPart]) -> RayHit:
-        """Where the beam of the arms in `parts` ends, (B,)."""
+    def aimed(self, parts: Mapping[str, ArmPart], laser: str = LASER) -> RayHit:
+        """Where the beam of a laser ends, (B,), with the arms as in `parts`."""
         lines = {name: part.line_mm for name, part in parts.items()}
-        beam = parts[LASER]
-        return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=LASER)
+        beam = parts[laser]
+        return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=laser)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor) -> SceneState:
-        lines, eye = {name: part.line_mm for name, part in parts.items()}, parts[ENDOSCOPE]
-        clearance, hit = self.collision.clearance(lines), self.aimed(parts)
-        pose = frames.pose_from_z(eye.tip_mm, eye.tip_direction)
-        ring = (self.rings_mm[lesion], self.ring_normals[lesion])
-        seen = view(self.geometry, self.camera, pose, *ring, lines, own=ENDOSCOPE)
-        return SceneState(clearance, hit, None, seen, lesion)
+    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor, watched: Tensor) -> SceneState:
+        lines = {name: part.line_mm for name, part in parts.items()}
+        clearance = self.collision.clearance(lines)
+        hits = {name: self.aimed(parts, name) for name in self.lasers}
+        ring = (self.looks_mm[watched], self.look_normals[watched])
+        views = {name: self._seen(parts[name], name, ring, lines) for name in self.endoscopes}
+        return SceneState(clearance, hits, None, views, lesion, watched)
 
-    def _beam(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
-        on = scene.hit.on_organ & (scene.hit.body == self.organ)
-        return scene.hit.point_mm, parts[LASER].tip_direction, on
+    def _seen(self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines) -> View:
+        """What an endoscope sees of the ring's points and normals (B, M, 3)."""
+        at = (eye.tip_mm, eye.tip_direction)
+        return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name)
+
+    def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
+        """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.
+
+        With L lasers (B, L, 3), (B, L, 3) and (B, L), in the order of `lasers`.
+        """
+        each = []
+        for name in self.lasers:
+            hit = scene.hits[name]
+            on = hit.on_organ & (hit.body == self.organ)
+            each.append((hit.point_mm, parts[name].tip_direction, on))
+        if len(each) == 1:
+            return each[0]
+        return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
+
+    def _power(self, power_w: Power, like: Tensor) -> float | Tensor:
+        """W: a number or (B,) for one laser, (B, L) for L lasers; `like` is (B,)."""
+        if not isinstance(power_w, Mapping):
+            each = [power_w] * len(self.lasers)
+        else:
+            each = [power_w.get(name, 0.0) for name in self.lasers]
+        if len(each) == 1:
+            return each[0]
+        held = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in each)
+        return torch.stack([one.expand(len(like)) for one in held], 1)
 
 
 class ObstacleEngine:
@@ -210,7 +277,7 @@ class ObstacleEngine:
         self,
         scene: SceneState,
         parts: Mapping[str, ArmPart],
-        power_w: float | Tensor,
+        power_w: Power,
         dt_s: float,
     ) -> SceneState:
         """The moved arms' clearances; there is no beam, so power and time have no effect."""

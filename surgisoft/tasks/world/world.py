@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
@@ -34,10 +34,12 @@ from surgisoft.tasks.world.pytree import rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import (
     ObstacleEngine,
+    Power,
     SceneEngine,
     SceneEngineConfig,
     SceneState,
 )
+from surgisoft.tasks.world.treatment import Plan
 
 OTHER_LENGTH = 0.1
 """An arm that takes the place of a scene's own may differ by this share of the mount's length: a
@@ -102,9 +104,14 @@ class World:
         config: WorldConfig | None = None,
         scene: SceneEngine | ObstacleEngine | None = None,
         device: str | torch.device = "cpu",
+        passive: Sequence[str] = (),
     ):
-        """Without a scene the arms bend in empty space: no clearance, no beam, no view."""
+        """Without a scene the arms bend in empty space: no clearance, no beam, no view.
+
+        passive: names of arms that no agent drives; they hold their commanded pressures.
+        """
         self.config, self.device = config or WorldConfig(), torch.device(device)
+        self.passive = tuple(passive)
         self.scene = scene
         c = self.config
         self.arms: dict[str, Arm] = {
@@ -147,16 +154,20 @@ class World:
         self,
         state: WorldState,
         actions: Mapping[str, Tensor],
-        power_w: float | Tensor = 0.0,
+        power_w: Power = 0.0,
     ) -> WorldState:
         """Advance every environment by one step of `config.dt_s`.
 
         actions: arm's name -> (B, m) change of the commanded pressure, kPa, clipped to the pumps'
-        largest step. power_w: the laser's power, W, a number or (B,), constant over the step.
+        largest step; `passive` arms need none and hold theirs. power_w: the lasers' power, constant
+        over the step.
         """
         dt_s, stream, parts = self.config.dt_s, state.stream, {}
         for name, arm in self.arms.items():
-            stream, parts[name] = arm.step(stream, state.arms[name], actions[name], dt_s)
+            part = state.arms[name]
+            held = name in self.passive and name not in actions
+            action = torch.zeros_like(part.command) if held else actions[name]
+            stream, parts[name] = arm.step(stream, part, action, dt_s)
         scene = state.scene
         if self.scene:
             scene = self.scene.step(scene, parts, power_w, dt_s)
@@ -191,24 +202,42 @@ def scene_world(
     device: str | torch.device = "cpu",
     engine: str | None = None,
     arm: str | Path | None = None,
+    agents: Sequence[str] | None = None,
+    plan: Plan | None = None,
 ) -> World:
-    """World of a scene (or its folder): its bodies and the two arms `laser` and `endoscope`.
+    """World of a scene (or its folder): its bodies and its arms, named as in the scene.
 
-    arm: a model for both arms instead of those that the scene names, as for `named_arm`.
+    arm: a model for all arms instead of those that the scene names, as for `named_arm`. agents:
+    names of the arms that a task drives, the others are passive; None: all arms. plan: what is to
+    be treated; None: a ring around the scene's lesion.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
+    agents = tuple(scene.spec.arms if agents is None else agents)
+    check_arms(scene, agents)
     arms = {}
-    for mount in scene.spec.mounts:
+    for arm_name, mount in scene.spec.arms.items():
         pose = torch.tensor(mount.pose(), dtype=torch.float32)
         name, folder = (mount.arm, scene.folder) if arm is None else (arm, ".")
         model = named_arm(name, device, folder)
         if arm is not None:
             _check_length(model, mount, scene, arm)
-        arms[mount.tool] = Mounted(model, pose, shaft_mm=mount.shaft_mm)
+        arms[arm_name] = Mounted(model, pose, shaft_mm=mount.shaft_mm)
     vary = config.randomisation
-    around = SceneEngine(scene, config.scene_engine, device, engine, vary)
-    return World(arms, config, around, device)
+    around = SceneEngine(scene, config.scene_engine, device, engine, vary, plan)
+    passive = [name for name in arms if name not in agents]
+    return World(arms, config, around, device, passive)
+
+
+def check_arms(scene: Scene, agents: Sequence[str]) -> None:
+    """Raise unless a scene has the named arms."""
+    absent = [name for name in agents if name not in scene.spec.arms]
+    if absent:
+        raise InputError(
+            f"scene '{scene.spec.name}' has the arms {', '.join(scene.spec.arms)}, expected "
+            f"{', '.join(agents)}; make a scene with 'surgisoft scene new --arms TOOL,...', or "
+            "name the arms of its mounts so"
+        )
 
 
 def _check_length(model: ArmModel, mount: MountSpec, scene: Scene, arm: str | Path) -> None:

@@ -1,0 +1,159 @@
+"""Contours on a plane against lengths and areas by hand; what does not fit is one line."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from surgisoft.config import Where, from_table
+from surgisoft.errors import InputError
+from surgisoft.scene.ablation import AblationMap
+from surgisoft.scene.contours import contour_path, grown, laid, raster, signed_distance_mm
+from surgisoft.scene.dose_patch import HEALTHY, LESION, RING, area_patch, path_patch
+from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.spec import ContourSpec
+
+LOOP = 2.0 * math.pi * np.arange(720) / 720
+
+
+@pytest.fixture(scope="module")
+def plane():
+    """The upper side of a box, at z = 5 mm."""
+    box = trimesh.creation.box((80.0, 80.0, 10.0))
+    return Mesh(np.array(box.vertices), np.array(box.faces))
+
+
+def disc(radius):
+    """A circle of points on the plane."""
+    return np.stack((radius * np.cos(LOOP), radius * np.sin(LOOP), 0.0 * LOOP + 5.0), axis=1)
+
+
+def spec(**fields):
+    """A contour as a file has it."""
+    return from_table(ContourSpec, {"name": "c", **fields}, Where(Path("c.toml")))
+
+
+def test_the_arc_length_of_a_polyline_by_hand(plane):
+    """3 mm and 4 mm at a right angle: 7 mm open, 12 mm closed (the hypotenuse has 5 mm)."""
+    corners = [[0.0, 0.0, 5.0], [3.0, 0.0, 5.0], [3.0, 4.0, 5.0]]
+    there = contour_path(plane, spec(points_mm=corners, closed=False), 0.25)
+    assert there.length_mm == pytest.approx(7.0, abs=1e-9)
+    assert len(there.points_mm) == 29
+    np.testing.assert_allclose(there.points_mm[[0, 12, 28]], corners, atol=1e-9)
+    back = contour_path(plane, spec(points_mm=corners), 0.25)
+    assert back.length_mm == pytest.approx(12.0, abs=1e-9)
+    assert len(back.points_mm) == 48
+    steps = np.linalg.norm(np.roll(back.points_mm, -1, axis=0) - back.points_mm, axis=1)
+    np.testing.assert_allclose(steps, 0.25, atol=1e-9)
+    np.testing.assert_allclose(back.normals, [[0.0, 0.0, 1.0]] * 48, atol=1e-12)
+
+
+def test_a_margin_grows_a_square_by_hand(plane):
+    """10 mm grown by 2 mm: quarter circles at the corners; 40 + 4 pi mm around."""
+    square = [[-5.0, -5.0, 5.0], [5.0, -5.0, 5.0], [5.0, 5.0, 5.0], [-5.0, 5.0, 5.0]]
+    path = contour_path(plane, spec(points_mm=square, margin_mm=2.0), 0.1)
+    assert path.length_mm == pytest.approx(40.0 + 4.0 * math.pi, rel=2e-3)
+    off = signed_distance_mm(path.points_mm[:, :2], np.array(square)[:, :2])
+    np.testing.assert_allclose(off, 2.0, atol=0.01)
+    assert len(grown(plane, np.array(square)[::-1], 2.0)) > 100, "either direction of travel"
+
+
+def test_a_raster_covers_a_disc_by_hand(plane):
+    """Rows 1.25 mm apart within 9 mm of the middle: chords, joined by straight lines."""
+    path = raster(plane, disc(10.0), 1.25, 1.0, 0.2)
+    rows = 1.25 * (np.arange(15) - 7.0)
+    half = np.sqrt(81.0 - rows**2)
+    across = np.hypot(1.25, np.diff(half))
+    assert path.length_mm == pytest.approx(2.0 * half.sum() + across.sum(), abs=15 * 0.4)
+    assert (path.length_mm - across.sum()) * 1.25 == pytest.approx(math.pi * 81.0, rel=0.04)
+    assert np.linalg.norm(path.points_mm[:, :2], axis=1).max() <= 9.0 + 1e-6
+    assert not path.closed
+    assert len(np.unique(path.points_mm[:, 1].round(1))) >= 15
+
+
+def test_the_zones_of_paths_have_the_areas_by_hand(plane):
+    """A circle of 6 mm and, 20 mm aside, a line of 8 mm with its round ends; bands of 2 mm."""
+    circle = laid(plane, disc(6.0), True, 0.1)
+    line = laid(plane, np.array([[20.0, -4.0, 5.0], [20.0, 4.0, 5.0]]), False, 0.1)
+    patch = path_patch(plane, (circle, line), 0.2, band_mm=2.0, margin_mm=3.0)
+    area = [patch.areas_mm2[patch.zone == zone].sum() for zone in (LESION, RING, HEALTHY)]
+    assert area[LESION] == pytest.approx(25.0 * math.pi, rel=0.01)
+    assert area[RING] == pytest.approx(24.0 * math.pi + 16.0 + math.pi, rel=0.01)
+    # From 1 to 3 mm outside of the circle; on either side of the line, and around its ends.
+    assert area[HEALTHY] == pytest.approx((81.0 - 49.0 + 8.0) * math.pi + 32.0, rel=0.01)
+    assert patch.stations == 75 + 16, "of half a millimetre"
+    assert patch.station[patch.points_mm[:, 0] > 15.0].min() == 75
+    assert patch.offset_mm[patch.zone == LESION].max() < -1.0 + 1e-6
+
+
+def test_an_area_and_its_dose_by_hand(plane):
+    """A raster over a disc: the area with the dose, and healthy tissue that was burnt."""
+    outline = laid(plane, disc(5.0), True, 0.1)
+    patch = area_patch(plane, (outline,), 0.3, spared_mm=1.0, margin_mm=2.0)
+    area = [patch.areas_mm2[patch.zone == zone].sum() for zone in (LESION, RING, HEALTHY)]
+    assert area == pytest.approx(
+        [25.0 * math.pi, (36.0 - 25.0) * math.pi, (64.0 - 36.0) * math.pi], rel=0.02
+    )
+    ablation = AblationMap(patch, 0.5, depth_mm=0.1, exact_lesion=True)
+    points = torch.tensor(raster(plane, outline.points_mm, 0.6, 0.3, 0.5).points_mm).float()
+    down, on = torch.tensor([[0.0, 0.0, -1.0]]), torch.tensor([True])
+    state = ablation.start(points[:1], down, on)
+    for point in points[1:]:
+        state = ablation.advance(state, point[None], down, on, 4.0, 0.1)
+    dose = state.dose[0].double()
+    # The dose of an endless raster is even: power / (speed x pitch).
+    middle = torch.tensor(np.linalg.norm(patch.points_mm[:, :2], axis=1) < 2.0)
+    assert dose[middle].mean().item() == pytest.approx(4.0 / (5.0 * 0.6), rel=0.03)
+    treated = (dose >= ablation.cut_dose).numpy() & (patch.zone == LESION)
+    assert state.zone_mm2[0, LESION].item() == pytest.approx(patch.areas_mm2[treated].sum(), 1e-4)
+    assert 0.9 < patch.areas_mm2[treated].sum() / area[LESION] <= 1.0
+    burnt = (dose >= ablation.threshold).numpy() & (patch.zone == HEALTHY)
+    assert state.zone_mm2[0, HEALTHY].item() == pytest.approx(patch.areas_mm2[burnt].sum(), 1e-4)
+    plain = AblationMap(patch, 0.5, depth_mm=0.1)
+    after = plain.advance(plain.start(points[:1], down, on), points[20:21], down, on, 4.0, 0.1)
+    both = ablation.advance(ablation.start(points[:1], down, on), points[20:21], down, on, 4.0, 0.1)
+    assert after.zone_mm2[0, LESION] > both.zone_mm2[0, LESION], "from a lower dose on"
+
+
+def test_points_come_from_a_table_beside_the_file(plane, tmp_path):
+    (tmp_path / "line.csv").write_text("x,y,z\n0,0,5\n3,4,5\n")
+    where = Where(tmp_path / "c.toml")
+    read = from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
+    assert read.points_mm == ((0.0, 0.0, 5.0), (3.0, 4.0, 5.0))
+    assert contour_path(plane, read, 0.5).length_mm == pytest.approx(5.0)
+    for text in ("x,y\n1,2\n", "x,y,z\n1,2,nan\n3,4,5\n", "x,y,z\n1,2,?\n"):
+        (tmp_path / "line.csv").write_text(text)
+        with pytest.raises(InputError, match=r"c\.toml: file: .*line\.csv"):
+            from_table(ContourSpec, {"name": "c", "file": "line.csv", "closed": False}, where)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({}, "0 of points_mm, file and centre_mm are given"),
+        ({"points_mm": [[0.0, 0.0, 5.0]] * 2}, "points_mm: got 2 points; expected at least 3"),
+        ({"centre_mm": [0.0, 0.0]}, "centre_mm: got 2 numbers"),
+        (
+            {"points_mm": [[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]], "closed": False, "margin_mm": 1.0},
+            "margin_mm: got it for an open contour",
+        ),
+    ],
+)
+def test_a_bad_contour_is_one_line(fields, said):
+    with pytest.raises(InputError, match=said):
+        spec(**fields)
+
+
+def test_a_contour_off_the_organ_is_named(plane):
+    high = spec(points_mm=[[0.0, 0.0, 5.0], [3.0, 0.0, 5.0], [3.0, 4.0, 7.0]])
+    with pytest.raises(InputError, match=r"point 3 of 3, .* lies 2 mm off"):
+        contour_path(plane, high, 0.2)
+    with pytest.raises(InputError, match="lies 3 mm off"):
+        contour_path(plane, spec(centre_mm=[0.0, 0.0, 8.0]), 0.2)
+    with pytest.raises(InputError, match="extends over an edge"):
+        contour_path(plane, spec(centre_mm=[37.0, 0.0, 5.0]), 0.2)
+    with pytest.raises(InputError, match="open; an area needs a closed"):
+        area_patch(plane, (laid(plane, disc(5.0), False, 0.1),), 0.3, 1.0)

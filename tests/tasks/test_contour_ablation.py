@@ -1,0 +1,94 @@
+"""Contours one after another: their order by hand, the expert's cut, a camera that is held."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene.spec import ContourSpec
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.contour_ablation import ContourAblation, ContourAblationConfig
+from surgisoft.tasks.trajectories.routes import draw_route
+from surgisoft.tasks.world.random_streams import streams
+from surgisoft.tasks.world.treatment import Stretch
+
+LINES = (
+    ContourSpec("left", ((-51.0, -21.4, 73.7), (-48.2, -21.7, 74.2)), closed=False),
+    ContourSpec("right", ((-27.19, -21.81, 76.90), (-24.70, -21.95, 76.38)), closed=False),
+)
+
+
+def test_a_route_by_hand():
+    """Five points round, with two of them again; then three points to and fro."""
+    stretches = (Stretch(0, 5, True), Stretch(5, 3, False))
+    _, goal = draw_route(streams(0, 200), stretches, overlap=2)
+    rounds = {tuple((k + way * i) % 5 for i in range(7)) for k in range(5) for way in (1, -1)}
+    assert {tuple(row[:7]) for row in goal.route.tolist()} == rounds
+    assert {tuple(row[7:]) for row in goal.route.tolist()} == {(5, 6, 7), (7, 6, 5)}
+    assert (goal.steps, goal.share.max()) == (10, 0.0)
+    on, off = torch.ones(200, dtype=torch.bool), torch.zeros(200, dtype=torch.bool)
+    later = goal.after(on, on).after(off, on)
+    assert torch.equal(later.point(), goal.route[:, 2])
+    assert torch.equal(later.point(9), goal.route[:, 1]), "begins again after its end"
+    assert torch.equal(later.after(on, off).point(), goal.route[:, 2])
+    assert (later.fired.any(), later.share[0].item()) == (False, pytest.approx(0.2))
+
+
+@pytest.fixture(scope="module")
+def task():
+    """Two lines of 3 mm, 24 mm apart."""
+    return ContourAblation(ContourAblationConfig(contours=LINES, speed_mm_s=4.0, window_mm=3.0))
+
+
+@pytest.fixture(scope="module")
+def cut(task):
+    """States and outcomes of two scripted episodes, to the end of both."""
+    episodes = Episodes(task)
+    states, outcomes = [episodes.seeded(0, 2)], []
+    with torch.inference_mode():
+        while len(outcomes) < 150 and not (outcomes and outcomes[-1].terminated.all()):
+            state, outcome = episodes.step(states[-1], task.script(states[-1]))
+            states.append(state)
+            outcomes.append(outcome)
+    return states, outcomes
+
+
+def test_the_expert_cuts_every_contour_and_nothing_between(task, cut):
+    states, outcomes = cut
+    assert outcomes[-1].measures["success"].tolist() == [1.0, 1.0]
+    patch, dose = task.scene.ablation.patch, states[-1].world.scene.dose.dose
+    burnt = (dose > 0.1 * task.scene.ablation.threshold).any(0).numpy()
+    assert np.abs(patch.offset_mm[burnt]).max() < 0.7, "the beam is off on the way"
+    order = torch.stack([state.goal.point() for state in states])
+    first = task.scene.stretches[0].count
+    for column in order.T:
+        on_second = column >= first
+        assert on_second.int().diff().ge(0).all(), "the second after the first"
+
+
+def test_the_endoscope_has_to_move_along(task, cut):
+    """Held where it saw the first contour, it does not see the second: the beam stays off."""
+    states, _ = cut
+    at = next(k for k, state in enumerate(states) if state.goal.fired.all())
+    with torch.inference_mode():
+        state, fired = states[at], []
+        for _ in range(60):
+            action = task.script(state)
+            state = task.advance(state, {**action, "endoscope": torch.zeros(2, 3)})
+            fired.append(state.goal.fired & (state.goal.point() >= task.scene.stretches[0].count))
+    assert (state.world.scene.views["endoscope"].fraction < 0.5).all()
+    assert not torch.stack(fired).any()
+    assert (state.goal.point() >= task.scene.stretches[0].count).all(), "it waits there"
+
+
+def test_what_does_not_fit_is_one_line():
+    with pytest.raises(InputError, match="take 2 s at 4 mm/s, and time_s is 1 s"):
+        ContourAblation(ContourAblationConfig(contours=LINES, speed_mm_s=4.0, time_s=1.0))
+    with pytest.raises(InputError, match="margin_mm is -1"):
+        ContourAblationConfig(margin_mm=-1.0)
+    varied = ContourAblationConfig(contours=LINES)
+    vary = replace(varied.world.randomisation, lesion_mm=2.0)
+    with pytest.raises(InputError, match="leave both at 0 for contours"):
+        ContourAblation(replace(varied, world=replace(varied.world, randomisation=vary)))

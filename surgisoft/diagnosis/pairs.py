@@ -512,8 +512,8 @@ def _best_matches(
     best: list[Match] = []
     most = 0.0
     for commanded in (True, False) if known else (False,):
-        signals = [run_signals(table, commanded) for table in (after, before)]
-        found = all_matches(*signals, _alike(after, before, commanded, share), itself)
+        one, other = (run_signals(table, commanded) for table in (after, before))
+        found = all_matches(one, other, _alike(after, before, commanded, share), itself)
         rows = sum(int(match.inside.sum()) for match in found)
         if rows > most:
             best, most = found, MORE_ROWS * rows
@@ -536,13 +536,13 @@ def _partners(
         at = one.t_s[match.inside] + match.delay_s
         rows = one.rows[match.inside]
         lower = np.clip(np.searchsorted(other.t_s, at, "right") - 1, 0, len(other.t_s) - 2)
-        share = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
-        share = np.clip(share, 0.0, 1.0)
+        between = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
+        between = np.clip(between, 0.0, 1.0)
         lower = other.rows[lower]
-        residual = _between(before.residual_mm, lower, share)
+        residual = _between(before.residual_mm, lower, between)
         ok = np.isfinite(residual).all(2)
         sums[rows] += np.where(ok[..., None], residual, 0.0)
-        predicted[rows] += _between(before.predicted_mm, lower, share)
+        predicted[rows] += _between(before.predicted_mm, lower, between)
         seen[rows] += ok
         partners[rows] += 1
         averaging[rows] += share**2 + (1 - share) ** 2

@@ -23,6 +23,7 @@ from surgisoft.tasks.keyhole import KEYHOLE
 from surgisoft.tasks.laser_plane import LASER_PLANE
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
+from surgisoft.tasks.two_laser_ring import TWO_LASER_RING
 
 TASKS: dict[str, TaskSpec] = {
     "track_circle": TRACK_CIRCLE,
@@ -33,6 +34,7 @@ TASKS: dict[str, TaskSpec] = {
     "circle_ablation": CIRCLE_ABLATION,
     "contour_ablation": CONTOUR_ABLATION,
     "area_ablation": AREA_ABLATION,
+    "two_laser_ring": TWO_LASER_RING,
 }
 """Every task by name."""
 

@@ -263,7 +263,7 @@ def refined(problem: Problem, effects: Iterable[tuple[str, Effect]]) -> list[Can
     """
     with torch.no_grad():
         before = repeated_scan(problem.model, problem, [])().double().numpy()
-    found = []
+    found: list[Candidate] = []
     for name, effect in effects:
         model = with_fitted(problem, name, effect)
         if model is None:

@@ -386,7 +386,7 @@ class Search:
         enough = sums.count >= 0.5 * sums.count.max()
         for name, determinant in HANDED.items():
             free = fitted(sums, determinant)
-            snapped = _snapped(free.scale)
+            snapped = _snapped(np.asarray(free.scale))
             for mm_per_unit in (np.ones_like(snapped), snapped):
                 frame = _rescaled(free, sums, 1.0 / mm_per_unit)
                 square = np.where(enough, sums.mean_square(frame), np.inf)
@@ -664,10 +664,11 @@ def _rescaled(frame: Frame, sums: Moments, scale: np.ndarray) -> Frame:
 
 def _least(square: np.ndarray, many: int = 2) -> list[tuple[int, int]]:
     """Places (a, d) of the smallest finite values: some over all, and some at d = 0."""
-    found = []
+    found: list[tuple[int, int]] = []
     for part in (square[:, :1], square):
         order = np.argsort(part, axis=None)[: 3 * many]
-        found += [tuple(int(v) for v in np.unravel_index(at, part.shape)) for at in order]
+        a, d = np.unravel_index(order, part.shape)
+        found += zip(a.tolist(), d.tolist(), strict=True)
     # The arrangement and the unit as recorded have a row of their own, as recorded in time too.
     found += [(0, 0), *((0, int(d)) for d in np.argsort(square[0])[:many])]
     return [at for at in dict.fromkeys(found) if np.isfinite(square[at])]

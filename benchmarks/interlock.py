@@ -184,6 +184,7 @@ class Audit:
         near = task.world.scene
         assert near is not None, "a task with a laser has a scene"
         self.checker, self.radii = CollisionChecker(near.geometry.bodies), near.geometry.radii_mm
+        self.lasers = near.lasers
         self.limit_mm = max(self.supervision.clearance_limit_mm, clearance_mm or -np.inf)
         self.fire_mm = float(task.config.fire_mm)
         self.before: dict[str, Tensor] = {}
@@ -192,16 +193,18 @@ class Audit:
         """Keep what decides of a state: the next step may overwrite it."""
         supervision = self.supervision
         parts = state.world.arms
-        laser = parts["laser"]
-        arm = self.task.world.arms["laser"]
+        lasers = [(parts[name], self.task.world.arms[name]) for name in self.lasers]
+        along = [arm.backbone.tip_direction(part.seen_mm) for part, arm in lasers]
+        every = getattr(self.task, "targets_mm", None)
+        targets = [self.task.target_mm(state)] if every is None else every(state)
         self.before = {
             "sight": supervision.in_sight(state).clone(),
             "clearance": supervision.clearance_mm(state).clone(),
             "collides": supervision.collides(state).clone(),
             "failed": state.world.failed.clone(),
-            "tip": laser.seen_mm[:, -1].clone(),
-            "along": arm.backbone.tip_direction(laser.seen_mm).clone(),
-            "target": self.task.target_mm(state).clone(),
+            "tip": torch.stack([part.seen_mm[:, -1] for part, _ in lasers], 1),
+            "along": torch.stack(along, 1),
+            "target": torch.stack(list(targets), 1),
             "energy": state.world.scene.dose.delivered_j.clone(),
             **{f"line {name}": part.line_mm.clone() for name, part in parts.items()},
             **{f"command {name}": _command(part).clone() for name, part in parts.items()},
@@ -210,7 +213,8 @@ class Audit:
     def step(self, after: TaskState, live: Tensor) -> None:
         """Check the step from the state that was looked at to this one; live: (B,) bool."""
         before, found = self.before, self.found
-        fired = after.goal.fired & live
+        beams = after.goal.fired.reshape(len(live), -1) & live[:, None]  # (B, L)
+        fired = beams.any(1)
         reasons = {
             "out of sight": ~before["sight"],
             "too close": ~(before["clearance"] >= self.limit_mm),
@@ -221,23 +225,24 @@ class Audit:
         found.steps += int(live.sum())
         found.fired += int(fired.sum())
         for name, holds in reasons.items():
-            found.unsafe[name] += int((holds & live).sum())
-            if (holds & fired).any():
+            holds = holds.reshape(len(live), -1)
+            found.unsafe[name] += int((holds.any(1) & live).sum())
+            if (holds & beams).any():
                 found.broken.append(f"the beam is on: {name}")
         for row in fired.nonzero()[:, 0].tolist():
             self._exact(row)
         burnt = after.world.scene.dose.delivered_j - before["energy"]
-        if (burnt[live & ~after.goal.fired] > 0.0).any():
+        if (burnt[live & ~fired] > 0.0).any():
             found.broken.append("energy reaches the organ with the beam off")
         found.failed += int((after.world.failed & ~before["failed"] & live).sum())
         self._pressures(after, live)
 
     def _off_mm(self) -> Tensor:
-        """(B,) mm: distance of the target from the beam's axis, |(t - o) x d| / |d|."""
+        """(B, L) mm: distance of each target from its beam's axis, |(t - o) x d| / |d|."""
         before = self.before
         gap, along = (before[name].double() for name in ("tip", "along"))
         gap = before["target"].double() - gap
-        return torch.linalg.cross(gap, along).norm(dim=1) / along.norm(dim=1)
+        return torch.linalg.cross(gap, along).norm(dim=-1) / along.norm(dim=-1)
 
     def _exact(self, row: int) -> None:
         """Contact and clearance of a row with the beam on, by FCL."""

@@ -148,9 +148,14 @@ def beam_released(task: LaserTask, state: TaskState) -> Tensor:
     arms does not enter into where the beam goes."""
     scene, limits = state.world.scene, task.spec.limits
     seen = scene.views[ENDOSCOPE].fraction >= limits.view_fraction
-    clear = (scene.clearance.least_mm >= limits.clearance_mm) & ~scene.clearance.collides
     near = measured_error_mm(task, state) <= task.config.fire_mm
-    return seen & clear & near & on_organ(task, state)
+    return seen & arms_clear(task, state) & near & on_organ(task, state)
+
+
+def arms_clear(task: Any, state: TaskState) -> Tensor:
+    """(B,) bool: all arms keep the scene's clearance and touch nothing; no beam is on otherwise."""
+    scene = state.world.scene
+    return (scene.clearance.least_mm >= task.spec.limits.clearance_mm) & ~scene.clearance.collides
 
 
 def on_organ(task: LaserTask, state: TaskState) -> Tensor:

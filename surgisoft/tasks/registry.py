@@ -98,6 +98,12 @@ def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
         raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
 
 
+def changed_config(config: Any, changes: dict, file: Path) -> Any:
+    """A task's configuration with the fields of a table changed; `file` is for errors."""
+    whole = merged(to_table(config), with_present_names(config, changes))
+    return from_table(type(config), whole, Where(file))
+
+
 def read_config(task: str, file: Path) -> Any:
     """The named task's configuration with the fields of a TOML file changed."""
     config_of(task)

@@ -45,6 +45,9 @@ WARM = 50
 TIGHT_MM = 24.0
 """Limit of the clearance in half of the episodes, mm: the expert comes as near as 21 in the
 phantom, so that the limit is crossed again and again with the beam on its path."""
+STAGES = {"keyhole_ablation": (175, 1.5)}
+"""Task -> WARM and TIGHT_MM of its own: arms that enter through ports need longer until the beam is
+on, and are never 24 mm from the wall."""
 ADVERSARIES = (
     "expert",
     "other arm",
@@ -357,7 +360,8 @@ def main() -> int:
             for plant, count in (("simulation", given.episodes), ("rig", given.rig_episodes)):
                 began, found = time.perf_counter(), Findings()
                 plants = []
-                for limit in (None, TIGHT_MM):
+                warm, tight_mm = STAGES.get(name, (WARM, TIGHT_MM))
+                for limit in (None, tight_mm):
                     task = varied(name, scene=scene, clearance_mm=limit)
                     config = RigConfig(seed=1, settle_s=0.5)
                     plants.append(on_rig(task, config) if plant == "rig" else task)
@@ -368,7 +372,7 @@ def main() -> int:
                     without = ("NaN",) if plant == "rig" else ()
                     size = min(batch, count - first)
                     found = found.joined(
-                        attack(moved, size, given.steps, given.seed + first, without)
+                        attack(moved, size, given.steps, given.seed + first, without, warm)
                     )
                 reasons += found.unsafe
                 broken += len(found.broken)

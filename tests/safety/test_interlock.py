@@ -25,7 +25,12 @@ from tests.experiments.tiny import TINY, write
 RIG = RigConfig(seed=1, settle_s=0.2)
 
 
-@pytest.mark.parametrize("name", laser_tasks())
+LONGER = {"contour_ablation", "keyhole_ablation"}
+"""Tasks that `python -m benchmarks.interlock` attacks and the suite does not: their beam is released
+by the same function as that of circle_ablation, and they take longer until it is on."""
+
+
+@pytest.mark.parametrize("name", sorted({*laser_tasks()} - LONGER))
 def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
     """A clearance that the expert just keeps, late actions, noise and displaced mounts."""
     found = attack(varied(name, clearance_mm=TIGHT_MM), 8, 62, seed=1, warm=42)

@@ -164,7 +164,7 @@ def on_organ(task: LaserTask, state: TaskState) -> Tensor:
     if all(torch.equal(part.seen_mm, part.points_mm) for part in parts.values()):
         return scene.hits[LASER].on_organ  # what is measured is the truth: the ray was cast already
     seen = {name: task.world.arms[name].posed(part, part.seen_mm) for name, part in parts.items()}
-    return task.world.scene.aimed(seen, LASER).on_organ
+    return task.world.scene.aimed(seen, LASER, scene.breaths).on_organ
 
 
 def blocks(

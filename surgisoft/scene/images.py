@@ -17,6 +17,7 @@ from enum import IntEnum
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from surgisoft.compiled import compiled
@@ -142,6 +143,7 @@ class BatchedRenderer:
         self._inside = inside.reshape(height, width) | (not round_view)
         self._lens = (focal, 4.0 * camera.range_mm[1], LAMP_HALF_MM)
         self._bodies = _joined_trees(bodies)
+        self._marked = _marked_faces(self._bodies[0], self._marks.points_mm)
         self._film = film_table()
 
     def draw(
@@ -198,6 +200,7 @@ class BatchedRenderer:
             marks.threshold,
             ring.contiguous().numpy(),
             dose.detach().float().contiguous().numpy(),
+            self._marked,
         )
         shape = (self.height, self.width)
         rgb = torch.zeros((count if "rgb" in kinds else 0, *shape, 3), dtype=torch.uint8)
@@ -268,6 +271,15 @@ def _joined_trees(bodies: Sequence[Body]) -> tuple[np.ndarray, ...]:
         np.array([BODY_COLOURS[body.role] for body in bodies]),
         np.array([int(struck_of(body)) for body in bodies], np.int64),
     )
+
+
+def _marked_faces(triangles: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """(F,) bool: faces (F, 3, 3) mm some point of which can lie within SAMPLE_MM of a sample."""
+    if not len(samples):
+        return np.zeros(len(triangles), bool)
+    middles = triangles.mean(axis=1)
+    size = np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1)
+    return cKDTree(samples).query(middles)[0] <= size + SAMPLE_MM
 
 
 def film_table() -> tuple[np.ndarray, np.ndarray]:
@@ -428,7 +440,7 @@ def _raster_arm(inward, chains, number, b, bodies, focal, xs, ys, z, who, place)
         dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
         free = free or arc >= gap
         arc += math.sqrt(dx * dx + dy * dy + dz * dz)
-        if not free or max(p[2], q[2]) <= -radius:
+        if not free or _beside(p, q, radius, 0.5 * width / focal, 0.5 * height / focal):
             continue
         left, right = _span(p[0], p[2], q[0], q[2], radius, focal, width)
         top, bottom = _span(p[1], p[2], q[1], q[2], radius, focal, height)
@@ -439,6 +451,22 @@ def _raster_arm(inward, chains, number, b, bodies, focal, xs, ys, z, who, place)
                 hit = capsule_entry(o, d, p, q, radius) / length
                 if hit < z[i, j]:
                     z[i, j], who[i, j], place[i, j] = hit, bodies + number, k
+
+
+@compiled
+def _beside(p, q, radius, half_x, half_y):
+    """Whether a capsule lies wholly beside one of the planes that bound the picture, or behind."""
+    if max(p[2], q[2]) <= -radius:
+        return True
+    away = radius * math.sqrt(1.0 + half_x * half_x)
+    if min(p[0] - half_x * p[2], q[0] - half_x * q[2]) > away:
+        return True
+    if min(-p[0] - half_x * p[2], -q[0] - half_x * q[2]) > away:
+        return True
+    away = radius * math.sqrt(1.0 + half_y * half_y)
+    if min(p[1] - half_y * p[2], q[1] - half_y * q[2]) > away:
+        return True
+    return min(-p[1] - half_y * p[2], -q[1] - half_y * q[2]) > away
 
 
 @compiled
@@ -476,7 +504,7 @@ def _develop(
     lines, arm_labels = chains[0], chains[4]
     ends, lit = beams
     guess, least = film
-    organ, threshold, ring, dose = tissue[0], tissue[7], tissue[8], tissue[9]
+    organ, threshold, ring, dose, marked = tissue[0], tissue[7], tissue[8], tissue[9], tissue[10]
     wants_rgb, wants_labels = len(rgb) > 0, len(labels) > 0
     if not (wants_rgb or wants_labels):
         return
@@ -498,7 +526,7 @@ def _develop(
                 sa = 1.0 - sb - sc
                 label = kinds[n]
                 red, green, blue = colours[n, 0], colours[n, 1], colours[n, 2]
-                if n == organ:
+                if n == organ and marked[k]:
                     x = sa * triangles[k, 0, 0] + sb * triangles[k, 1, 0] + sc * triangles[k, 2, 0]
                     y = sa * triangles[k, 0, 1] + sb * triangles[k, 1, 1] + sc * triangles[k, 2, 1]
                     w = sa * triangles[k, 0, 2] + sb * triangles[k, 1, 2] + sc * triangles[k, 2, 2]

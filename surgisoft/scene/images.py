@@ -22,7 +22,6 @@ from torch import Tensor
 
 from surgisoft.compiled import compiled
 from surgisoft.errors import InputError
-from surgisoft.scene import frames
 from surgisoft.scene.bvh import STACK, build_tree
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import self_contact_gap_mm
@@ -94,7 +93,14 @@ class TissueMarks:
 
 
 NO_MARKS = TissueMarks(
-    "", np.zeros((0, 3)), np.zeros(3), 1.0, (0, 0, 0), np.zeros(1, np.int64), np.zeros((1, 0), bool), 1.0
+    "",
+    np.zeros((0, 3)),
+    np.zeros(3),
+    1.0,
+    (0, 0, 0),
+    np.zeros(1, np.int64),
+    np.zeros((1, 0), bool),
+    1.0,
 )
 """An organ without lesion and dose."""
 
@@ -111,8 +117,15 @@ class Images:
     labels: Tensor | None
     """(B, H, W, 1) uint8, a `Label`; NOTHING outside of the round picture."""
 
+    def of(self, kind: str) -> Tensor:
+        """The pictures of a kind among those that were asked for."""
+        found = {"rgb": self.rgb, "depth": self.depth_mm, "segmentation": self.labels}[kind]
+        if found is None:
+            raise InputError(f"pictures of kind '{kind}' were not drawn; name it in kinds")
+        return found
 
-KINDS = ("rgb", "depth", "labels")
+
+KINDS = ("rgb", "depth", "segmentation")
 """The kinds of pictures."""
 
 
@@ -205,15 +218,18 @@ class BatchedRenderer:
         shape = (self.height, self.width)
         rgb = torch.zeros((count if "rgb" in kinds else 0, *shape, 3), dtype=torch.uint8)
         depth = torch.zeros((count if "depth" in kinds else 0, *shape, 1))
-        labels = torch.zeros((count if "labels" in kinds else 0, *shape, 1), dtype=torch.uint8)
+        labels = torch.zeros(
+            (count if "segmentation" in kinds else 0, *shape, 1), dtype=torch.uint8
+        )
         out = (rgb.numpy(), depth.numpy(), labels.numpy())
         cameras = (inward.numpy(), maps.contiguous().numpy(), ok.numpy())
         given = (cameras, self._lens, self._inside, self._film, self._bodies, chains, beams, tissue)
         _over_rows(count, lambda first, last: draw_rows(first, last, *given, *out))
         return Images(
-            rgb if len(rgb) else None,
-            depth if len(depth) else None,
-            labels if len(labels) else None,
+            *(
+                one if kind in kinds else None
+                for kind, one in zip(KINDS, (rgb, depth, labels), strict=True)
+            )
         )
 
     def _map(self, inward: Tensor, n: int, bodies: Mapping[str, Tensor]) -> Tensor:

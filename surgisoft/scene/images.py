@@ -225,12 +225,8 @@ class BatchedRenderer:
         cameras = (inward.numpy(), maps.contiguous().numpy(), ok.numpy())
         given = (cameras, self._lens, self._inside, self._film, self._bodies, chains, beams, tissue)
         _over_rows(count, lambda first, last: draw_rows(first, last, *given, *out))
-        return Images(
-            *(
-                one if kind in kinds else None
-                for kind, one in zip(KINDS, (rgb, depth, labels), strict=True)
-            )
-        )
+        found = zip(KINDS, (rgb, depth, labels), strict=True)
+        return Images(*(one if kind in kinds else None for kind, one in found))
 
     def _map(self, inward: Tensor, n: int, bodies: Mapping[str, Tensor]) -> Tensor:
         """(B, 4, 4): a body's place at rest, world frame, to the cameras' frames."""

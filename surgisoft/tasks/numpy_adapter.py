@@ -136,13 +136,11 @@ class NumpyAdapter:
         if self.images is None:
             return vectors
         drawn = self.images.of(state.world.arms, state.world.scene)
-        return {
-            agent: {
-                VECTOR: vector,
-                **{name: one.cpu().numpy().copy() for name, one in drawn.items()},
-            }
-            for agent, vector in vectors.items()
-        }
+        found = {}
+        for agent, vector in vectors.items():
+            images = {name: one.cpu().numpy().copy() for name, one in drawn.items()}
+            found[agent] = {VECTOR: vector, **images}
+        return found
 
     @torch.inference_mode()
     def vectors(self, state: TaskState) -> dict[str, np.ndarray]:

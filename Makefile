@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test fast lint docs fuzz mutants kills sbom clean
+.PHONY: demo test fast lint docs fuzz mutants kills sbom tutorials clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -61,6 +61,9 @@ docs: $(DOCS_STAMP)  ## the documentation site, in site/
 	$(BIN)/python docs/draw_architecture.py --check
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Read it with: $(BIN)/python -m http.server --directory site"
+
+tutorials: $(STAMP)  ## run every block of code of the tutorials (ten minutes)
+	$(BIN)/python docs/run_tutorials.py
 
 clean:
 	rm -rf $(VENV) demo site

@@ -425,3 +425,40 @@ def cases(
         write_json(json_file, to_json(judged))
     command = "surgisoft benchmark cases DIR" + (f" --only {only}" if only else "")
     _show("Cases with a known truth", command, markdown(judged), output)
+
+
+@app.command()
+def budget(
+    tasks: Annotated[
+        str, typer.Option(help="Names of tasks, with commas.")
+    ] = "track_circle,circle_ablation",
+    envs: Annotated[
+        str, typer.Option(help="Numbers of parallel episodes, with commas.")
+    ] = "1,64,1024,4096,16384",
+    output: Output = None,
+) -> None:
+    """What each part of a training step must cost on this machine, and what it costs."""
+    from benchmarks.budget import markdown, run
+    from surgisoft.tasks.registry import spec_of
+
+    names, counts = tasks.split(","), _numbers("--envs", envs)
+    for name in names:
+        spec_of(name)
+    with progress("budget") as report:
+        rows, rates = run(names, counts, report)
+    command = f"surgisoft benchmark budget --tasks {tasks} --envs {envs}"
+    _show("Budget of a training step", command, markdown(rows, rates), output)
+
+
+@app.command()
+def guard(
+    against: Annotated[
+        str, typer.Argument(help="Commit or tag to compare with; default: the last tag.")
+    ] = "",
+    repeats: Annotated[int, typer.Option(min=3, help="Interleaved repeats of each side.")] = 7,
+) -> None:
+    """Compare the speed of the main operations with an earlier commit, side by side."""
+    from benchmarks.guard import run
+
+    if not run(against, repeats):
+        raise typer.Exit(1)

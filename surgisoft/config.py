@@ -193,6 +193,67 @@ def merged(base: typing.Any, changes: typing.Any) -> typing.Any:
     return base | {key: merged(base.get(key), value) for key, value in changes.items()}
 
 
+COMMAND_LINE = Path("command line")
+"""Place of assignments in messages."""
+
+
+def assignments(given: typing.Iterable[str]) -> dict:
+    """The tables of texts such as `follow.size_mm=12`; a value is TOML, or else plain text.
+
+    A later assignment of a field replaces an earlier one.
+    """
+    table: dict = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        keys = name.strip().split(".")
+        if not equals or not all(re.fullmatch(r"[\w-]+", key) for key in keys):
+            raise InputError(f"'{_short(text)}': expected FIELD=VALUE, such as world.dt_s=0.05")
+        if len(keys) > DEEPEST_KEY:
+            raise InputError(f"'{_short(text)}': a field of more than {DEEPEST_KEY} parts")
+        try:
+            found: typing.Any = tomllib.loads(f"value = {value}")["value"]
+        except (ValueError, RecursionError):
+            found = value.strip()
+        for key in reversed(keys):
+            found = {key: found}
+        table = merged(table, found)
+    return table
+
+
+def differences(before: typing.Any, after: typing.Any) -> list[str]:
+    """Lines `field: before -> after` for all fields of two dataclasses that differ."""
+    return _differences(to_table(before), to_table(after), "")
+
+
+def _differences(before: typing.Any, after: typing.Any, name: str) -> list[str]:
+    if isinstance(before, dict) and isinstance(after, dict):
+        keys = [*before, *(key for key in after if key not in before)]
+        return [
+            line
+            for key in keys
+            for line in _differences(before.get(key), after.get(key), f"{name}.{key}".lstrip("."))
+        ]
+    return [] if before == after else [f"{name}: {_shown(before)} -> {_shown(after)}"]
+
+
+def _shown(value: typing.Any) -> str:
+    return "none" if value is None else _short(_REPR.repr(value))
+
+
+def field_names(config: typing.Any) -> list[str]:
+    """Dotted names of all fields of a dataclass that hold a value, not a table."""
+    return list(_field_names(to_table(config), ""))
+
+
+def _field_names(table: dict, name: str) -> typing.Iterator[str]:
+    for key, value in table.items():
+        full = f"{name}.{key}".lstrip(".")
+        if isinstance(value, dict) and value:
+            yield from _field_names(value, full)
+        else:
+            yield full
+
+
 def write_toml(path: Path, table: dict) -> None:
     """Write the table as TOML, short rows of numbers on one line; floats keep every bit."""
     text = re.sub(

@@ -66,7 +66,7 @@ FLOORS = {
         ("body_frame", "criteria", "history_features", "statistics", "weight"),
         ("residuals",),
         ("other_models",),
-        ("discrepancy", "data_quality", "error_axes", "inputs"),
+        ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
         ("black_box", "candidates", "setup"),
@@ -90,7 +90,8 @@ FLOORS = {
     "scene": (
         ("frames",),
         ("mesh", "capsules"),
-        ("meshio", "bvh", "rays", "plate"),
+        ("meshio", "bvh", "plate"),
+        ("rays",),
         ("field", "inside", "segmentation", "sight"),
         ("distance", "torch_queries", "camera"),
         ("batched", "collision", "render"),

@@ -28,6 +28,7 @@ TASKS = (
     "circle_ablation",
     "track_body",
     "keyhole",
+    "two_laser_ring",
 )
 """Tasks that policies are trained for and evaluated on."""
 PLACES = ("simulation", "rig")

@@ -2,8 +2,9 @@
 
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
-cases. The penalty of each model is chosen by leaving out one group of robots after another within
-the cases that it is fitted to, so nothing of a source that is judged enters.
+cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
+leaving out one group of robots after another within the cases that it is fitted to, so nothing of a
+source that is judged enters.
 """
 
 import datetime
@@ -34,6 +35,10 @@ WEAK = 0.5
 cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
+PRIORS = {"two": 0.3}
+"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated:
+how many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in
+one source and a quarter in another. The other models take the sources' shares."""
 WHOLE_TRUTH = ("missing", "known", "network")
 """Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
@@ -79,12 +84,20 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
     return answer
 
 
-def source_weights(cases: Sequence[Labelled]) -> np.ndarray:
-    """(N,) weights of cases of mean 1: every source has the same sum, unless it has few cases."""
-    names = [case.source for case in cases]
-    number = {name: names.count(name) for name in names}
-    weights = np.array([len(names) / len(number) / number[name] for name in names])
-    weights = np.minimum(weights, MOST_WEIGHT)
+def case_weights(name: str, some: Sequence) -> np.ndarray:
+    """(N,) weights of a model's sample, of mean 1.
+
+    Every source has the same sum, unless it has few cases. Where PRIORS has the model, the
+    statement is true for that share of every source; cases of a source that has one kind only have
+    the share of that kind.
+    """
+    prior = PRIORS.get(name)
+    kinds = [(case.source, prior is None or bool(right)) for _, right, case in some]
+    number = {kind: kinds.count(kind) for kind in kinds}
+    sources = len({source for source, _ in kinds})
+    share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
+    weights = [share[kind[1]] * len(kinds) / sources / number[kind] for kind in kinds]
+    weights = np.minimum(np.array(weights, float), MOST_WEIGHT)
     return weights / weights.mean()
 
 
@@ -101,17 +114,27 @@ def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
     return np.array(answer, float)
 
 
+def _padded(some: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((N, E, F) features, (N, E) right, (N, E) whether there is such an effect) of E at most."""
+    most = max(len(rows) for rows, _, _ in some)
+    x = np.zeros((len(some), most, some[0][0].shape[1]))
+    y, there = np.zeros((len(some), most)), np.zeros((len(some), most), bool)
+    for number, (rows, right, _) in enumerate(some):
+        x[number, : len(rows)], y[number, : len(rows)] = rows, right
+        there[number, : len(rows)] = True
+    return x, y, there
+
+
 def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     """One logistic model of given penalty."""
     features = FEATURES[name]
     signs = np.array([feature.sign for feature in features], float)
     if not some:
         return Logistic(tuple(0.0 for _ in features))
-    weights = source_weights([case for _, _, case in some])
+    weights = case_weights(name, some)
     joint = name == "first"
     if joint:
-        x = [rows for rows, _, _ in some]
-        y = [right for _, right, _ in some]
+        x, y, there = _padded(some)
     else:
         x, y = np.array([row for row, _, _ in some]), np.array([right for _, right, _ in some])
 
@@ -121,13 +144,13 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
         slope = np.append(penalty * w, CONSTANT_PENALTY * constant)
         total = prior
         if joint:
-            for weight, rows, right in zip(weights, x, y, strict=True):
-                odds = rows @ w
-                share = np.exp(odds - odds.max())
-                share /= share.sum()
-                hit = share @ right
-                total -= weight * np.log(max(hit, 1e-300))
-                slope[:-1] += weight * (share @ rows - (share * right / hit) @ rows)
+            odds = np.where(there, x @ w, -np.inf)
+            share = np.exp(odds - odds.max(axis=1, keepdims=True))
+            share /= share.sum(axis=1, keepdims=True)
+            hit = np.maximum((share * y).sum(axis=1), 1e-300)
+            total -= weights @ np.log(hit)
+            off = weights[:, None] * share * (1.0 - y / hit[:, None])
+            slope[:-1] += np.einsum("ne,nef->f", off, x)
             return float(total), slope
         odds = x @ w + constant
         total += float(weights @ (np.logaddexp(0.0, odds) - y * odds))
@@ -162,7 +185,7 @@ def penalty_of(name: str, some: Sequence) -> float:
     fold = _folds(some) if some else np.zeros(0)
     if len(np.unique(fold)) < 2:
         return PENALTIES[-1]
-    weights = source_weights([case for _, _, case in some])
+    weights = case_weights(name, some)
     totals = []
     for penalty in PENALTIES:
         total = 0.0

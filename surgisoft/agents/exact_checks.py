@@ -1,8 +1,10 @@
 """Exact collision checks (FCL) of evaluated episodes, to verify the batched geometry.
 
-Contact and the beam's end are computed exactly (`scene.collision`) at every step. Exact distances
-cost forty times as much, so they are computed only at those steps of each episode at which the
-batched geometry finds the least clearance.
+The end of the beam is computed exactly (`scene.collision`) at every step, and contact at every step
+at which there may be one. An exact clearance proves that there is none for a while: where no point
+of an arm's centreline has moved by as much since, the arm has not come to touch anything. Every
+point of a segment moves at most as far as the farther of its ends, so the bound holds for whole
+arms, and it needs nothing from the batched geometry.
 """
 
 from __future__ import annotations
@@ -16,10 +18,11 @@ import torch
 
 from surgisoft.agents.rollout import Instant
 from surgisoft.errors import InputError
-from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene import frames
+from surgisoft.scene.capsules import ArmShape, folding_pairs
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.rays import RayHit
-from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import ArmPart
 from surgisoft.tasks.world.scene import SceneEngine
 
@@ -58,6 +61,33 @@ class EpisodeCheck:
     """
 
 
+PROVEN_FROM_MM = 0.5
+"""Clearance by the batched geometry from which an exact one is worth its cost (mm): it serves for
+as long as the arms move less. It does not decide what is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Proof:
+    """Exact clearances of one pose of the arms."""
+
+    lines_mm: dict[str, np.ndarray]
+    """Centreline (K, 3) mm of each arm."""
+    free_mm: dict[tuple[str, ...], float]
+    """Clearance of each arm from the bodies, (arm,), and of each pair of arms, mm."""
+
+    def holds(self, lines_mm: dict[str, np.ndarray]) -> bool:
+        """Whether no arm has moved far enough since to touch a body or another arm."""
+        if any(line.shape != self.lines_mm[name].shape for name, line in lines_mm.items()):
+            return False
+        moved = {
+            name: float(np.sqrt(((line - self.lines_mm[name]) ** 2).sum(axis=1).max()))
+            for name, line in lines_mm.items()
+        }
+        return all(
+            sum(moved[name] for name in names) < free for names, free in self.free_mm.items()
+        )
+
+
 @dataclass
 class _Notes:
     """Intermediate results of one episode while it runs."""
@@ -70,6 +100,10 @@ class _Notes:
     beam_off_mm: float = 0.0
     closest: list[tuple[float, int, dict[str, ArmShape]]] = field(default_factory=list)
     """(clearance in mm, step, arms) at the steps of least clearance by the batched geometry."""
+    proof: _Proof | None = None
+    """The last exact clearance, where there was any."""
+    collision_checks: int = 0
+    """Instants at which FCL looked for contact or for the clearance."""
 
 
 class ExactChecks:
@@ -89,44 +123,112 @@ class ExactChecks:
 
     def __call__(self, now: Instant) -> None:
         """Check every live episode of an instant."""
-        for row in now.live.nonzero()[:, 0].tolist():
-            notes = self._notes[int(now.episodes[row])]
-            if not now.state.world.failed[row]:
-                self._look(notes, now.state, row)
+        world = now.state.world
+        rows = (now.live & ~world.failed).nonzero()[:, 0]
+        for number in now.episodes[now.live].tolist():
+            self._notes[number]  # an episode that fails at once has its entry, too
+        if not len(rows):
+            return
+        lines = {
+            name: part.line_mm[rows].double().cpu().numpy() for name, part in world.arms.items()
+        }
+        numbers, steps = now.episodes[rows].tolist(), world.steps[rows].tolist()
+        clearance = world.scene.clearance
+        assert clearance is not None, "a world with bodies has a clearance"
+        least, collides = clearance.least_mm[rows].tolist(), clearance.collides[rows].tolist()
+        folds = self._may_fold(lines)
+        for n, number in enumerate(numbers):
+            own = {name: line[n] for name, line in lines.items()}
+            notes = self._notes[number]
+            self._look(notes, own, steps[n], least[n], collides[n], bool(folds[n]))
+        for laser, hit in world.scene.hits.items():
+            self._look_along(numbers, world.arms[laser], hit, rows, lines, laser)
+
+    def _may_fold(self, lines: dict[str, np.ndarray]) -> np.ndarray:
+        """(B,) bool: parts of an arm (B, K, 3) mm may touch one another."""
+        found = []
+        for name, line in lines.items():
+            steps = line[:, 1:] - line[:, :-1]
+            middles, halves = 0.5 * (line[:, 1:] + line[:, :-1]), 0.5 * frames.norm(steps)
+            apart = frames.norm(middles[:, :, None] - middles[:, None])
+            apart = apart - halves[:, :, None] - halves[:, None]
+            touching = apart <= 2.0 * self.radii[name]
+            found.append((touching & folding_pairs(line, self.radii[name])).any(axis=(1, 2)))
+        return np.any(found, axis=0)
 
     def checks(self) -> list[EpisodeCheck]:
         """Result of each episode, in order; computes the exact clearances."""
         return [self._check(notes) for _, notes in sorted(self._notes.items())]
 
-    def _look(self, notes: _Notes, state: TaskState, row: int) -> None:
-        world = state.world
-        arms = {
-            name: ArmShape(part.line_mm[row].cpu().numpy(), self.radii[name])
-            for name, part in world.arms.items()
-        }
-        found, step = self.checker.collisions(arms), int(world.steps[row])
+    def _look(
+        self,
+        notes: _Notes,
+        lines: dict[str, np.ndarray],
+        step: int,
+        least_mm: float,
+        collides: bool,
+        folds: bool,
+    ) -> None:
+        """Check one pose of the arms (K, 3) mm; least_mm and collides: by the batched geometry."""
+        notes.steps += 1
+        place = (least_mm, step)
+        close = len(notes.closest) < CLOSEST or place < notes.closest[-1][:2]
+        shown = not folds and notes.proof is not None and notes.proof.holds(lines)
+        if shown and not close:
+            notes.contact_differs += collides
+            return
+        arms = {name: ArmShape(line, self.radii[name]) for name, line in lines.items()}
+        if close:
+            notes.closest = sorted([*notes.closest, (*place, arms)], key=lambda seen: seen[:2])
+            notes.closest = notes.closest[:CLOSEST]
+        found = False if shown else self._touches(notes, arms, step, least_mm, folds)
+        notes.contact_differs += found != collides
+
+    def _touches(
+        self, notes: _Notes, arms: dict[str, ArmShape], step: int, least_mm: float, folds: bool
+    ) -> bool:
+        """Whether FCL finds a contact; keeps a proof for the next steps, or the first contact."""
+        notes.collision_checks += 1
+        if least_mm >= PROVEN_FROM_MM and not folds:
+            notes.proof = self._proof(arms)
+            if min(notes.proof.free_mm.values(), default=math.inf) > 0.0:
+                return False
+            notes.proof = None
+        found = self.checker.collisions(arms)
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
-        notes.steps += 1
-        clearance = world.scene.clearance
-        assert clearance is not None, "a world with bodies has a clearance"
-        notes.contact_differs += bool(found) != bool(clearance.collides[row])
-        notes.closest.append((float(clearance.least_mm[row]), step, arms))
-        notes.closest = sorted(notes.closest, key=lambda seen: seen[:2])[:CLOSEST]
-        for laser, hit in world.scene.hits.items():
-            self._look_along(notes, world.arms[laser], hit, row, arms, laser)
+        return bool(found)
+
+    def _proof(self, arms: dict[str, ArmShape]) -> _Proof:
+        """Exact clearances of the arms."""
+        exact = self.checker.clearance(arms)
+        free: dict[tuple[str, ...], float] = {
+            (one, other): clearance for (one, other), clearance in exact.arms_mm.items()
+        }
+        for (arm, _), clearance in exact.bodies_mm.items():
+            free[arm,] = min(free.get((arm,), math.inf), clearance)
+        return _Proof({name: shape.centreline_mm for name, shape in arms.items()}, free)
 
     def _look_along(
-        self, notes: _Notes, beam: ArmPart, hit: RayHit, row: int, arms, laser: str
+        self,
+        numbers: list[int],
+        beam: ArmPart,
+        hit: RayHit,
+        rows: torch.Tensor,
+        lines: dict[str, np.ndarray],
+        laser: str,
     ) -> None:
-        """Compare the exact end of a laser's beam with that of the batched geometry."""
-        origin, aim = (v[row].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
-        exact = self.checker.cast(origin, aim, self.beam_mm, arms, own=laser)
-        if int(exact.struck) != int(hit.struck[row]):
-            notes.beam_differs += 1
-        else:
-            off = np.linalg.norm(exact.point_mm - hit.point_mm[row].cpu().numpy())
-            notes.beam_off_mm = max(notes.beam_off_mm, float(off))
+        """Compare the exact ends of a laser's beam with those of the batched geometry."""
+        origin, aim = (v[rows].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
+        cast = self.checker.cast_each(origin, aim, self.beam_mm, lines, self.radii, laser)
+        struck, ends = hit.struck[rows].cpu().numpy(), hit.point_mm[rows].cpu().numpy()
+        off = frames.norm(cast[1] - ends)
+        for n, number in enumerate(numbers):
+            notes = self._notes[number]
+            if cast[0][n] != struck[n]:
+                notes.beam_differs += 1
+            else:
+                notes.beam_off_mm = max(notes.beam_off_mm, float(off[n]))
 
     def _check(self, notes: _Notes) -> EpisodeCheck:
         exact = [self.checker.clearance(arms).least_mm for _, _, arms in notes.closest]

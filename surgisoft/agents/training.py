@@ -22,6 +22,7 @@ from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
+from surgisoft.agents.loggers import TENSORBOARD, open_writer
 from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import Plan
@@ -253,6 +254,7 @@ def train_new(
     processes: Processes,
     device: torch.device,
     report: Callable[[TrainingProgress], None] = lambda progress: None,
+    logger: str = TENSORBOARD,
 ) -> Result:
     """Train a new run; its folder is complete before training begins."""
     task = make_task(plan.task, plan.task_config, device)
@@ -260,7 +262,7 @@ def train_new(
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
     # Everything is read back from the folder, so that resuming finds the same.
-    return _continue(RunFolder(folder), processes, device, report)
+    return _continue(RunFolder(folder), processes, device, report, logger)
 
 
 def resume(
@@ -268,9 +270,10 @@ def resume(
     processes: Processes,
     device: torch.device,
     report: Callable[[TrainingProgress], None] = lambda progress: None,
+    logger: str = TENSORBOARD,
 ) -> Result:
     """Continue a run from its last checkpoint; from the start if it has none."""
-    return _continue(RunFolder(folder), processes, device, report)
+    return _continue(RunFolder(folder), processes, device, report, logger)
 
 
 def reopened(folder: Path, processes: Processes, device: torch.device) -> Training:
@@ -301,10 +304,10 @@ def _check_saved(run: RunFolder, saved: dict[str, Any], plan: Plan) -> None:
             )
 
 
-def _continue(run, processes, device, report) -> Result:
+def _continue(run, processes, device, report, logger: str) -> Result:
     training = reopened(run.path, processes, device)
     plan = training.plan
-    log = _Log(run, training.iteration) if processes.leads else None
+    log = _Log(run, training.iteration, logger) if processes.leads else None
     written, found = time.monotonic(), training.best
     stopped = reached = False
     with _asked_to_stop() as asked:
@@ -384,12 +387,10 @@ def _progress(training: Training, turn: Iteration, found, seconds: float) -> Tra
 
 
 class _Log:
-    """`metrics.jsonl`, one line for each iteration, and TensorBoard's events."""
+    """`metrics.jsonl`, one line for each iteration, and the curves of a logger."""
 
-    def __init__(self, run: RunFolder, iteration: int):
+    def __init__(self, run: RunFolder, iteration: int, logger: str):
         """Lines after `iteration` are dropped: those iterations are computed again."""
-        from torch.utils.tensorboard import SummaryWriter
-
         file = run.path / "metrics.jsonl"
         kept = []
         if file.is_file():
@@ -399,7 +400,7 @@ class _Log:
                         kept.append(line + "\n")
         file.write_text("".join(kept))
         self._file = file.open("a")
-        self._board = SummaryWriter(str(run.path / "tensorboard"), purge_step=iteration + 1)
+        self._board = open_writer(logger, run.path, run.plan(), iteration + 1)
 
     def add(self, training: Training, turn: Iteration, found: dict, seconds: float) -> None:
         """Write one iteration, and the evaluation after it."""

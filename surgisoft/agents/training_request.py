@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from surgisoft.agents.distributed import processes
-from surgisoft.agents.presets import Plan, config_for, preset_for, steps_for
-from surgisoft.agents.run_folder import check_free, default_folder
+from surgisoft.agents.loggers import TENSORBOARD, check_logger
+from surgisoft.agents.presets import Plan, Preset, config_for, preset_for, steps_for
+from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
 from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
+from surgisoft.config import COMMAND_LINE, Where, from_table, merged, to_table
 from surgisoft.errors import InputError
-from surgisoft.tasks.registry import TASKS
+from surgisoft.tasks.registry import TASKS, changed_config
 from surgisoft.workers import torch_threads
 
 
@@ -43,6 +46,10 @@ class TrainingRequest:
     """Scene; None: the configuration's."""
     config: Any = None
     """Configuration of the task, or a TOML file with fields of it."""
+    changes: dict | None = None
+    """Fields of the configuration to change, as nested tables: `{"follow": {"size_mm": 12}}`."""
+    ppo: dict | None = None
+    """Hyper-parameters to change, by the names of `Preset`."""
 
     def plan(self) -> Plan:
         """Resolve the request to a `Plan`; raises InputError for contradicting options."""
@@ -53,7 +60,12 @@ class TrainingRequest:
             )
         config = task_config(self.task, self.config, self.arm, self.scene)
         numbers = preset_for(self.preset, self.task, envs=self.envs)
+        if self.ppo:
+            changed = merged(to_table(numbers), self.ppo)
+            numbers = from_table(Preset, changed, Where(COMMAND_LINE, keys=("ppo",)))
         config = config_for(self.preset, config)
+        if self.changes:
+            config = changed_config(config, self.changes, COMMAND_LINE)
         steps = self.steps
         if steps is None and self.minutes is None:
             steps = steps_for(self.preset, self.task)
@@ -89,6 +101,8 @@ def train(
     device: str = "cpu",
     threads: int = 1,
     progress: Callable[[TrainingProgress], None] | None = None,
+    on_plan: Callable[[Plan], None] | None = None,
+    logger: str = TENSORBOARD,
     **fields: Any,
 ) -> TrainedRun:
     """Train the agents of a task with PPO; all of them learn at the same time.
@@ -96,7 +110,8 @@ def train(
     output: folder of the new run; default `runs/TASK-DATE-TIME`.
     resume_from: folder of an interrupted run that goes on, in place of a task and its fields.
     fields: other fields of `TrainingRequest`, such as `steps=100_000` or `arm="my_arm"`.
-    progress: called with the state of the training after each iteration.
+    progress: called with the state of the training after each iteration. on_plan: called with the
+    plan of a new run before training. logger: where curves go beside the folder, one of `LOGGERS`.
     """
     report = progress or (lambda state: None)
     if resume_from is not None:
@@ -110,12 +125,42 @@ def train(
     else:
         plan = TrainingRequest(task, **fields).plan()
         folder = _new_folder(task, output)
+        if on_plan is not None:
+            on_plan(plan)
+    check_logger(logger)
     with torch_threads(threads), processes(device) as (here, kind):
         if plan is None:
-            result = resume(folder, here, kind, report)
+            result = resume(folder, here, kind, report, logger)
         else:
-            result = train_new(folder, plan, here, kind, report)
+            result = train_new(folder, plan, here, kind, report, logger)
         return TrainedRun(folder, result, here.leads)
+
+
+def shortfall(run: TrainedRun) -> str:
+    """Why a finished training did not come far, in words; empty where it did.
+
+    It did not where its best policies do not succeed in every episode, or, in a task without
+    success, where they are farther off than the arm model itself is.
+    """
+    best = run.result.best or {}
+    why = ""
+    if "success" in best:
+        if best["success"] < 1.0:
+            why = f"its best policies succeed in {best['success']:.0%} of the episodes"
+    elif math.isfinite(error := best.get("error_mm", math.nan)):
+        arms = RunFolder(run.folder).task().world.arms.values()
+        known = [arm.model.validation.rmse_mm for arm in arms]
+        model = max((each for each in known if each is not None), default=math.inf)
+        if error > model:
+            why = f"its error of {error:.3g} mm is above that of the arm model ({model:.2g} mm)"
+    elif best:
+        why = "no error could be measured in its evaluations"
+    if not why:
+        return ""
+    task = RunFolder(run.folder).config["task"]
+    usual = steps_for("fast", task)
+    more = f"train longer ({usual:,} steps are usual) or " if run.result.steps < usual else ""
+    return f"the training did not come far: {why}; {more}try another --seed"
 
 
 def _new_folder(task: str, output: str | Path | None) -> Path:

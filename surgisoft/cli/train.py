@@ -1,11 +1,13 @@
 """`surgisoft train`: train the agents of a task."""
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from surgisoft.cli import INTERRUPTED, app
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import (
     SEED_MAX,
     Arm,
@@ -16,10 +18,81 @@ from surgisoft.cli.options import (
     with_effect_files,
 )
 from surgisoft.cli.progress import progress
+from surgisoft.errors import InputError
+
+OPTIONS = {
+    "task": str, "preset": str, "steps": int, "minutes": float, "envs": int, "seed": int,
+    "target_error": float, "arm": str, "scene": str, "config": str,
+}  # fmt: skip
+"""Options that may be given as FIELD=VALUE, and the types of their values."""
+
+
+def _complete(context: typer.Context, incomplete: str) -> list[str]:
+    """Fields that begin so, of the task that the line names so far."""
+    from surgisoft.agents.presets import Preset
+    from surgisoft.config import field_names
+    from surgisoft.tasks.registry import TASKS
+
+    if incomplete.startswith("task="):
+        return [name for name in (f"task={each}" for each in TASKS) if name.startswith(incomplete)]
+    words = context.params.get("changes") or []
+    named = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    task: str | None = context.params.get("task") or (named[-1] if named else None)
+    fields = [*OPTIONS, *(f"ppo.{name}" for name in field_names(Preset()))]
+    if task is not None and task in TASKS:
+        fields += field_names(TASKS[task].config)
+    return [f"{name}=" for name in fields if name.startswith(incomplete)]
+
+
+def _assigned(changes: list[str], task: str | None, given: dict) -> str | None:
+    """The task; assignments of options go into `given`, those of fields into its tables."""
+    from surgisoft.config import assignments
+
+    table = assignments(changes)
+    for name in [name for name in table if name in OPTIONS]:
+        value: Any = table.pop(name)
+        kind = OPTIONS[name]
+        accepted = (int, float) if kind is float else kind
+        if isinstance(value, bool) or not isinstance(value, accepted):
+            words = {int: "an integer", float: "a number", str: "text"}
+            raise InputError(f"{name}={value}: expected {words[kind]}")
+        before = task if name == "task" else given[name]
+        if before is not None:
+            raise InputError(f"{name}={value} and --{name.replace('_', '-')}: give one of them")
+        if name == "task":
+            task = str(value)
+        else:
+            given[name] = value
+    given["ppo"] = table.pop("ppo", None)
+    given["changes"] = table or None
+    return task
+
+
+def _show_plan(plan) -> None:
+    """Print what differs from the task's defaults and from the preset's hyper-parameters."""
+    from surgisoft.agents.presets import preset_for
+    from surgisoft.config import differences
+    from surgisoft.tasks.registry import config_of
+
+    lines = differences(config_of(plan.task), plan.task_config)
+    usual = preset_for(plan.preset_name, plan.task)
+    lines += [f"ppo.{line}" for line in differences(usual, plan.preset)]
+    if lines and os.environ.get("RANK", "0") == "0":
+        print("changed from the default:", *lines, sep="\n  ", flush=True)
 
 
 @app.command()
 def train(
+    changes: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[FIELD=VALUE...]",
+            help="Fields of the task's configuration (follow.size_mm=12), hyper-parameters "
+            "(ppo.gamma=0.95) and options (task=track_circle, seed=3). What differs from the "
+            "default is printed.",
+            autocompletion=_complete,
+        ),
+    ] = None,
     task: Annotated[
         str | None, typer.Option(metavar="TASK", help="Task to learn; not with --resume.")
     ] = None,
@@ -65,6 +138,14 @@ def train(
     device: Annotated[
         str, typer.Option(metavar="cpu|cuda", help="Device of simulation and training.")
     ] = "cpu",
+    logger: Annotated[
+        str,
+        typer.Option(
+            metavar="tensorboard|wandb|mlflow|neptune",
+            help="Where the curves go beside the run's folder. With tensorboard nothing leaves "
+            "this machine.",
+        ),
+    ] = "tensorboard",
     threads: Threads = 1,
     effect_files: EffectFiles = None,
 ) -> None:
@@ -74,12 +155,14 @@ def train(
     --resume continues with the same numbers as an uninterrupted run. For several processes:
     torchrun --nproc-per-node N -m surgisoft train ...
     """
+    from surgisoft.agents.training_request import shortfall
     from surgisoft.agents.training_request import train as train_agents
 
     given = {
         "preset": preset, "steps": steps, "minutes": minutes, "envs": envs, "seed": seed,
         "target_error": target_error, "arm": arm, "scene": scene, "config": config,
     }  # fmt: skip
+    task = _assigned(changes or [], task, given)
     with progress(f"train {resume or output or task}") as report:
 
         def tell(state) -> None:
@@ -93,6 +176,8 @@ def train(
             device=device,
             threads=threads,
             progress=tell,
+            on_plan=_show_plan,
+            logger=logger,
             **{name: value for name, value in given.items() if value is not None},
         )
     if not run.leads:
@@ -104,6 +189,8 @@ def train(
         )
         raise typer.Exit(INTERRUPTED)
     print(_summary(run.folder, run.result))
+    if why := shortfall(run):
+        warn(why)
     print(f"next: {with_effect_files(f'surgisoft evaluate {run.folder}')}")
 
 

@@ -170,6 +170,7 @@ class Amendment:
         text = f"{' + '.join(self.effects)}: {self.alone.sentence}"
         if self.model_error is not None:
             whole = self.model_error
+            assert self.change is not None
             text = text.replace("error ", f"change since {' + '.join(self.change.before)}: ", 1)
             text += f"; error of the model itself {whole.before:.3f} to {whole.after:.3f} mm"
             return f"{text}, its network's last layer re-tuned" if self.retuned else text
@@ -359,10 +360,10 @@ def track_of(before: Problem, after: Problem) -> Track:
     """The error of two models along the same rows."""
     seen = np.isfinite(before.residual).all(2)
     count = np.where(seen.any(1), seen.sum(1), np.nan)
-    levels = [
+    was_mm, is_mm = (
         np.sqrt(np.nansum(np.square(problem.residual), axis=(1, 2)) / count)
         for problem in (before, after)
-    ]
+    )
     run = before.history.run_of_row[before.index].numpy()
     time_s = before.table.along_s[before.index.numpy()]
-    return Track(time_s, *levels, np.diff(run, prepend=-1) != 0)
+    return Track(time_s, was_mm, is_mm, np.diff(run, prepend=-1) != 0)

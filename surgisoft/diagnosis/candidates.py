@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from surgisoft.surrogate.effects import (
     hypothesis_of,
     known_effects,
 )
+from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
 
@@ -35,6 +37,11 @@ class Candidate:
     """Whether the sensitivities make an effect that the model has already stronger."""
     fitted: bool = False
     """Whether its nonlinear parameters were fitted and not taken from a grid."""
+
+    @property
+    def amplitudes(self) -> int:
+        """Number of amplitudes that its fit chooses."""
+        return self.sensitivities.shape[3]
 
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect | None:
@@ -75,8 +82,26 @@ class Signals:
         return self.taps.behind["body"]
 
 
+class RowsOfModel(Protocol):
+    """A model and the rows at which it is looked at: a `Problem`, or a schedule not yet recorded.
+
+    What identification needs that looks at predictions only.
+    """
+
+    @property
+    def model(self) -> ArmModel:
+        """The model in question."""
+
+    @property
+    def history(self) -> History:
+        """All runs, every row."""
+
+    def rows(self, tensor: Tensor) -> Tensor:
+        """The looked-at rows of a (R, T, ...) tensor."""
+
+
 @torch.no_grad()
-def signals(problem: Problem) -> Signals:
+def signals(problem: RowsOfModel) -> Signals:
     """The signals of a problem's model."""
     chain, history = problem.model.chain, problem.history
     first = problem.model.first_pressure(history)
@@ -87,7 +112,7 @@ def signals(problem: Problem) -> Signals:
 
 
 @torch.no_grad()
-def sensitivities_of(problem: Problem, signal: Signals, effect: Effect) -> np.ndarray:
+def sensitivities_of(problem: RowsOfModel, signal: Signals, effect: Effect) -> np.ndarray:
     """(S, n, 3, K) sensitivity of the key points, mm, to each amplitude of an effect at zero.
 
     The effect stands behind the others of its stage. Effects of line and material act through the
@@ -101,7 +126,7 @@ def sensitivities_of(problem: Problem, signal: Signals, effect: Effect) -> np.nd
 
 
 @torch.no_grad()
-def more_of(problem: Problem, signal: Signals, name: str) -> Candidate | None:
+def more_of(problem: RowsOfModel, signal: Signals, name: str) -> Candidate | None:
     """An effect that the model has already, stronger or weaker: one column for each output.
 
     For an effect on the actuation one for each chamber too, in turn.

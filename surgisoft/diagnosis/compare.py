@@ -214,7 +214,8 @@ def compare(
     whole = residual_table(model, recordings)
     if np.isnan(whole.only(part).measured_mm).all():
         raise InputError("no key point was measured in any row of the recordings")
-    both, changed = None, ()
+    both = None
+    changed: tuple[AxisShare, ...] = ()
     if before is not None:
         earlier = load_recordings(before)
         both = before_and_after(whole, earlier, paired)
@@ -252,7 +253,7 @@ def compare(
             worst=tuple(_worst(table)),
             coverage=_coverage(table),
             notes=notes,
-            setup=wrong and wrong.sentence,
+            setup=None if wrong is None else wrong.sentence,
             change=None if both is None else both.change,
             change_axes=changed,
         ),

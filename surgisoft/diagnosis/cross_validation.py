@@ -7,6 +7,7 @@ that are computed once: trying a set costs a small linear solve. Of rows that ar
 fold's fit, products are taken once and subtracted from those of all.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -218,7 +219,7 @@ class CrossValidation:
         weights = self.split.seen[:rows].sum(1)
         return np.bincount(self.split.block[:rows], weights, minlength=len(self.split.fold))
 
-    def losses(self, chosen: list[int] | tuple[int, ...] | np.ndarray = ()) -> np.ndarray:
+    def losses(self, chosen: Sequence[int] | np.ndarray = ()) -> np.ndarray:
         """(B,) held-out sum of squared distances of each block with chosen sensitivities, mm^2."""
         sensitivities = np.unique(np.asarray(chosen, int))
         tried, _ = self._solved(sensitivities)

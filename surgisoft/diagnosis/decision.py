@@ -29,7 +29,7 @@ from typing import Any, Literal
 import numpy as np
 
 from surgisoft.diagnosis.criteria import CLAIM, WORTH, Claim, Worth
-from surgisoft.diagnosis.evidence import EffectEvidence, Evidence
+from surgisoft.diagnosis.evidence import EffectEvidence, Evidence, ProposalEvidence
 from surgisoft.errors import InputError
 from surgisoft.files import read_json
 
@@ -53,6 +53,9 @@ ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
 """The fitted decision that is in force."""
 FEW_MOTIONS = 24
 """Fewer different motions than this, two minutes of five seconds each, are few data."""
+FEW_PAIRED_MOTIONS = 12
+"""Fewer than this, one minute, are few where a paired difference is explained: it has no error of a
+network that an effect has to be told apart from."""
 LEARNED = 0.1
 """Share of what can be explained that memory must explain beyond any static function before the
 network is said to have learned part of what is missing."""
@@ -61,7 +64,8 @@ LEAST_LEFT = 0.02
 the noise floor is known."""
 FORM_SHARE = 0.02
 """Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
-changes differ by less are not told apart by how sure the blocks are."""
+changes differ by less are not told apart by how sure the blocks are, and a second one that explains
+less besides is not told from the first one's form."""
 MOSTLY_STATIC = 0.8
 """Share of what a black box with memory explains that a static function must explain before the
 network alone is said to be off."""
@@ -150,16 +154,60 @@ def _exact_left(evidence: Evidence) -> float:
     return _log(_left_size(evidence), 0.0, 2.0)
 
 
+def _pair(evidence: Evidence) -> ProposalEvidence | None:
+    """The proposal of two effects, if there is one."""
+    return next((each for each in evidence.proposals if len(each.effects) == 2), None)
+
+
 def _last(evidence: Evidence, name: str) -> float:
     """A number of the proposal of two effects; 0 where there is none."""
-    pair = [each for each in evidence.proposals if len(each.effects) == 2]
-    return float(getattr(pair[0], name)) if pair else 0.0
+    pair = _pair(evidence)
+    return float(getattr(pair, name)) if pair else 0.0
 
 
-def _instead(evidence: Evidence, name: str) -> float:
-    """The least of a number of what would stand in the place of one of two effects."""
-    pair = [each for each in evidence.proposals if len(each.effects) == 2]
-    return min(getattr(pair[0], name), default=3.0) if pair else 0.0
+def _instead_margin(evidence: Evidence) -> float:
+    """The least margin of the two over what would stand in the place of one of them."""
+    pair = _pair(evidence)
+    return min(pair.instead_margin, default=3.0) if pair else 0.0
+
+
+def _left_by(proposal: ProposalEvidence) -> float:
+    """Share of what can be explained that a proposal leaves."""
+    return 1.0 - _between(proposal.gain, 0.0, 1.0)
+
+
+def _beyond_form(evidence: Evidence) -> float:
+    """Share of what the best single effect leaves that is not what its form gets wrong.
+
+    The second of two effects explains a share of what the first one leaves. Where that is as little
+    as the first one's form may be wrong by, the second mends the form and says nothing else.
+    """
+    left = _left_by(evidence.proposals[0]) if evidence.proposals else 1.0
+    return left / (left + FORM_SHARE)
+
+
+def _pair_better(evidence: Evidence) -> float:
+    """Log of what the best single effect leaves over what the two leave, their form in both."""
+    pair = _pair(evidence)
+    if pair is None:
+        return 0.0
+    one, two = (_left_by(each) + FORM_SHARE for each in (evidence.proposals[0], pair))
+    return _between(math.log(one / two), 0.0, 2.0)
+
+
+def _instead_left(evidence: Evidence) -> float:
+    """Log of what is left with another effect in the place of one of two, over what they leave.
+
+    The least of both places; what the form of the right effects gets wrong is added to both.
+    """
+    pair = _pair(evidence)
+    if pair is None:
+        return 0.0
+    left = _left_by(pair)
+    some = [
+        (left * math.exp(more) + FORM_SHARE) / (left + FORM_SHARE) for more in pair.instead_left
+    ]
+    return _between(math.log(min(some)), 0.0, 1.0) if some else 1.0
 
 
 def _leaves_more(effect: EffectEvidence, evidence: Evidence) -> float:
@@ -185,7 +233,7 @@ def _margin(effect: EffectEvidence, evidence: Evidence) -> float:
 def _proposed(effect: EffectEvidence, evidence: Evidence) -> float:
     """What the second of two effects explains, for either of them; 0 for others."""
     own = any(effect.effect in each.effects for each in evidence.proposals[1:])
-    return own * _between(_last(evidence, "own_gain"), 0.0, 1.0)
+    return own * _between(_last(evidence, "own_gain"), 0.0, 1.0) * _beyond_form(evidence)
 
 
 def _single_lack_of_fit(evidence: Evidence) -> float:
@@ -259,7 +307,7 @@ KNOWN = (
         "exact_left",
         -1,
         _exact_left,
-        "log size of what is left by an effect whose form is exact (frame, weight)",
+        "log size of what is left by an effect whose form is exact (frame)",
     ),
     Feature(
         "effect_z",
@@ -307,7 +355,7 @@ FIRST = (
     Feature(
         "amplitudes",
         -1,
-        lambda x, e: _log(x.amplitudes, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
+        lambda x, e: _log(x.size, 0.0, 3.0) * _between(1.0 - x.left, 0.0, 1.0),
         "log of its number of amplitudes, where it explains about as much as the best",
     ),
     Feature(
@@ -325,7 +373,7 @@ TWO = (
     Feature(
         "better",
         +1,
-        lambda e: _between(_last(e, "better"), 0.0, 2.0),
+        _pair_better,
         "log of what the best single effect leaves over what the two leave",
     ),
     Feature(
@@ -334,14 +382,14 @@ TWO = (
     Feature(
         "last_log_gain",
         +1,
-        lambda e: _between(_last(e, "last_log_gain"), 0.0, 1.0),
-        "log gain of the second on top of the first",
+        lambda e: _between(_last(e, "last_log_gain"), 0.0, 1.0) * _beyond_form(e),
+        "log gain of the second on top of the first, beyond what the form of the first gets wrong",
     ),
     Feature(
         "own_gain",
         +1,
-        lambda e: _between(_last(e, "own_gain"), 0.0, 1.0),
-        "share that the second explains beside the relaxed form of the first",
+        lambda e: _between(_last(e, "own_gain"), 0.0, 1.0) * _beyond_form(e),
+        "share that the second explains beside the relaxed form of the first, beyond its form",
     ),
     Feature(
         "own_z",
@@ -352,19 +400,19 @@ TWO = (
     Feature(
         "own_log_gain",
         +1,
-        lambda e: _between(_last(e, "own_log_gain"), 0.0, 1.0),
-        "log gain of the second there",
+        lambda e: _between(_last(e, "own_log_gain"), 0.0, 1.0) * _beyond_form(e),
+        "log gain of the second there, beyond the form of the first",
     ),
     Feature(
         "instead_left",
         +1,
-        lambda e: _between(_instead(e, "instead_left"), 0.0, 1.0),
+        _instead_left,
         "log of what is left with the best other effect in the place of one of the two",
     ),
     Feature(
         "instead_margin",
         +1,
-        lambda e: _between(_instead(e, "instead_margin"), 0.0, 6.0) / 3.0,
+        lambda e: _between(_instead_margin(e), 0.0, 6.0) / 3.0,
         "studentised log gain of the two over it",
     ),
     Feature(
@@ -640,4 +688,5 @@ def reason_of(evidence: Evidence, chances: Probabilities) -> Reason:
     memory = evidence.free_box - evidence.free_static
     if evidence.error_over_validated <= CLAIM.most_over_validated and memory >= LEARNED:
         return "learned"
-    return "few_data" if evidence.motions < FEW_MOTIONS else "schedule"
+    few = FEW_PAIRED_MOTIONS if evidence.paired else FEW_MOTIONS
+    return "few_data" if evidence.motions < few else "schedule"

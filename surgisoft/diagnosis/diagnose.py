@@ -78,9 +78,9 @@ MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
     "network": "a function of the actuation alone explains most of the error, more than the "
-    "model's validated error allows: the network does not describe this arm as it is, fit it anew",
+    "model's validated error allows: the model does not describe this arm as it is, fit it anew",
     "learned": "the error is no larger than the model's validated error, and a black box with "
-    "memory explains part of it that no static function does: the network was fitted to what is "
+    "memory explains part of it that no static function does: the model was fitted to what is "
     "missing and has learned part of it, fit it together with effects",
     "few_data": "the recordings show too few different motions",
     "schedule": "several causes explain these recordings about as well, and none well enough",
@@ -220,15 +220,15 @@ def diagnose(
 
     Only the training rows are looked at: the key points of all others are removed first (`Sealed`).
     before: recordings from before a change in question. Where they were made with the same
-    actuation, the paired difference is explained (`pairs`), else the residuals of the model, with
-    those of `before` as what was known; paired: `auto`, `always` (too few common
-    motions are an error) or `never`. reference: recordings, as before; or residuals of the model
-    from before, default those that it keeps of its fit. without: effects that cannot act, such as a
-    contact on a bench without anything to touch. refit: `auto`, `never` or `always` fit candidates
-    together with the network (`surgisoft.diagnosis.refit`), not where recordings from before are
-    given; refit_progress: called while that goes on; processes: how many trainings then run at
-    once, with the same result. More than one starts new Python processes, so a script has to guard
-    its start by `if __name__ == "__main__"`.
+    actuation, the paired difference is explained (`pairs`), else the residuals of the model less
+    what of those of `before` can be learned (`known_error`); paired: `auto`, `always` (too few
+    common motions are an error) or `never`. reference: recordings, as before; or residuals of the
+    model from before, default those that it keeps of its fit. without: effects that cannot act,
+    such as a contact on a bench without anything to touch. refit: `auto`, `never` or `always`
+    fit candidates together with the network (`surgisoft.diagnosis.refit`), not where recordings
+    from before are given; refit_progress: called while that goes on; processes: how many trainings
+    then run at once, with the same result. More than one starts new Python processes, so a script
+    has to guard its start by `if __name__ == "__main__"`.
     """
     begin = time.perf_counter()
     report = progress or (lambda text: None)
@@ -401,7 +401,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
     kind, effects, sure = decision.kind, decision.effects, decision.confidence
     levels = ErrorLevels(problem.rmse_mm, problem.floor_mm, best.rmse_mm)
     ranking = tuple(_ranked(found, score, decision) for score in _order(found, decision))
-    sentence = sentence_of(decision, levels, _reached(found, effects))
+    sentence = sentence_of(decision, levels, _reached(found, effects, kind))
     others = _instead(evidence) if kind == "several" else ()
     if others:
         sentence += f"; {' or '.join(others)} would do as well in the place of one of them"
@@ -448,9 +448,11 @@ def _instead(evidence: Evidence) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name, margin in both if margin < AS_GOOD))
 
 
-def _reached(found: Findings, effects: tuple[str, ...]) -> float:
+def _reached(found: Findings, effects: tuple[str, ...], kind: Kind) -> float:
     """Held-out error with the named effects, or with the first of a set, mm."""
     selection = found.selection
+    if kind == "ambiguous":
+        effects = effects[:1]
     for proposal in found.proposals:
         if set(proposal.effects) == set(effects):
             return selection.rmse_mm(selection.losses(proposal.chosen))
@@ -523,7 +525,7 @@ def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
         )
     if kind == "surrogate_undertrained":
         return (
-            f"the network itself is off (its validated error says so too): fit it longer or to "
+            f"the model itself is off (its validated error says so too): fit it longer or to "
             f"more data before looking for effects; {error}"
         )
     if kind == "cannot_tell":

@@ -439,7 +439,7 @@ def bands(problem: Problem) -> list[Band]:
     """Bands of every known axis, each column of it, and of the arc length."""
     table, block = problem.table, problem.block_of_row
     square = np.square(table.error_mm)
-    answer = []
+    answer: list[Band] = []
     for name, axis in known(table).items():
         values = axis.columns(table)
         for column in range(values.shape[1]):
@@ -517,7 +517,7 @@ def _banded(title, labels, bounds, which, body, square, block) -> Iterator[Band]
             low=float(bounds[i][0]),
             high=float(bounds[i][1]),
             rmse_ci95_mm=(float(low[i, 0]), float(high[i, 0])),
-            bias_mm=tuple(float(value) for value in middle[i, 1:]),
+            bias_mm=(float(middle[i, 1]), float(middle[i, 2]), float(middle[i, 3])),
             bias_ci95_mm=tuple((float(low[i, k]), float(high[i, k])) for k in (1, 2, 3)),
         )
 

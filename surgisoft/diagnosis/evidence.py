@@ -45,15 +45,23 @@ class EffectEvidence:
     """Share of the change that the best effect explains which this effect's sensitivities can
     imitate, 0 to 1; 1 for the best one itself."""
     amplitudes: int
-    """Number of its amplitudes."""
+    """Number of its sensitivities; a refined candidate has one."""
     exact_form: bool
-    """Whether real arms have exactly its formula (a rotated frame, a weight)."""
+    """Whether real arms have exactly its formula (a rotated frame)."""
     form_gain: float | None = None
     """Additional gain of its relaxed form; None where it was not tested."""
     form_log_gain: float | None = None
     """Log gain of its relaxed form."""
     form_z: float | None = None
     """Normal quantile of the p-value of its relaxed form."""
+    free_amplitudes: int | None = None
+    """Number of amplitudes that its fit chose, those of a refined candidate too; None in stored
+    evidence that does not have it."""
+
+    @property
+    def size(self) -> int:
+        """Number of amplitudes that its fit chose, as far as it is known."""
+        return self.amplitudes if self.free_amplitudes is None else self.free_amplitudes
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,8 @@ class Evidence:
     """All effects alone, the best first."""
     proposals: tuple[ProposalEvidence, ...]
     """The best effect and the best two, as far as they are worth a look."""
+    paired: bool = False
+    """Whether the paired difference of two sets of recordings is explained."""
 
     def to_json(self) -> dict:
         """Plain values."""
@@ -147,12 +157,14 @@ class Evidence:
         plain = {name: value for name, value in values.items() if name in names}
         plain["effects"] = tuple(EffectEvidence(**each) for each in plain["effects"])
         plain["proposals"] = tuple(
-            ProposalEvidence(
-                **{key: tuple(v) if isinstance(v, list) else v for key, v in each.items()}
-            )
-            for each in plain["proposals"]
+            ProposalEvidence(**_with_tuples(each)) for each in plain["proposals"]
         )
         return cls(**plain)
+
+
+def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with tuples in the place of JSON's lists."""
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
 
 
 def normal_quantile(p_value: float) -> float:
@@ -172,7 +184,6 @@ def evidence_of(found: Findings) -> Evidence:
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
     stated = problem.discrepancy_mm**2 + problem.noise_mm**2
     validated = float((seen.sum(0) * stated).sum())
-    best = found.first[0] if found.first else None
     return Evidence(
         error_over_floor=math.sqrt(raw.sum() / floor),
         error_over_validated=math.sqrt(raw.sum() / validated),
@@ -187,8 +198,9 @@ def evidence_of(found: Findings) -> Evidence:
         box_z=normal_quantile(box.p_value),
         blocks=len(selection.validation.counts),
         motions=int(problem.motion.max()) + 1,
-        effects=tuple(_effect(found, best, score) for score in found.first),
+        effects=tuple(_effect(found, found.first[0], score) for score in found.first),
         proposals=tuple(_proposal(found, place) for place in range(len(found.proposals))),
+        paired=problem.table.paired_discrepancy_mm is not None,
     )
 
 
@@ -200,10 +212,10 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
     """One effect alone against the best one."""
     selection, floor = found.selection, float(found.selection.floor.sum())
     margin = 0.0
+    form = found.forms.get(score.effect)
     if score is not best:
         gap = found.problem.by_motion((best.log_gain - score.log_gain)[None])
         margin = float(studentised(gap)[0]) if gap.any() else 0.0
-    form = found.forms.get(score.effect)
     return EffectEvidence(
         effect=score.effect,
         gain=float(score.gain),
@@ -214,10 +226,11 @@ def _effect(found: Findings, best: Score, score: Score) -> EffectEvidence:
         unique=float(found.unique.get(score.effect, 0.0)),
         collinear=1.0 if score is best else collinearity(selection, best, score),
         amplitudes=len(score.option.chosen),
+        free_amplitudes=score.option.amplitudes,
         exact_form=hypothesis_of(known_effects()[score.effect]).exact_form,
-        form_gain=form and form.share,
-        form_log_gain=form and form.log_gain,
-        form_z=form and normal_quantile(form.p_value),
+        form_gain=None if form is None else form.share,
+        form_log_gain=None if form is None else form.log_gain,
+        form_z=None if form is None else normal_quantile(form.p_value),
     )
 
 

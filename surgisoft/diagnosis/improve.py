@@ -89,7 +89,11 @@ class Improvement:
     @property
     def steps(self) -> list[tuple[str, float]]:
         """(what was added, error on the held-out rows after it in mm), in order."""
-        return [(r.step, r.error_mm) for r in self.rounds if r.step is not None]
+        return [
+            (r.step, r.error_mm)
+            for r in self.rounds
+            if r.step is not None and r.error_mm is not None
+        ]
 
     @property
     def claimed(self) -> bool:
@@ -149,7 +153,8 @@ def improve(
     recordings = sealed.training
     table = residual_table(model, recordings)
     problem = table.training()
-    models, rounds, parameters = [model], [], ()
+    models, rounds = [model], []
+    parameters: tuple[Parameter, ...] = ()
     diagnoses: list[Diagnosis] = []
     added: list[str] = []
 
@@ -185,8 +190,10 @@ def improve(
             fall = fall_of(before, problem.with_model(fitted.model))
             doubt = _doubt(name, fall, fitted.parameters)
             if not doubt and isinstance(fitted, JointFit):
-                pair = [problem.with_model(each) for each in (fitted.alone, fitted.model)]
-                doubt = _idle(name, fall_of(*pair))
+                alone, together_ = (
+                    problem.with_model(each) for each in (fitted.alone, fitted.model)
+                )
+                doubt = _idle(name, fall_of(alone, together_))
             if doubt and fall.claimed and isinstance(fitted, Fitted):
                 tried = fit_plausible(before, fitted, [*added, name], name)
                 if tried is not None:

@@ -22,7 +22,7 @@ Recordings = Iterable[Recording | str | Path] | Recording | str | Path
 
 
 def open_inputs(
-    model: Model, recordings: Recordings, sized: bool = True
+    model: ArmModel | str | Path, recordings: Recordings, sized: bool = True
 ) -> tuple[ArmModel, list[Recording], tuple[str, ...]]:
     """The model and the recordings as a diagnosis takes them, with notes for its reader.
 
@@ -35,8 +35,8 @@ def open_inputs(
     check_fits(arm.spec, measured, sized)
     turned, notes = under_weight(arm, measured)
     taken_part = part_in_fit(arm, measured)
-    notes = (*notes_of(arm), *notes, *outside_range(arm.spec, measured), *taken_part)
-    return turned, measured, notes
+    beyond = outside_range(arm.spec, measured)
+    return turned, measured, (*notes_of(arm), *notes, *beyond, *taken_part)
 
 
 def part_in_fit(model: ArmModel, recordings: list[Recording]) -> tuple[str, ...]:

@@ -132,6 +132,7 @@ def open_model(
             "the model's folder states its validated error: expected --model-error only with a "
             "callable or with predictions"
         )
+    assert isinstance(model, ArmModel | str | Path)
     return Opened(load_model(model), measured, earlier)
 
 
@@ -212,7 +213,8 @@ def has_slope(model: ArmModel) -> bool:
 
 def notes_of(model: ArmModel) -> list[str]:
     """What a reader has to know of a model of other origin; empty for a fitted one."""
-    network, notes = model.network, []
+    network = model.network
+    notes: list[str] = []
     if not isinstance(network, CallableNetwork | PredictedNetwork):
         return notes
     if model.validation.rmse_mm is None:

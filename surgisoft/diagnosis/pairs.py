@@ -27,6 +27,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.discrepancy import LENGTHS
+from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.residuals import (
     BLOCK_ROWS,
     LEAST_BLOCKS,
@@ -81,6 +82,9 @@ REFINEMENTS = 8
 """Most Newton steps of a delay."""
 APART_S = 10.0
 """Least delay at which a run repeats itself, s; a smaller one is the run itself."""
+IDLE = 0.1
+"""Motion of a chamber, as a share of that of the one that moves most, below which it is nearly
+idle: as much as two motions may differ (`residuals.MOTION_ALIKE`)."""
 LEAST_SHARE = 0.5
 """Share of the training rows of AFTER that must have a partner for the paired difference to be
 used, or:"""
@@ -190,7 +194,10 @@ class Change:
         """The change in words."""
         names = " + ".join(self.before)
         if self.change_mm is None:
-            return f"no common actuation with {names}: compared through the model"
+            return (
+                f"no common actuation with {names}: compared through the model, less what it got "
+                "wrong there"
+            )
         delays = sorted({f"{each.delay_s:.2f} s" for each in self.stretches[:DELAYS_SHOWN]})
         return (
             f"{100 * self.paired_share:.0f} % of the rows have a partner in {names} (delay "
@@ -505,8 +512,8 @@ def _best_matches(
     best: list[Match] = []
     most = 0.0
     for commanded in (True, False) if known else (False,):
-        signals = [run_signals(table, commanded) for table in (after, before)]
-        found = all_matches(*signals, _alike(after, before, commanded, share), itself)
+        one, other = (run_signals(table, commanded) for table in (after, before))
+        found = all_matches(one, other, _alike(after, before, commanded, share), itself)
         rows = sum(int(match.inside.sum()) for match in found)
         if rows > most:
             best, most = found, MORE_ROWS * rows
@@ -529,13 +536,13 @@ def _partners(
         at = one.t_s[match.inside] + match.delay_s
         rows = one.rows[match.inside]
         lower = np.clip(np.searchsorted(other.t_s, at, "right") - 1, 0, len(other.t_s) - 2)
-        share = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
-        share = np.clip(share, 0.0, 1.0)
+        between = (at - other.t_s[lower]) / (other.t_s[lower + 1] - other.t_s[lower])
+        between = np.clip(between, 0.0, 1.0)
         lower = other.rows[lower]
-        residual = _between(before.residual_mm, lower, share)
+        residual = _between(before.residual_mm, lower, between)
         ok = np.isfinite(residual).all(2)
         sums[rows] += np.where(ok[..., None], residual, 0.0)
-        predicted[rows] += _between(before.predicted_mm, lower, share)
+        predicted[rows] += _between(before.predicted_mm, lower, between)
         seen[rows] += ok
         partners[rows] += 1
         averaging[rows] += share**2 + (1 - share) ** 2
@@ -817,8 +824,8 @@ class BeforeAfter:
     """Residuals of AFTER: paired differences where `used`, else those of the model."""
     plain: ResidualTable
     """Residuals of the model on AFTER."""
-    before: tuple[Recording, ...]
-    """The recordings of BEFORE."""
+    earlier: ResidualTable
+    """Residuals of the model on BEFORE."""
     pairs: Pairs
     """The partners of the rows of AFTER."""
     used: bool
@@ -830,9 +837,10 @@ class BeforeAfter:
         return " + ".join(self.pairs.before)
 
     def training(self, rows: int = ROWS) -> Problem:
-        """The training rows of AFTER; without pairs the residuals of BEFORE are their reference."""
-        problem = self.table.training(rows)
-        return problem if self.used else problem.with_reference(self.before)
+        """The training rows of AFTER; without pairs less what the model got wrong on BEFORE."""
+        if self.used:
+            return self.table.training(rows)
+        return known_error(self.plain, self.earlier).problem_of(self.plain, rows)
 
     def track(self, problem: Problem, explained_mm: np.ndarray) -> ChangeTrack:
         """The change along the rows of a problem, of which effects explain (S, n, 3) mm."""
@@ -883,8 +891,8 @@ class BeforeAfter:
         share = float(self.pairs.paired[~self.table.held_out].mean())
         return (
             f"{100 * share:.0f} % of the rows were recorded with the same actuation as "
-            f"{self.names}: compared through the model, whose error counts; record the same "
-            "protocol before and after",
+            f"{self.names}: compared through the model, less what can be learned of its error; "
+            "record the same protocol before and after",
         )
 
 
@@ -902,7 +910,7 @@ def before_and_after(
     if paired == "never":
         empty = replace(other, run=np.full(len(other.run), -1))
         return BeforeAfter(
-            table, table, before, _pairs(table, other, _partners(table, empty)), False
+            table, table, other, _pairs(table, other, _partners(table, empty)), False
         )
     found, pairs = paired_table(table, other)
     if found is None and paired == "always":
@@ -911,16 +919,18 @@ def before_and_after(
             f"recorded with the same actuation as {' + '.join(pairs.before)}; record the same "
             "protocol before and after, or leave out --paired always"
         )
-    return BeforeAfter(found or table, table, before, pairs, found is not None)
+    return BeforeAfter(found or table, table, other, pairs, found is not None)
 
 
 def _check_common_range(after: ResidualTable, before: ResidualTable) -> None:
-    """Raise where the actuation of BEFORE and AFTER has no range in common."""
-    for chamber in range(after.spec.chambers):
-        (a, b), (c, d) = (
-            (table.pressure[:, chamber].min(), table.pressure[:, chamber].max())
-            for table in (after, before)
-        )
+    """Raise where the actuation of BEFORE and AFTER has no range in common.
+
+    A chamber that is nearly idle in both has none to compare: a regulator holds it at about 0.
+    """
+    ranges = [(table.pressure.min(axis=0), table.pressure.max(axis=0)) for table in (after, before)]
+    moved = np.max([high - low for low, high in ranges], axis=0)
+    for chamber in np.flatnonzero(moved >= IDLE * moved.max()):
+        (a, b), (c, d) = ((low[chamber], high[chamber]) for low, high in ranges)
         if min(b, d) < max(a, c):
             raise InputError(
                 f"{' + '.join(before.names)}: chamber {chamber + 1} goes from {c:.4g} to {d:.4g} "

@@ -731,8 +731,8 @@ def _decided(
         competing = [score for score in (best, *competing) if score is not line[0]]
         best = line[0]
     alike = {score.effect for score in (best, *competing)}
-    shares = dict(zip(gains, win_shares(-np.stack(list(gains.values()))), strict=True))
-    sure = max(float(sum(shares[name] for name in alike)) - best.p_value, 0.0)
+    every = dict(zip(gains, win_shares(-np.stack(list(gains.values()))), strict=True))
+    sure = max(float(sum(every[name] for name in alike)) - best.p_value, 0.0)
     if competing:
         sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure

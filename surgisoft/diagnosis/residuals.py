@@ -598,7 +598,7 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     """
     rows = np.flatnonzero(block >= 0)
     rows = rows[:: max(1, -(-len(rows) // MOTION_ROWS))]
-    state, owner = _motion_states(history, half)[rows], block[rows]
+    state, owner = motion_states(history, half)[rows], block[rows]
     count = int(block.max()) + 1
     whole = np.maximum(np.bincount(owner, minlength=count), 1)
     moving = np.abs(state[:, history.chambers :]).max(1) > STILL
@@ -619,7 +619,7 @@ def motions(history: History, half: np.ndarray, block: np.ndarray) -> np.ndarray
     return answer
 
 
-def _motion_states(history: History, half: np.ndarray) -> np.ndarray:
+def motion_states(history: History, half: np.ndarray) -> np.ndarray:
     """(N, 3 m) the actuation of every row and how far it runs ahead of its low passes."""
     signal = history.pressure.double() / torch.from_numpy(half)
     decay = torch.exp(-history.dt_s.double().unsqueeze(-1) / torch.tensor(MOTION_TIMES_S))

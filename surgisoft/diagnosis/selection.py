@@ -37,6 +37,15 @@ class Option:
     """Its sensitivities."""
     candidate: int | None
     """Number of the candidate; None: several of them."""
+    amplitudes: int
+    """Number of amplitudes that were fitted to the recordings; a refined candidate has one
+    sensitivity, whose amplitudes were all fitted."""
+
+    @property
+    def alone(self) -> int:
+        """Number of the candidate of a form that has one."""
+        assert self.candidate is not None
+        return self.candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +90,7 @@ def _options_of(
     """One option for each candidate, numbered and indexed from the given numbers on."""
     for candidate in candidates:
         end = first + candidate.sensitivities.shape[3]
-        yield Option(candidate.name, tuple(range(first, end)), number)
+        yield Option(candidate.name, tuple(range(first, end)), number, candidate.amplitudes)
         number, first = number + 1, end
 
 
@@ -113,11 +122,12 @@ class ModelSelection:
             options.setdefault(option.effect, []).append(option)
         for name, choices in options.items():
             # Beside more of an effect that the model has, one further candidate is enough.
-            own = any(candidates[option.candidate].more for option in choices)
-            members = [candidates[option.candidate].effect for option in choices]
+            own = any(candidates[option.alone].more for option in choices)
+            members = [candidates[option.alone].effect for option in choices]
             for some in [] if own else hypothesis_of(members[0]).combinations(members):
                 if len(some) > 1:
-                    choices.append(Option(name, sum((choices[i].chosen for i in some), ()), None))
+                    chosen = sum((choices[i].chosen for i in some), ())
+                    choices.append(Option(name, chosen, None, len(chosen)))
         noise = float(np.mean(problem.noise_mm**2))
         return cls(
             problem, candidates, validation, options, sensitivities, validation.counts * noise
@@ -226,7 +236,7 @@ class ModelSelection:
         effect = self.in_place(self.single(option, base), base)
         if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
             return False
-        some = self.candidates[self.options[option.effect][0].candidate].effect
+        some = self.candidates[self.options[option.effect][0].alone].effect
         return (
             not hypothesis_of(some).needs_reversals
             or self._static_share(option, base) <= SEARCH.most_static
@@ -270,7 +280,7 @@ class ModelSelection:
         key = (option.candidate, base)
         if key not in self.fitted:
             amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
-            self.fitted[key] = self.candidates[option.candidate].with_amplitudes(amplitudes)
+            self.fitted[key] = self.candidates[option.alone].with_amplitudes(amplitudes)
         return self.fitted[key]
 
     def starts(self, scores: Sequence[Score]) -> list[tuple[str, Effect]]:

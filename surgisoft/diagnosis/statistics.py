@@ -5,7 +5,7 @@ is a block of neighbouring rows (Kunsch 1989, "The jackknife and the bootstrap f
 stationary observations").
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -95,7 +95,10 @@ def studentised(gains: np.ndarray) -> np.ndarray:
 
 
 def sign_flip_p_values(
-    gains: np.ndarray, group: np.ndarray | None = None, seed: int = 0, draws: int = DRAWS
+    gains: np.ndarray,
+    group: Sequence[str] | np.ndarray | None = None,
+    seed: int = 0,
+    draws: int = DRAWS,
 ) -> np.ndarray:
     """(C,) probability of so large a gain in any of C candidates if none had one.
 

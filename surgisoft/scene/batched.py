@@ -1,7 +1,7 @@
 """Clearance and ray queries for many environments at once, as training needs them.
 
 `BatchedScene` gives the results of `collision.CollisionChecker` for batches of arms: on the CPU
-with Embree and compiled queries, on an accelerator with torch. Both agree with FCL to the
+with compiled queries, on an accelerator with torch. Both agree with FCL to the
 tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
 """
 
@@ -28,7 +28,16 @@ from surgisoft.scene.distance import (
 )
 from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
-from surgisoft.scene.rays import EmbreeSurface, RayHit, Struck, rays_to_chains, struck_of
+from surgisoft.scene.rays import (
+    RayHit,
+    Struck,
+    aim_rays,
+    chain_hits,
+    ray_ends,
+    rays_to_body,
+    rays_to_chains,
+    struck_of,
+)
 from surgisoft.scene.sight import hide_behind_body, hide_behind_chain
 from surgisoft.scene.torch_queries import (
     TorchSurface,
@@ -38,7 +47,7 @@ from surgisoft.scene.torch_queries import (
 )
 
 ENGINES = ("compiled", "torch")
-"""The batched engines: Embree and compiled queries, or torch alone."""
+"""The batched engines: compiled queries, or torch alone."""
 LONGEST_SEGMENT_MM = 6.0
 """Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
 MOST_PARTS = 256
@@ -90,7 +99,7 @@ class BatchedScene:
             band = 5.0 * math.ceil((thickest + self.exact_within_mm + 5.0) / 5.0)
             field = load_field(body.mesh, margin, band, most_nodes, tree, cache)
             self._surfaces.append(kind(tree, field, self.device))
-            self._trees.append(tree.arrays)
+            self._trees.append(tree)
 
     def radius_mm(self, arm: str) -> float:
         """Radius of an arm by name (mm)."""
@@ -137,6 +146,8 @@ class BatchedScene:
 
         `own` names the arm that carries the beam: its segments near the tip do not block it.
         """
+        if self.compiled:
+            return self._compiled_cast(origins_mm, directions, range_mm, arms or {}, own, poses)
         shape = origins_mm.shape[:-1]
         count = shape[0]
         origins = _held(origins_mm).double().reshape(count, -1, 3)
@@ -151,6 +162,7 @@ class BatchedScene:
             turn, shift = self._inward(body, poses)
             o = origins @ turn.mT + shift[:, None]
             d = aims @ turn.mT
+            assert isinstance(surface, TorchSurface), "the compiled engine has its own loops"
             t, f = surface.first_hit(o.reshape(-1, 3), d.reshape(-1, 3), float(range_mm))
             t, f = t.view_as(best), f.view_as(best)
             nearer = (f >= 0) & (t < best)
@@ -163,7 +175,7 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius, line = self.radius_mm(name), _held(line)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            t, segment = self._chain_hits(origins, aims, line, radius, gap, best)
+            t, segment = rays_to_chains_torch(origins, aims, line, radius, gap, best)
             nearer = t < best
             point = origins + t[..., None] * aims
             outward = chain_normal(point, line.double()[:, None], segment)
@@ -183,6 +195,45 @@ class BatchedScene:
             point_mm=point.to(dtype).reshape(*shape, 3),
             normal=normal.to(dtype).reshape(*shape, 3),
             incidence_rad=torch.atan2(sine, cosine).to(dtype).reshape(shape),
+        )
+
+    def _compiled_cast(self, origins_mm, directions, range_mm, arms, own, poses) -> RayHit:
+        """`cast` in a few compiled loops."""
+        shape, dtype = origins_mm.shape[:-1], origins_mm.dtype
+        each, count = math.prod(shape[1:]), math.prod(shape)
+        origins, aims, normals = (np.empty((count, 3)) for _ in range(3))
+        given = (_held(t).reshape(-1, 3).numpy() for t in (origins_mm, directions))
+        aim_rays(*given, origins, aims)
+        np.negative(aims, out=normals)
+        struck, t = torch.zeros(count, dtype=torch.int8), np.full(count, float(range_mm))
+        body, face = torch.full((2, count), -1, dtype=torch.int32)
+        found = (struck.numpy(), body.numpy(), face.numpy(), t, normals)
+        for number, (one, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
+            frame = (part.numpy() for part in self._inward(one, poses))
+            tree, outward = self._trees[number], surface.normals.numpy()
+            mesh = (tree.arrays, tree.order, outward, number, int(struck_of(one)))
+            rays_to_body(origins, aims, each, *frame, *mesh, *found)
+        for name, line in arms.items():
+            radius, line = self.radius_mm(name), _held(line).numpy()
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
+            before, segment = t.copy(), np.zeros(count, np.int64)
+            rays = (part.reshape(-1, each, 3) for part in (origins, aims))
+            ends = (part.reshape(-1, each) for part in (t, segment))
+            rays_to_chains(*rays, line, radius, gap, *ends)
+            chain_hits(origins, aims, each, line, kind, before, segment, *found)
+        point, normal = torch.empty((2, count, 3), dtype=dtype)
+        distance, incidence = torch.empty((2, count), dtype=dtype)
+        arrays = (part.numpy() for part in (point, normal, distance, incidence))
+        ray_ends(origins, aims, t, normals, *arrays)
+        return RayHit(
+            struck=struck.reshape(shape),
+            body=body.reshape(shape),
+            face=face.reshape(shape),
+            distance_mm=distance.reshape(shape),
+            point_mm=point.reshape(*shape, 3),
+            normal=normal.reshape(*shape, 3),
+            incidence_rad=incidence.reshape(shape),
         )
 
     def clear_lines(
@@ -207,13 +258,11 @@ class BatchedScene:
         for name, line in (arms or {}).items():
             radius = self.radius_mm(name)
             gap = self_contact_gap_mm(radius) if name == own else -1.0
-            spine = _held(line).numpy()
-            hide_behind_chain(
-                eyes, ends, distance, short_mm, spine, radius, gap, wanted.numpy(), flags
-            )
+            chain = _held(line).numpy(), radius, gap
+            hide_behind_chain(eyes, ends, distance, short_mm, *chain, wanted.numpy(), flags)
         for body, tree in zip(self.bodies, self._trees, strict=True):
             turn, shift = (t.numpy() for t in self._inward(body, poses))
-            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree, flags)
+            hide_behind_body(eyes, ends, distance, short_mm, turn, shift, tree.arrays, flags)
         return clear
 
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
@@ -240,29 +289,13 @@ class BatchedScene:
         chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
         return out
 
-    def _chain_hits(self, origins, aims, line, radius, gap, best):
-        if not self.compiled:
-            return rays_to_chains_torch(origins, aims, line, radius, gap, best)
-        distance, segment = best.clone(), torch.zeros_like(best, dtype=torch.int64)
-        rays_to_chains(
-            origins.numpy(),
-            aims.numpy(),
-            line.numpy(),
-            radius,
-            gap,
-            distance.numpy(),
-            segment.numpy(),
-        )
-        return distance, segment
-
 
 class CompiledSurface:
-    """One body's surface on the CPU: compiled clearance queries, rays by Embree."""
+    """One body's surface on the CPU, for clearance queries."""
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
         self._tree, self._field = tree, field
         self._closed = tree.mesh.is_watertight
-        self._embree = EmbreeSurface(tree.mesh)
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
     def clearance(
@@ -299,13 +332,6 @@ class CompiledSurface:
             out.numpy(),
         )
         return out
-
-    def first_hit(
-        self, origins: torch.Tensor, directions: torch.Tensor, range_mm: float
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Distance (N,) mm and face (N,) of rays (N, 3) in the body's frame; -1 for none."""
-        distance, face = self._embree.first_hit(origins.numpy(), directions.numpy(), range_mm)
-        return torch.from_numpy(distance), torch.from_numpy(face)
 
 
 def _pose_of(body: Body) -> torch.Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import fcl
@@ -26,6 +27,7 @@ from surgisoft.scene.capsules import (
     folding_pairs,
     ray_chain,
     ray_free_segments,
+    segment_distance,
 )
 from surgisoft.scene.inside import points_inside
 from surgisoft.scene.mesh import Body
@@ -125,19 +127,40 @@ class _Chain:
 
     def __init__(self, name: str, shape: ArmShape):
         self.name, self.shape = name, shape
-        points = shape.centreline_mm
+
+    @cached_property
+    def capsules(self) -> list[fcl.Capsule]:
+        """The segments as FCL capsules, base to tip."""
+        points = self.shape.centreline_mm
+        return [
+            fcl.Capsule(self.shape.radius_mm, one) for one in frames.norm(np.diff(points, axis=0))
+        ]
+
+    @cached_property
+    def segment_of(self) -> dict[int, int]:
+        """Id of each capsule -> its segment."""
+        return {id(capsule): i for i, capsule in enumerate(self.capsules)}
+
+    @cached_property
+    def manager(self) -> fcl.DynamicAABBTreeCollisionManager:
+        """The capsules where they are, in FCL's broad phase."""
+        points = self.shape.centreline_mm
         axes = points[1:] - points[:-1]
         turns = frames.rotation_from_z(axes + (frames.norm(axes) == 0)[:, None])
-        lengths, middles = frames.norm(axes), 0.5 * (points[1:] + points[:-1])
-        self.capsules = [fcl.Capsule(shape.radius_mm, length) for length in lengths]
-        self.segment_of = {id(capsule): i for i, capsule in enumerate(self.capsules)}
+        middles = 0.5 * (points[1:] + points[:-1])
         objects = [
             fcl.CollisionObject(capsule, fcl.Transform(turn, middle))
             for capsule, turn, middle in zip(self.capsules, turns, middles, strict=True)
         ]
-        self.manager = fcl.DynamicAABBTreeCollisionManager()
-        self.manager.registerObjects(objects)
-        self.manager.setup()
+        manager = fcl.DynamicAABBTreeCollisionManager()
+        manager.registerObjects(objects)
+        manager.setup()
+        return manager
+
+    @cached_property
+    def whole(self) -> fcl.CollisionObject:
+        """The whole centreline, see `line`."""
+        return self.line()
 
     def line(self, start: int = 0, stop: int | None = None) -> fcl.CollisionObject:
         """Segments start..stop as FCL triangles without width, which give exact distances."""
@@ -250,7 +273,7 @@ class CollisionChecker:
         }
         pairs = {
             (a.name, b.name): self._saturated(
-                _distance(a.line(), b.line()) - a.shape.radius_mm - b.shape.radius_mm
+                _distance(a.whole, b.whole) - a.shape.radius_mm - b.shape.radius_mm
             )
             for a, b in combinations(chains, 2)
         }
@@ -260,7 +283,7 @@ class CollisionChecker:
         return min(clearance_mm, self.horizon_mm)
 
     def _body_clearance(self, chain: _Chain, index: int) -> float:
-        centre = _distance(chain.line(), self._objects[index])
+        centre = _distance(chain.whole, self._objects[index])
         for point in self._points_within(chain.shape.centreline_mm, index, centre > ROUNDING_MM):
             ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
             centre = min(centre, -_distance(ball, self._objects[index]))
@@ -273,12 +296,68 @@ class CollisionChecker:
         return points[self.inside(index, points)]
 
     def _self_clearance(self, chain: _Chain) -> float:
-        bounds, least = chain.fold_bounds(), np.inf
-        for i in np.argsort(bounds.min(axis=1)):
-            if bounds[i].min() < least:
-                first = int(np.argmax(np.isfinite(bounds[i])))
-                least = min(least, _distance(chain.line(i, i + 1), chain.line(first)))
+        """FCL's distance of the segments that the closed form finds nearest, minus two radii.
+
+        What FCL finds for a segment rules out those that the closed form puts farther away.
+        """
+        line, least = chain.shape.centreline_mm, np.inf
+        allowed = folding_pairs(line, chain.shape.radius_mm)
+        if allowed.any():
+            a, b = line[:-1, None], line[1:, None]
+            apart = segment_distance(a, b, line[None, :-1], line[None, 1:])
+            bounds = np.where(allowed, apart, np.inf)
+            nearest = bounds.min(axis=1)
+            for i in np.argsort(nearest):
+                if nearest[i] < least - ROUNDING_MM:
+                    first = int(np.argmax(allowed[i]))
+                    found = _distance(chain.line(i, i + 1), chain.line(first))
+                    least = min(least, found)
         return self._saturated(least - 2.0 * chain.shape.radius_mm)
+
+    def cast_each(
+        self,
+        origins_mm: np.ndarray,
+        directions: np.ndarray,
+        range_mm: float,
+        lines_mm: Mapping[str, np.ndarray],
+        radii_mm: Mapping[str, float],
+        own: str | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What each of B rays meets first, a `Struck` (B,) int8, and where it ends (B, 3) mm.
+
+        As `cast`, each ray (B, 3) among arms of its own: name -> (B, K, 3) mm. Closed forms are
+        evaluated for all rays at once; FCL finds the faces, of bodies whose box the ray enters
+        before it meets an arm.
+        """
+        origins = np.asarray(origins_mm, dtype=np.float64)
+        aims = frames.normalise(np.asarray(directions, dtype=np.float64))
+        t, struck = np.full(len(origins), range_mm), np.zeros(len(origins), np.int8)
+        for name, line in lines_mm.items():
+            free = ray_free_segments(line, radii_mm[name]) if name == own else None
+            found, _ = ray_chain(origins, aims, line, radii_mm[name], free)
+            nearer = found < t
+            t = np.where(nearer, found, t)
+            struck[nearer] = Struck.OWN_ARM if name == own else Struck.OTHER_ARM
+        request = fcl.CollisionRequest(num_max_contacts=MOST_CONTACTS, enable_contact=True)
+        for index, body in enumerate(self.bodies):
+            inward = self._inward[index]
+            o, d = frames.apply(inward, origins), frames.rotate(inward, aims)
+            rows, faces = [], []
+            for row in np.flatnonzero(_enter_box(o, d, t, body.mesh.bounds_mm)):
+                result = fcl.CollisionResult()
+                probe = _probe(origins[row], aims[row], t[row])
+                if fcl.collide(self._objects[index], probe, request, result):
+                    faces += [contact.b1 for contact in result.contacts]
+                    rows += [row] * len(result.contacts)
+            if rows:
+                each = np.array(rows)
+                hits = ray_triangles(o[each], d[each], body.mesh.triangles_mm[np.array(faces)])
+                nearest = np.full(len(t), np.inf)
+                np.minimum.at(nearest, each, hits)
+                nearer = nearest < t
+                t = np.where(nearer, nearest, t)
+                struck[nearer] = struck_of(body)
+        return struck, origins + t[:, None] * aims
 
     def cast(
         self,
@@ -306,6 +385,10 @@ class CollisionChecker:
         best = (Struck.NOTHING, -1, -1, range_mm, origin + range_mm * direction, -direction)
         probe = _probe(origin, direction, range_mm)
         for index, body in enumerate(self.bodies):
+            inward = self._inward[index]
+            o, d = frames.apply(inward, origin[None]), frames.rotate(inward, direction[None])
+            if not _enter_box(o, d, best[3], body.mesh.bounds_mm)[0]:
+                continue
             face, t = self._first_face(index, probe, origin, direction, best[3])
             if face >= 0:
                 normal = body.pose[:3, :3] @ body.mesh.face_normals[face]
@@ -349,6 +432,21 @@ def _probe(origin, direction, range_mm: float) -> fcl.CollisionObject:
     end = origin + range_mm * direction
     corners = np.stack((origin, end, end + side))
     return fcl.CollisionObject(surface_model(corners, np.array([[0, 1, 2]])))
+
+
+def _enter_box(origins, directions, range_mm, bounds_mm) -> np.ndarray:
+    """(N,) bool: the ray (N, 3) enters the box (2, 3) mm before its range, with room for rounding.
+
+    By slabs (Kay & Kajiya 1986).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low = (bounds_mm[0] - ROUNDING_MM - origins) / directions
+        high = (bounds_mm[1] + ROUNDING_MM - origins) / directions
+    # 0 / 0: the ray runs along the slab's face, which counts as inside.
+    first = np.nan_to_num(np.minimum(low, high), nan=-np.inf, neginf=-np.inf, posinf=np.inf)
+    last = np.nan_to_num(np.maximum(low, high), nan=np.inf, neginf=-np.inf, posinf=np.inf)
+    first, last = first.max(axis=1), last.min(axis=1)
+    return (first <= last) & (last >= 0.0) & (first <= range_mm)
 
 
 def ray_triangles(

@@ -1,8 +1,9 @@
 """Rays through the scene: what a laser beam or a line of sight meets first.
 
 Both engines return a `RayHit`: the exact one in `collision`, the batched one in `batched`. The rest
-of this module is the batched engine's part on the CPU: Embree finds the face, float64 arithmetic
-the point on it, and compiled closed forms the hits on arms.
+of this module is the batched engine's part on the CPU, compiled: the hits on bodies by a walk
+through the tree of their faces, those on arms by closed forms. `EmbreeSurface` does the same for
+one mesh without arms, as pictures and the placing of lesions need it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from surgisoft.compiled import compiled
+from surgisoft.scene.bvh import STACK, line_triangle, triangle
 from surgisoft.scene.mesh import Body, Mesh
 
 
@@ -222,3 +224,145 @@ def rays_to_chains(origins, directions, lines, radius, gap, distance, segment):
                     hit = capsule_entry(o, d, a, b, radius)
                     if hit < distance[n, r]:
                         distance[n, r], segment[n, r] = hit, k
+
+
+@compiled
+def aim_rays(origins, directions, origin, aim):
+    """Origins (N, 3) and unit directions (N, 3) as float64; nan for a ray that is not finite."""
+    for n in range(len(origin)):
+        x = np.float64(directions[n, 0])
+        y = np.float64(directions[n, 1])
+        z = np.float64(directions[n, 2])
+        length = math.sqrt(x * x + y * y + z * z)
+        length = length if length > 0.0 else 1.0
+        aim[n, 0], aim[n, 1], aim[n, 2] = x / length, y / length, z / length
+        for i in range(3):
+            origin[n, i] = origins[n, i]
+
+
+@compiled
+def _nearest_face(p, d, best, triangles, starts, lower, upper, nodes, entry):
+    """Distance to and tree index of the first face on a ray before `best`; -1 for none."""
+    leaves = len(starts) - 1
+    ix = 1.0 / d[0] if d[0] != 0.0 else 1e300
+    iy = 1.0 / d[1] if d[1] != 0.0 else 1e300
+    iz = 1.0 / d[2] if d[2] != 0.0 else 1e300
+    face = -1
+    nodes[0], entry[0], size = 0, _entry(p, ix, iy, iz, lower, upper, 0), 1
+    while size > 0:
+        size -= 1
+        node = nodes[size]
+        if entry[size] > best:
+            continue
+        if node >= leaves - 1:
+            leaf = node - (leaves - 1)
+            for k in range(starts[leaf], starts[leaf + 1]):
+                a, b, c = triangle(triangles, k)
+                t = line_triangle(p, d, a, b, c)
+                if 0.0 <= t < best:
+                    best, face = t, k
+            continue
+        one, two = 2 * node + 1, 2 * node + 2
+        to_one = _entry(p, ix, iy, iz, lower, upper, one)
+        to_two = _entry(p, ix, iy, iz, lower, upper, two)
+        if to_one < to_two:
+            one, two, to_one, to_two = two, one, to_two, to_one
+        if to_one <= best:
+            nodes[size], entry[size] = one, to_one
+            size += 1
+        if to_two <= best:
+            nodes[size], entry[size] = two, to_two
+            size += 1
+    return best, face
+
+
+@compiled
+def _entry(p, ix, iy, iz, lower, upper, node):
+    """Where a ray enters a box, inf for a miss; rounding may not lose a box that it grazes."""
+    one, two = (lower[node, 0] - p[0]) * ix, (upper[node, 0] - p[0]) * ix
+    first, last = min(one, two), max(one, two)
+    one, two = (lower[node, 1] - p[1]) * iy, (upper[node, 1] - p[1]) * iy
+    first, last = max(first, min(one, two)), min(last, max(one, two))
+    one, two = (lower[node, 2] - p[2]) * iz, (upper[node, 2] - p[2]) * iz
+    first, last = max(first, min(one, two)), min(last, max(one, two))
+    return max(first, 0.0) - 1e-9 if first <= last + 1e-9 and last >= -1e-9 else math.inf
+
+
+@compiled
+def rays_to_body(
+    origins, aims, each, turns, shifts, tree, order, normals, which, kind, struck, body, face, t, n
+):
+    """First hits of rays (N, 3) on a body, where they are nearer than t (N,) mm.
+
+    `each` rays belong to one environment; turns (B or 1, 3, 3) and shifts (B or 1, 3): world to
+    body. Writes struck, body and face (N,), distance t (N,) and normal n (N, 3), world frame.
+    """
+    triangles, starts, lower, upper = tree
+    nodes, entry = np.empty(STACK, np.int64), np.empty(STACK)
+    for k in range(len(t)):
+        pose = k // each if len(turns) > 1 else 0
+        turn, shift = turns[pose], shifts[pose]
+        p, d = _turned(turn, origins, k), _turned(turn, aims, k)
+        p = (p[0] + shift[0], p[1] + shift[1], p[2] + shift[2])
+        if not math.isfinite(p[0] + p[1] + p[2] + d[0] + d[1] + d[2]):
+            continue
+        distance, found = _nearest_face(p, d, t[k], triangles, starts, lower, upper, nodes, entry)
+        if found >= 0:
+            t[k], face[k], body[k], struck[k] = distance, order[found], which, kind
+            out = normals[order[found]]
+            for i in range(3):
+                n[k, i] = turn[0, i] * out[0] + turn[1, i] * out[1] + turn[2, i] * out[2]
+
+
+@compiled
+def _turned(turn, vectors, k):
+    """Rotation (3, 3) times vector k, as a tuple."""
+    x, y, z = vectors[k, 0], vectors[k, 1], vectors[k, 2]
+    return (
+        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
+        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
+        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+    )
+
+
+@compiled
+def chain_hits(origins, aims, each, lines, kind, before, segment, struck, body, face, t, n):
+    """Mark rays (N, 3) that meet an arm (B, K, 3) at t (N,) mm, nearer than `before` (N,).
+
+    segment (N,) is the one that is met; the normal n (N, 3) points away from its axis.
+    """
+    for k in range(len(t)):
+        if not t[k] < before[k]:
+            continue
+        body[k], face[k], struck[k] = -1, -1, kind
+        b, s = k // each, segment[k]
+        x = origins[k, 0] + t[k] * aims[k, 0] - lines[b, s, 0]
+        y = origins[k, 1] + t[k] * aims[k, 1] - lines[b, s, 1]
+        z = origins[k, 2] + t[k] * aims[k, 2] - lines[b, s, 2]
+        ux = np.float64(lines[b, s + 1, 0]) - np.float64(lines[b, s, 0])
+        uy = np.float64(lines[b, s + 1, 1]) - np.float64(lines[b, s, 1])
+        uz = np.float64(lines[b, s + 1, 2]) - np.float64(lines[b, s, 2])
+        share = (x * ux + y * uy + z * uz) / (ux * ux + uy * uy + uz * uz + 1e-30)
+        share = min(max(share, 0.0), 1.0)
+        x, y, z = x - share * ux, y - share * uy, z - share * uz
+        length = math.sqrt(x * x + y * y + z * z)
+        length = length if length > 0.0 else 1.0
+        n[k, 0], n[k, 1], n[k, 2] = x / length, y / length, z / length
+
+
+@compiled
+def ray_ends(origins, aims, t, n, point, normal, distance, incidence):
+    """Ends (N, 3) mm, normals, distances and angles of incidence of rays that were followed."""
+    for k in range(len(t)):
+        distance[k] = t[k]
+        ax, ay, az = aims[k, 0], aims[k, 1], aims[k, 2]
+        for i in range(3):
+            point[k, i] = origins[k, i] + t[k] * aims[k, i]
+            normal[k, i] = n[k, i]
+        cx, cy, cz = (
+            n[k, 1] * az - n[k, 2] * ay,
+            n[k, 2] * ax - n[k, 0] * az,
+            n[k, 0] * ay - n[k, 1] * ax,
+        )
+        cosine = abs(n[k, 0] * ax + n[k, 1] * ay + n[k, 2] * az)
+        incidence[k] = math.atan2(math.sqrt(cx * cx + cy * cy + cz * cz), cosine)

@@ -23,6 +23,7 @@ from surgisoft.tasks.keyhole import KEYHOLE
 from surgisoft.tasks.laser_plane import LASER_PLANE
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
+from surgisoft.tasks.two_laser_ring import TWO_LASER_RING
 
 TASKS: dict[str, TaskSpec] = {
     "track_circle": TRACK_CIRCLE,
@@ -33,6 +34,7 @@ TASKS: dict[str, TaskSpec] = {
     "circle_ablation": CIRCLE_ABLATION,
     "contour_ablation": CONTOUR_ABLATION,
     "area_ablation": AREA_ABLATION,
+    "two_laser_ring": TWO_LASER_RING,
 }
 """Every task by name."""
 
@@ -102,6 +104,12 @@ def config_from(task: str, table: dict, file: Path, text: str = "") -> Any:
         return from_table(type(default), whole, Where(file, text))
     except InputError as error:
         raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
+
+
+def changed_config(config: Any, changes: dict, file: Path) -> Any:
+    """A task's configuration with the fields of a table changed; `file` is for errors."""
+    whole = merged(to_table(config), with_present_names(config, changes))
+    return from_table(type(config), whole, Where(file))
 
 
 def read_config(task: str, file: Path) -> Any:

@@ -9,6 +9,8 @@ from surgisoft.agents.evaluate import evaluate
 from surgisoft.agents.exact_checks import Contact, ExactChecks, has_obstacles
 from surgisoft.agents.policies import Random
 from surgisoft.agents.rollout import Instant
+from surgisoft.scene.capsules import ArmShape
+from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import PHANTOM, CircleAblation, CircleAblationConfig
@@ -50,6 +52,31 @@ def test_an_arm_driven_into_the_organ_is_found_with_time_and_place(task):
     # The batched path still holds the clearances of the body that was not moved.
     assert check.contact_differs == 1
     assert check.clearance_off_mm > 1.0
+
+
+def test_contact_is_found_at_its_first_step_however_slowly_an_arm_comes(task):
+    """Steps that a clearance proves free are those at which FCL finds nothing, and no other."""
+    state = Episodes(task).seeded(0, 1)
+    scene, line = task.world.scene, state.world.arms["laser"].line_mm[0]
+    towards = scene.centre_mm - line[-1]
+    towards = towards / towards.norm() * 0.4 * (line[-1] - scene.centre_mm).norm() / 20.0
+    steps, states = 55, []
+    for step in range(steps):
+        world = replace(state.world, steps=state.world.steps + step)
+        states.append(at(replace(state, world=world), line + step * towards))
+    checker, radii = CollisionChecker(scene.geometry.bodies), scene.geometry.radii_mm
+    touching = [
+        bool(
+            checker.collisions(
+                {n: ArmShape(p.line_mm[0].numpy(), radii[n]) for n, p in one.world.arms.items()}
+            )
+        )
+        for one in states
+    ]
+    assert 5 < touching.index(True) < steps - 5
+    check = looked_at(task, *states)
+    assert round(check.contact.time_s / 0.1) == touching.index(True)
+    assert check.contact_differs == sum(touching)  # the batched path saw the arm at its start
 
 
 def test_two_straight_arms_are_as_far_apart_as_their_axes_less_radii(task):

@@ -8,12 +8,13 @@ import pytest
 
 from benchmarks.decision.evidence_log import Labelled, append, read
 from benchmarks.decision.fit import (
+    PRIORS,
+    case_weights,
     fit,
     fit_one,
     log_losses,
     model_of,
     sample,
-    source_weights,
 )
 from benchmarks.decision.own_rig import ROUND, Plan, draw
 from benchmarks.decision.table import (
@@ -96,7 +97,7 @@ def test_the_fit_is_at_the_least_penalised_loss():
     """No small change of any free weight lowers the loss, computed from the losses of each case."""
     some = sample("missing", some_cases(count=60))
     model = fit_one("missing", some, 1.0)
-    weights = source_weights([one for _, _, one in some])
+    weights = case_weights("missing", some)
 
     def loss(values):
         losses = log_losses("missing", Logistic(tuple(values[:-1]), values[-1]), some)
@@ -122,13 +123,28 @@ def test_the_conditional_logit_is_a_softmax():
     assert share[0] > 0.8
 
 
+def drawn(source, true, false):
+    """A sample with so many cases of a source of which the statement is true, and false."""
+    return [
+        (np.zeros(1), np.array(float(right)), case(number, source))
+        for right, count in ((1, true), (0, false))
+        for number in range(count)
+    ]
+
+
 def test_every_source_counts_alike():
-    cases = [case(n, "a") for n in range(30)] + [case(n, "b") for n in range(10)]
-    weights = source_weights(cases)
+    weights = case_weights("known", drawn("a", 20, 10) + drawn("b", 6, 4))
     assert weights[:30].sum() == pytest.approx(weights[30:].sum())
     assert weights.mean() == pytest.approx(1.0)
-    few = source_weights([*cases, case(99, "c")])
+    few = case_weights("known", drawn("a", 20, 10) + drawn("b", 20, 10) + drawn("c", 1, 0))
     assert few[-1] < 0.25 * few[:30].sum()
+
+
+def test_how_often_pairs_were_drawn_does_not_count():
+    """Of a source that is half pairs and of one that has few, pairs have the same weight."""
+    weights = case_weights("two", drawn("a", 10, 10) + drawn("b", 10, 30))
+    assert weights[:10].sum() / weights[:20].sum() == pytest.approx(PRIORS["two"])
+    assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
 
 
 def test_a_source_is_judged_without_its_own_cases(monkeypatch):

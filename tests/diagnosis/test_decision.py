@@ -207,6 +207,22 @@ def test_how_sure_the_blocks_are_does_not_tell_two_apart_that_do_the_same():
         assert rows[1, place] == pytest.approx(math.sqrt(0.5) / 3.0)
 
 
+def test_a_second_effect_that_mends_the_form_of_the_first_says_nothing_of_two():
+    """What is left of the first's 99 % is within what its form is wrong by; of 80 % it is not."""
+    second = replace(PAIR, own_gain=0.5, own_log_gain=0.7, own_z=3.3, last_log_gain=0.7)
+    names = [feature.name for feature in FEATURES["two"]]
+    chances, rows = [], []
+    for left in (0.01, 0.2):
+        alone, both = replace(ALONE, gain=1.0 - left), replace(second, gain=1.0 - left / 2)
+        evidence = replace(GOOD, proposals=(alone, both))
+        rows.append(dict(zip(names, features_of("two", evidence), strict=True)))
+        chances.append(probabilities(evidence).pair)
+    assert rows[0]["own_gain"] == pytest.approx(0.5 * 0.01 / 0.03)
+    assert rows[1]["own_gain"] == pytest.approx(0.5 * 0.2 / 0.22)
+    assert rows[0]["better"] == pytest.approx(math.log(0.03 / 0.025))
+    assert chances[0] < chances[1]
+
+
 def test_the_weights_in_force_have_the_signs_of_their_features():
     model = load_decision()
     for name, features in FEATURES.items():

@@ -11,6 +11,7 @@ import torch
 from surgisoft.cli import run
 from surgisoft.diagnosis.amend import amend
 from surgisoft.diagnosis.diagnose import diagnose
+from surgisoft.diagnosis.known_error import known_error
 from surgisoft.diagnosis.pairs import before_and_after
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
@@ -238,6 +239,58 @@ def test_no_common_motion_is_a_note_and_an_error_if_pairs_are_asked_for(model):
         diagnose(model, [after], before=[before], paired="always")
     with pytest.raises(InputError, match="pairing"):
         diagnose(model, [after], before=[before], paired="perhaps")
+
+
+def lagging(pressure):
+    """(T,) mm: what the network never learned of the past: a first-order lag of 2 s."""
+    low = np.empty(len(pressure))
+    low[0] = pressure[0, 0]
+    for i in range(1, len(low)):
+        low[i] = low[i - 1] + PERIOD_S / 2.0 * (pressure[i - 1, 0] - low[i - 1])
+    return 0.6 * (low - pressure[:, 0])
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_what_was_wrong_before_is_no_change_without_pairs(model, changed):
+    """A lag of the arm that the model lacks is in both, with other motion; a gain is new."""
+    before, after = smooth_walk(15), smooth_walk(16)
+    time = PERIOD_S * np.arange(ROWS)
+    old = recording(lagging(before(time)), before(time), seed=2)
+    gain = 0.15 * after(time)[:, 1] * changed
+    new = recording(lagging(after(time)) + gain, after(time), seed=3)
+    both = before_and_after(residual_table(model, [new]), [old])
+    assert not both.used
+    problem = both.training()
+    rows = problem.index.numpy()
+    plain = np.sqrt(np.mean(np.square(both.plain.residual_mm[rows]).sum(2)))
+    # What is left beside the noise is the gain, of which the fit to BEFORE knows nothing.
+    left = np.sqrt(np.mean(np.square(gain[rows])) / 3 + 3 * NOISE_MM**2)
+    assert plain > 3.0 * NOISE_MM * np.sqrt(3)
+    assert problem.rmse_mm == pytest.approx(left, rel=0.3)
+    assert np.all(problem.discrepancy_mm < 0.5 * np.array(model.validation.per_key_point_mm))
+
+
+def test_repeats_of_one_motion_teach_nothing_of_another(model):
+    """What is wrong at each instant of a motion comes again with its repeats, and not elsewhere."""
+    cycle, repeats = 600, 4
+    once = smooth_walk(18)(PERIOD_S * np.arange(cycle))
+    wrong = smooth_walk(20)(PERIOD_S * np.arange(cycle))[:, 0]
+    old = recording(np.tile(wrong - wrong.mean(), repeats), np.tile(once, (repeats, 1)), seed=2)
+    pressure = smooth_walk(16)(PERIOD_S * np.arange(ROWS))
+    new = recording(np.zeros(ROWS), pressure, seed=3)
+    found = known_error(residual_table(model, [new]), residual_table(model, [old]))
+    assert found.ratio == 1.0
+    assert not found.correction_mm.any()
+
+
+def test_a_nearly_idle_chamber_is_no_common_range(model):
+    """A chamber that hardly moves, at another pressure before and after, refuses nothing."""
+    motion = smooth_walk(17)(PERIOD_S * np.arange(ROWS))
+    idle = np.random.default_rng(0).uniform(0, 0.1, ROWS)
+    before, after = (np.stack([motion[:, 0], at + idle], axis=1) for at in (1.0, 2.0))
+    some = [recording(np.zeros(ROWS), pressure, seed=3) for pressure in (after, before)]
+    both = before_and_after(residual_table(model, some[:1]), some[1:])
+    assert both.training().rmse_mm < 2.0 * np.sqrt(3) * NOISE_MM
 
 
 def test_recordings_and_reference_are_before(model):

@@ -52,7 +52,7 @@ class Table:
             gain = gain + np.random.default_rng(place).normal(0, 1e-3, 40)
             share = (self.losses(base).sum() - after.sum()) / self.excess(self.losses(base))
             chance = float(sign_flip_p_values(gain[None])[0])
-            answer.append(Score(name, Option(name, (place,), 0), after, gain, chance, share))
+            answer.append(Score(name, Option(name, (place,), 0, 1), after, gain, chance, share))
         return sorted(answer, key=lambda s: -s.score)
 
 

@@ -380,6 +380,7 @@ def history_of_protocol(model: ArmModel, protocol: Protocol) -> History:
             step = protocol.settle_s + protocol.average_s
             runs.append((step * np.arange(len(protocol.commands[rows])), protocol.commands[rows]))
         else:
+            assert protocol.t_s is not None, "continuous protocols have times"
             runs.append((protocol.t_s[rows], protocol.commands[rows]))
     period = PERIOD_S if protocol.kind == "continuous" else protocol.settle_s + protocol.average_s
     return planned_history(model, runs, period)

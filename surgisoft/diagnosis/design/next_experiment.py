@@ -139,7 +139,8 @@ def pose_question(
             "leave it out"
         )
     known = gains = noise = None
-    misfit, dt = MISFIT, PERIOD_S / 2
+    misfit: float | np.ndarray = MISFIT
+    dt = PERIOD_S / 2
     draws = sizes.draws()
     if problem is None:
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
@@ -281,7 +282,9 @@ def _fitted(gram: np.ndarray, sizes: Sizes) -> tuple[list[np.ndarray], np.ndarra
 def _likely(draws: Draws, sizes: Sizes, fitted, gains) -> Draws:
     """Each competing effect's best-fitting form with its amplitudes where it is clear, else
     plausible ones."""
-    amplitudes, form, owners = [], [], owners_of(sizes)
+    owners = owners_of(sizes)
+    amplitudes: list[np.ndarray] = []
+    form: list[np.ndarray] = []
     for name in dict.fromkeys(owners):
         mine = [j for j, owner in enumerate(owners) if owner == name]
         best = max(mine, key=lambda j: gains[j])
@@ -289,7 +292,7 @@ def _likely(draws: Draws, sizes: Sizes, fitted, gains) -> Draws:
             full = np.zeros(len(draws.amplitudes))
             full[sizes.spans[best]] = fitted[best]
             amplitudes.append(full[:, None])
-            form.append([best])
+            form.append(np.array([best]))
         else:
             chosen = np.isin(draws.form, mine)
             amplitudes.append(draws.amplitudes[:, chosen])
@@ -451,9 +454,11 @@ def _own_weight(question: Question, design: Design, setting: Setup) -> tuple[np.
     was = model.facts.gravity
     if was is None or not setting.moves_weight:
         return np.zeros((len(design.index), model.spec.key_points, 3, 1), np.float32), 1.0
-    pull = np.asarray(was) if setting.payload_g else np.subtract(setting.gravity(was), was)
+    turned = np.asarray(setting.gravity(was))
+    pull = np.asarray(was) if setting.payload_g else turned - was
     name = gravity_load()
-    load = make_effect(name, replace(model.facts, gravity=tuple(float(v) for v in pull)))
+    x, y, z = pull.tolist()
+    load = make_effect(name, replace(model.facts, gravity=(x, y, z)))
     known = hypothesis_of(load)
     amplitude = known.tip_mass if setting.payload_g else known.own_weight
     column = list(load.amplitudes()).index(amplitude)
@@ -473,9 +478,9 @@ def _greedy(question: Question, setting: str, parts: dict[str, Moments], minutes
     base = SETUPS[setting].minutes
     chosen: list[str] = []
     new: Moments | None = None
-    plan = None
+    plan: Plan | None = None
     while bench_minutes(len(chosen) + 1) <= minutes + 1e-9:
-        best = None
+        best: tuple[float, str, Moments, Isolability] | None = None
         for figure, part in parts.items():
             alone = part if new is None else new + part
             total = alone if question.known is None else question.known + alone
@@ -485,12 +490,14 @@ def _greedy(question: Question, setting: str, parts: dict[str, Moments], minutes
                 score += _score(question.isolability(alone))
             if best is None or score > best[0]:
                 best = (score, figure, alone, result)
+        assert best is not None, "there is a schedule to choose"
         score, figure, new, result = best
         chosen.append(figure)
         spent = base + bench_minutes(len(chosen))
         plan = Plan(setting, tuple(chosen), spent, score, result)
         if len(chosen) >= LEAST_RUNS and plan.worst >= TARGET:
             break
+    assert plan is not None, "the time suffices for one run"
     return plan
 
 
@@ -645,7 +652,7 @@ def next_experiment(
 
 def recommend(
     problem: Problem,
-    competing: list[str] | tuple[str, ...],
+    competing: Sequence[str],
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
 ) -> Recommendation:
@@ -658,7 +665,7 @@ def recommend(
 
 def propose(
     model: ArmModel,
-    competing: list[str] | tuple[str, ...] | None = None,
+    competing: Sequence[str] | None = None,
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
 ) -> Recommendation:
@@ -677,6 +684,7 @@ def likely_competing(problem: Problem, most: int = 4) -> list[str]:
     """
     question = pose_question(problem.model, problem)
     gains = question.gains
+    assert gains is not None, "a question about recordings has gains"
     best: dict[str, float] = {}
     for owner, gain in zip(question.owners, gains, strict=True):
         best[owner] = max(best.get(owner, -np.inf), gain)

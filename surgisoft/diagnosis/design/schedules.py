@@ -63,8 +63,12 @@ class Setup:
         x, y, z = np.asarray(weight, float)
         angle = np.radians(self.roll_deg)
         c, s = np.cos(angle), np.sin(angle)
-        turned = np.array([c * x + s * y, -s * x + c * y, z])
-        return tuple(float(v) for v in (-turned if self.flipped else turned))
+        sign = -1.0 if self.flipped else 1.0
+        return (
+            float(sign * (c * x + s * y)),
+            float(sign * (-s * x + c * y)),
+            float(sign * z),
+        )
 
 
 AS_IT_STANDS = "as_it_stands"
@@ -168,6 +172,7 @@ def schedule_text(protocol: Protocol) -> str:
     """A continuous protocol as the CSV file that `collect` reads."""
     header = ["t_s", *(f"c{k + 1}_{protocol.unit}" for k in range(protocol.chambers)), "run"]
     lines = [",".join(header)]
+    assert protocol.t_s is not None, "continuous protocols have times"
     for t, row, run in zip(protocol.t_s, protocol.commands, protocol.run, strict=True):
         lines.append(",".join([f"{t:.3f}", *(f"{value:.4f}" for value in row), str(run)]))
     return "\n".join(lines) + "\n"

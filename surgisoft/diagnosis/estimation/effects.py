@@ -237,6 +237,11 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
 class Refined(Candidate):
     """An effect whose nonlinear parameters were fitted; one column, at its fitted amplitudes."""
 
+    @property
+    def amplitudes(self) -> int:
+        """Number of amplitudes that were fitted, of which the column is the sum."""
+        return sum(parameter.numel() for parameter in self.effect.amplitudes().values())
+
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect:
         """The effect at a multiple (1,) of its fitted amplitudes."""
@@ -258,7 +263,7 @@ def refined(problem: Problem, effects: Iterable[tuple[str, Effect]]) -> list[Can
     """
     with torch.no_grad():
         before = repeated_scan(problem.model, problem, [])().double().numpy()
-    found = []
+    found: list[Candidate] = []
     for name, effect in effects:
         model = with_fitted(problem, name, effect)
         if model is None:

@@ -18,7 +18,7 @@ at about the same misfit take their share of the draws.
 `surgisoft benchmark intervals` measures how often the intervals hold.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -155,7 +155,7 @@ def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:
 
 def intervals(
     effects: dict[str, Effect],
-    parameters: dict[str, Tensor],
+    parameters: Mapping[str, Tensor],
     fit: Fitted,
     others: Sequence[Fitted] = (),
 ) -> list[Parameter]:
@@ -174,10 +174,10 @@ def intervals(
             set_vector(parameters, values)
             seen.append([quantity.value for e in effects.values() for quantity in e.quantities()])
     set_vector(parameters, fit.fit.values)
-    answer = []
+    answer: list[Parameter] = []
     for name, effect in effects.items():
         for quantity in effect.quantities():
-            drawn = np.array([row[len(answer)] for row in seen], float)
+            drawn = np.array([row[len(answer)] for row in seen], dtype=np.float64)
             low, high = np.quantile(drawn, [0.025, 0.975], axis=0).tolist()
             answer.append(
                 Parameter(

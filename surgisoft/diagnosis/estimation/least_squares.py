@@ -21,7 +21,7 @@ alone. `torch.func.jvp` through the scans would replace the compiled loops by pa
 log2(T) passes for each parameter; forward differences run the compiled loops.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,13 +133,13 @@ def free_parameters(
     return free
 
 
-def vector(parameters: dict[str, Tensor]) -> np.ndarray:
+def vector(parameters: Mapping[str, Tensor]) -> np.ndarray:
     """(P,) all values one after another."""
     return torch.cat([p.detach().flatten() for p in parameters.values()]).double().numpy()
 
 
 @torch.no_grad()
-def set_vector(parameters: dict[str, Tensor], values: np.ndarray) -> None:
+def set_vector(parameters: Mapping[str, Tensor], values: np.ndarray) -> None:
     """Write (P,) values back into their parameters."""
     flat, begin = torch.from_numpy(np.asarray(values, np.float32)), 0
     for parameter in parameters.values():
@@ -170,7 +170,7 @@ def repeated_scan(model: ArmModel, problem: Problem, keys: Iterable[str]) -> Rep
 class Prediction:
     """Predictions of a model for values of its free parameters, and their slopes."""
 
-    def __init__(self, forward: RepeatedScan, parameters: dict[str, Tensor]):
+    def __init__(self, forward: RepeatedScan, parameters: Mapping[str, Tensor]):
         self.forward, self.parameters = forward, parameters
         self.steps = OPTIONS.first_difference * np.maximum(np.abs(vector(parameters)), 1.0)
 
@@ -302,13 +302,13 @@ def fit_amplitudes(model: ArmModel, problem: Problem, key: str) -> Fit:
     residual = problem.measured - predict(values)
     nuisance = Nuisance.of(problem, residual)
     part = held_out_parts(problem)
-    hold, cost = None, nuisance.misfit(residual)
-    unheld = np.zeros(len(values))
-    for _ in range(AMPLITUDES.steps):
+    cost, unheld = nuisance.misfit(residual), np.zeros(len(values))
+    hold = np.zeros((len(values), len(values)))
+    for step_number in range(AMPLITUDES.steps):
         jacobian = amplitude_sensitivities(model, forward, key)
         fit = Fit(values, jacobian, residual, nuisance, hold, cost, unheld)
         grams, slopes = block_slopes(fit, part)
-        if hold is None:
+        if not step_number:
             penalty = _penalty(start) * np.trace(grams.sum(0)) / len(start)
             hold = penalty * _best_ridge(grams, slopes, penalty)
         slope = slopes.sum(0) - hold @ (values - start)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy import stats
-from torch import Tensor
+from torch import Tensor, nn
 
 from surgisoft.diagnosis.estimation.nuisance import held_out_parts
 from surgisoft.diagnosis.residuals import Problem
@@ -73,10 +73,11 @@ def retune(model: ArmModel, problem: Problem) -> Retuned:
     if not (share >= LEAST_GAIN and chance < CHANCE):
         return Retuned(model, False, share)
     change = torch.from_numpy(_ridge(hidden, residual, RIDGES[best] * held)).float()
-    last = network.layers[-1]
     network = copy.deepcopy(network)
-    network.layers[-1].weight.copy_(last.weight + change[:-1].T / network.scale[:, None])
-    network.layers[-1].bias.copy_(last.bias + change[-1] / network.scale)
+    last = network.layers[-1]
+    assert isinstance(last, nn.Linear)
+    last.weight.add_(change[:-1].T / network.scale[:, None])
+    last.bias.add_(change[-1] / network.scale)
     fresh = model.replace(network=network).eval().requires_grad_(False)
     better = np.nansum(np.square(problem.with_model(fresh).residual)) < total
     return Retuned(fresh if better else model, bool(better), share)

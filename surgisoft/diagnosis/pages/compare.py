@@ -58,7 +58,7 @@ BROAD_PX = {"loops": 620, "error": 620}
 
 
 def compare_page(
-    result: Comparison, table: ResidualTable, title: str, about: str, pictures: list[Path] = ()
+    result: Comparison, table: ResidualTable, title: str, about: str, pictures: Sequence[Path] = ()
 ) -> Page:
     """The page of a comparison; `pictures` are files that `pictures.draw_all` wrote."""
     return Page(
@@ -94,7 +94,7 @@ def _mm(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.3f} mm"
 
 
-def _span(interval: tuple[float, float], pattern: str = "{:.3f}") -> str:
+def _span(interval: tuple[float, ...], pattern: str = "{:.3f}") -> str:
     if any(math.isnan(value) for value in interval):
         return "-"
     return " .. ".join(pattern.format(value) for value in interval)

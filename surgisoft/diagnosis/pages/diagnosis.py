@@ -9,7 +9,7 @@ from surgisoft.diagnosis.diagnose import Diagnosis
 from surgisoft.diagnosis.pairs import ChangeTrack
 from surgisoft.diagnosis.refit import Refit
 from surgisoft.diagnosis.setup import SetupFault, SetupResult
-from surgisoft.report import Command, Facts, Page, Section, Share, Table, Text, write_page
+from surgisoft.report import Command, Facts, Page, Part, Section, Share, Table, Text, write_page
 
 HOW = (
     "Every effect is added to the model with each choice of its nonlinear parameters, to first "
@@ -60,7 +60,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
         ("best achievable error", f"{error.ceiling:.3f} mm"),
         ("time", f"{found.seconds:.1f} s"),
     ]
-    parts = [Facts(facts)]
+    parts: list[Part] = [Facts(facts)]
     if found.checks:
         parts.append(Section("Checks of the data", [Text("\n\n".join(found.checks))]))
     if found.setup:
@@ -109,6 +109,7 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
 def _change(found: Diagnosis) -> Section:
     """How far AFTER differs from BEFORE, and what the named effects explain of it."""
     change = found.change
+    assert change is not None
     parts: list = [Text(change.sentence[:1].upper() + change.sentence[1:] + ".")]
     rows = [
         (
@@ -182,7 +183,7 @@ def _setup(setup: SetupResult) -> Section:
     rows = [
         (fault.kind.replace("_", " "), fault.sentence, _numbers(fault)) for fault in setup.faults
     ]
-    parts = [
+    parts: list[Part] = [
         Table(["fault", "what was found", "numbers"], rows),
         Text(f"Recordings: {', '.join(setup.recordings)}."),
         Text("What mends it:"),

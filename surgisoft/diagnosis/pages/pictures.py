@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -221,7 +222,8 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
     )
     bar.set_label(f"error of a key point [mm]; lines of errors are {scale.stretch:g} times as long")
     # The label of z stands outside the axes' own box.
-    figure.get_layout_engine().set(rect=(0.0, 0.0, 0.97, 1.0))
+    layout: Any = figure.get_layout_engine()
+    layout.set(rect=(0.0, 0.0, 0.97, 1.0))
     return figure
 
 

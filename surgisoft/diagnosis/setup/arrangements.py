@@ -101,8 +101,8 @@ def neighbours(arrangement: Arrangement) -> list[Arrangement]:
         if signs != list(sign):
             found.append(Arrangement(tuple(swapped), tuple(signs), arrangement.factor))
     for at in range(len(order)):
-        signs = tuple(-s if k == at else s for k, s in enumerate(sign))
-        found.append(Arrangement(order, signs, arrangement.factor))
+        flipped = tuple(-s if k == at else s for k, s in enumerate(sign))
+        found.append(Arrangement(order, flipped, arrangement.factor))
     return found
 
 

@@ -8,6 +8,7 @@ squares). One more fault of the set-up is looked for beside it.
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -101,6 +102,7 @@ def blind_channel(search: Search, channel: int) -> Blind | None:
     best = min((look.settled(each, rows) for each in found), key=lambda tried: tried.cost)
     chamber = best.hypothesis.arrangement.order.index(channel)
     low, high = spec.low[chamber], spec.high[chamber]
+    assert best.share is not None, "what was fitted has the missing pressure"
     swing = low + np.quantile(best.share, [0.05, 0.95]) * (high - low)
     before = search.start.rmse_mm * max(1.0, best.hypothesis.mm_per_unit)
     asked, after = search.proof, best.error_mm
@@ -139,9 +141,9 @@ def _hypotheses(search: Search, channel: int) -> list[_Tried]:
                 _Tried(replace(nothing, arrangement=replace(plain, factor=factor)), as_it_is)
             )
     if chambers <= EXHAUSTIVE:
-        orders = itertools.permutations(range(chambers))
+        orders = list(itertools.permutations(range(chambers)))
     else:
-        orders = (_swapped(chambers, a, b) for a in range(chambers) for b in range(a))
+        orders = [_swapped(chambers, a, b) for a in range(chambers) for b in range(a)]
     for order in (plain.order, *orders):
         for signs in itertools.product(
             (1.0, -1.0), repeat=chambers if chambers <= EXHAUSTIVE else 0
@@ -152,8 +154,9 @@ def _hypotheses(search: Search, channel: int) -> list[_Tried]:
                 found.append(_Tried(replace(nothing, arrangement=some), as_it_is))
     turns = Rotation.from_euler("z", np.arange(12)[:, None] * np.pi / 6).as_matrix()
     turns = np.concatenate([turns, Rotation.create_group("O").as_matrix()])
-    for name, determinant in HANDED.items():
-        for turn in turns @ np.diag([1.0, determinant, 1.0]):
+    kinds: tuple[Literal["proper", "improper"], ...] = ("proper", "improper")
+    for name in kinds:
+        for turn in turns @ np.diag([1.0, HANDED[name], 1.0]):
             found.append(_Tried(replace(nothing, frame=name), Frame(turn, np.zeros(3), 1.0)))
     if search.coarse.timed:
         for late in search.settings.times_s:
@@ -198,6 +201,7 @@ class _Look:
 
     def there(self, tried: _Tried, rows: np.ndarray) -> np.ndarray:
         """(K, n, 3) prediction with the missing pressure that was found, mm."""
+        assert tried.share is not None, "what was fitted has the missing pressure"
         return _between(self.predicted(tried.hypothesis.arrangement)[:, rows], tried.share)
 
     def fit(self, tried: _Tried, rounds: int, rows: np.ndarray) -> _Tried:

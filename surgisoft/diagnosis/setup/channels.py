@@ -107,7 +107,8 @@ def _commanded(recordings: list[Recording], dead: tuple[int, ...]) -> list[Recor
         return recordings
     fresh = []
     for recording in recordings:
-        measured = recording.measured.copy()
-        measured[:, list(dead)] = recording.commanded[:, list(dead)]
+        measured, commanded = recording.measured.copy(), recording.commanded
+        assert commanded is not None
+        measured[:, list(dead)] = commanded[:, list(dead)]
         fresh.append(replace(recording, measured=measured))
     return fresh

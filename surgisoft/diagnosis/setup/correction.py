@@ -107,7 +107,7 @@ class Correction:
             keep[run] = (at >= t_s[0] - 1e-9) & (at <= t_s[-1] + 1e-9)
             for k in range(recording.chambers):
                 measured[run, k] = np.interp(at, t_s, recording.measured[run, k])
-            if commanded is not None:
+            if commanded is not None and recording.commanded is not None:
                 held = np.clip(np.searchsorted(t_s, at + 1e-9) - 1, 0, len(t_s) - 1)
                 commanded[run] = recording.commanded[run][held]
         if not keep.any():

@@ -386,7 +386,7 @@ class Search:
         enough = sums.count >= 0.5 * sums.count.max()
         for name, determinant in HANDED.items():
             free = fitted(sums, determinant)
-            snapped = _snapped(free.scale)
+            snapped = _snapped(np.asarray(free.scale))
             for mm_per_unit in (np.ones_like(snapped), snapped):
                 frame = _rescaled(free, sums, 1.0 / mm_per_unit)
                 square = np.where(enough, sums.mean_square(frame), np.inf)
@@ -529,18 +529,22 @@ class Search:
 
     def _simplest(self, tried: Sequence[Fitted]) -> Fitted:
         """The explanation with the fewest kinds among those that do as well as any."""
-        least = min(each.rmse_mm for each in tried)
-        near = [
-            each
-            for each in tried
-            if each.rmse_mm <= self.proof.as_good * max(least, self.levels.noise)
-        ]
+        limit = self._as_good(min(each.rmse_mm for each in tried))
+        near = [each for each in tried if each.rmse_mm <= limit]
         return min(near, key=lambda e: (e.complexity, e.hypothesis.arrangement.changes, e.rmse_mm))
+
+    def _as_good(self, least_mm: float) -> float:
+        """Error up to which an explanation does as well as one that leaves `least_mm`, mm.
+
+        What a correct set-up shows is as good, however much less a combination of several faults
+        may leave: of thousands of arrangements of six chambers one fits a poor model by chance.
+        """
+        return max(self.proof.as_good * max(least_mm, self.levels.noise), self.levels.reference)
 
     def _equals(self, best: Fitted, tried: Sequence[Fitted]) -> tuple[Fitted, ...]:
         """Other explanations with as many kinds, each once, that do as well."""
         found = {best.hypothesis.what: best}
-        limit = self.proof.as_good * max(best.rmse_mm, self.levels.noise)
+        limit = self._as_good(best.rmse_mm)
         for each in sorted(tried, key=lambda one: one.rmse_mm):
             same = each.complexity == best.complexity and each.rmse_mm <= limit
             if same and each.hypothesis.what not in found:
@@ -660,12 +664,13 @@ def _rescaled(frame: Frame, sums: Moments, scale: np.ndarray) -> Frame:
 
 def _least(square: np.ndarray, many: int = 2) -> list[tuple[int, int]]:
     """Places (a, d) of the smallest finite values: some over all, and some at d = 0."""
-    found = []
+    found: list[tuple[int, int]] = []
     for part in (square[:, :1], square):
         order = np.argsort(part, axis=None)[: 3 * many]
-        found += [tuple(int(v) for v in np.unravel_index(at, part.shape)) for at in order]
-    # The arrangement and the unit as recorded have a row of their own at every time.
-    found += [(0, int(d)) for d in np.argsort(square[0])[:many]]
+        a, d = np.unravel_index(order, part.shape)
+        found += zip(a.tolist(), d.tolist(), strict=True)
+    # The arrangement and the unit as recorded have a row of their own, as recorded in time too.
+    found += [(0, 0), *((0, int(d)) for d in np.argsort(square[0])[:many])]
     return [at for at in dict.fromkeys(found) if np.isfinite(square[at])]
 
 

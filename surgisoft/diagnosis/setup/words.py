@@ -1,6 +1,7 @@
 """Set-up faults in words, with their numbers."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,7 +64,7 @@ def faults_of(given: Fitted, frame: Frame, unit: str, recorded_unit: str) -> lis
     return [words[kind]() for kind in kinds]
 
 
-def joined(faults: list[SetupFault] | tuple[SetupFault, ...]) -> str:
+def joined(faults: Sequence[SetupFault]) -> str:
     """The sentences of faults that hold together."""
     return "; ".join(fault.sentence for fault in faults)
 

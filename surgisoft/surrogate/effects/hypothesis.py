@@ -41,7 +41,7 @@ class Hypothesis:
     needs_reversals: bool = False
     """Whether the effect can only be learned from data with inner reversals."""
     exact_form: bool = False
-    """Whether real arms have exactly this formula, as with a rotated frame or a weight. Then the
+    """Whether real arms have exactly this formula, as with a rotated frame. Then the
     effect must explain more before it is named, because nothing but noise may be left of it."""
     needs_motion: bool = False
     """Whether the effect shows only while the actuation moves or shortly after, as a lag does:

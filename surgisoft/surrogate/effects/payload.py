@@ -94,7 +94,6 @@ class Payload(Memoryless):
 
 HYPOTHESIS = Hypothesis(
     Payload,
-    exact_form=True,
     absent_in="bare_tip",
     own_weight="body_sag",
     tip_mass="tip_sag",

@@ -6,10 +6,12 @@ an arm on the virtual rig implements it with a simulated plant for each environm
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +19,9 @@ from surgisoft.errors import InputError
 from surgisoft.scene import frames
 from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
+from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -255,6 +259,13 @@ class ModelArm:
         self.pose = mounted.pose.to(**row)
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
+        self._compiled = CompiledStep.of(self.model) if device.type == "cpu" else None
+
+    def reference(self) -> ModelArm:
+        """This arm stepped by differentiable tensor operations alone, which agree to rounding."""
+        arm = copy.copy(self)
+        arm._compiled = None
+        return arm
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Draw parameters of an episode for each random number stream; returns (streams, arms)."""
@@ -269,7 +280,7 @@ class ModelArm:
         passed = (self.low + (self.high - self.low) * share).unbind(1)
         state = self.model.initial_state(count)
         for target in (*passed, pressure):
-            state, points = self.model.step(state, gain * target - state.pressure, 1.0)
+            state, points = self._advanced(state, gain * target, 1.0)
         mount = self._moved(turn)
         points = frames.apply(mount, points)
         part = ArmPart(
@@ -292,7 +303,7 @@ class ModelArm:
             return stream, part
         nominal = self.model.initial_state(count)
         for target in (*passed, pressure):
-            nominal, shape = self.model.step(nominal, target - nominal.pressure, 1.0)
+            nominal, shape = self._advanced(nominal, target, 1.0)
         offset = part.seen_mm - frames.apply(self.pose, shape)
         return stream, replace(part, belief=Belief(nominal, offset, torch.zeros_like(offset)))
 
@@ -300,12 +311,17 @@ class ModelArm:
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
         """Advance by dt_s seconds with changes (B, m) kPa of the commanded pressures."""
-        queue, action = self._due(part, action)
-        command = self.pneumatics.command(part.command, action, self.low, self.high)
-        pressure = self.pneumatics.follow(part.pressure, command, dt_s)
-        state, points = self.bent(part, pressure, dt_s)
-        part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
-        stream, part = self._measured(stream, self.posed(part, points))
+        step = self._compiled_for(part.command, action)
+        if step is not None:
+            part = self._stepped(step, part, action, dt_s)
+        else:
+            queue, action = self._due(part, action)
+            command = self.pneumatics.command(part.command, action, self.low, self.high)
+            pressure = self.pneumatics.follow(part.pressure, command, dt_s)
+            state, points = self.bent(part, pressure, dt_s)
+            part = replace(part, command=command, pressure=pressure, queue=queue, arm=state)
+            part = self.posed(part, points)
+        stream, part = self._measured(stream, part)
         return stream, self._estimated(part, dt_s)
 
     def predict(self, part: ArmPart, pressure: Tensor, dt_s: float) -> Tensor:
@@ -330,17 +346,81 @@ class ModelArm:
         self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
     ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
-        state, points = self.model.step(part.arm, part.gain * pressure - part.arm.pressure, dt_s)
-        return state, frames.apply(part.mount, points)
+        state, points = self._advanced(part.arm, part.gain * pressure, dt_s)
+        if self._compiled_for(points, part.mount) is None:
+            return state, frames.apply(part.mount, points)
+        return state, _placed(points, part.mount)
+
+    def _advanced(
+        self, state: ArmState, pressure: Tensor, dt_s: Tensor | float
+    ) -> tuple[ArmState, Tensor]:
+        """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m)."""
+        step, change = self._compiled_for(pressure), pressure - state.pressure
+        if step is None:
+            return self.model.step(state, change, dt_s)
+        return step(state, state.pressure + change)
 
     def posed(self, part: ArmPart, points_mm: Tensor) -> ArmPart:
         """The state with its body moved to key points (B, n, 3) mm, world frame."""
+        if self._compiled_for(points_mm, part.mount) is not None:
+            line, direction = self._body(points_mm, part.mount)
+        else:
+            line = self._line(points_mm, part.mount)
+            direction = self.backbone.tip_direction(points_mm)
+        return replace(part, points_mm=points_mm, line_mm=line, tip_direction=direction)
+
+    def _compiled_for(self, *tensors: Tensor) -> CompiledStep | None:
+        """The compiled step where it may take these tensors; None where the reference has to."""
+        if self._compiled is None or torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return None
+        plain = all(type(t) is Tensor and t.dtype == torch.float32 for t in tensors)
+        return self._compiled if plain and not torch.jit.is_tracing() else None
+
+    def _stepped(self, step: CompiledStep, part: ArmPart, action: Tensor, dt_s: float) -> ArmPart:
+        """The part after a step with the action (B, m) kPa, all but what is measured."""
+        command, pressure = torch.empty_like(part.command), torch.empty_like(part.pressure)
+        queue, target = torch.empty_like(part.queue), torch.empty_like(part.command)
+        drive(
+            *(
+                t.contiguous().numpy()
+                for t in (part.command, part.pressure, part.queue, part.delay, part.gain, action)
+            ),
+            self.low.numpy(),
+            self.high.numpy(),
+            np.float32(self.pneumatics.step_kPa),
+            np.float32(self.pneumatics.share(dt_s)),
+            part.arm.pressure.contiguous().numpy(),
+            *(t.numpy() for t in (command, pressure, queue, target)),
+        )
+        state, points = step(part.arm, target)
+        points = _placed(points, part.mount)
+        line, direction = self._body(points, part.mount)
         return replace(
             part,
-            points_mm=points_mm,
-            line_mm=self._line(points_mm, part.mount),
-            tip_direction=self.backbone.tip_direction(points_mm),
+            command=command,
+            pressure=pressure,
+            queue=queue,
+            arm=state,
+            points_mm=points,
+            line_mm=line,
+            tip_direction=direction,
         )
+
+    def _body(self, points_mm: Tensor, mount: Tensor) -> tuple[Tensor, Tensor]:
+        """Centreline (B, K, 3) mm and tip direction (B, 3), compiled."""
+        count, position = len(points_mm), self.backbone.position
+        line = points_mm.new_empty(count, len(self.shaft) + len(position), 3)
+        direction = points_mm.new_empty(count, 3)
+        draw_body(
+            points_mm.contiguous().numpy(),
+            mount.contiguous().numpy(),
+            self.shaft.numpy(),
+            position.numpy(),
+            self.backbone.derivative[-1].numpy(),
+            line.numpy(),
+            direction.numpy(),
+        )
+        return line, direction
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest pressures (B, m) kPa that the pumps can reach in dt_s seconds."""
@@ -394,8 +474,15 @@ class ModelArm:
         belief = part.belief
         if belief is None:
             return part
-        arm, points = self.model.step(belief.arm, part.seen_kPa - belief.arm.pressure, dt_s)
+        arm, points = self._advanced(belief.arm, part.seen_kPa, dt_s)
         points = frames.apply(self.pose, points)
         surprise = part.seen_mm - points - belief.offset_mm
         now, offset, drift = self.observer.adopted(surprise, belief.offset_mm, belief.drift_mm)
         return replace(part, seen_mm=points + now, belief=Belief(arm, offset, drift))
+
+
+def _placed(points: Tensor, mount: Tensor) -> Tensor:
+    """Key points (B, n, 3) mm, world frame, of those in the base frames (B, 4, 4), compiled."""
+    out = torch.empty_like(points)
+    place(points.contiguous().numpy(), mount.contiguous().numpy(), out.numpy())
+    return out

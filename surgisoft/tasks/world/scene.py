@@ -14,7 +14,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import View, seen_from
-from surgisoft.scene.capsules import BatchClearance
+from surgisoft.scene.capsules import BatchClearance, segment_distance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mesh import Body
@@ -218,6 +218,24 @@ class SceneEngine:
         lines = {name: part.line_mm for name, part in parts.items()}
         beam = parts[laser]
         return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=laser)
+
+    def path_clearance_mm(
+        self, parts: Mapping[str, ArmPart], laser: str, target_mm: Tensor
+    ) -> Tensor:
+        """(B,) mm: least distance of a beam's path from the skin of the other arms, without limit.
+
+        The path runs along the tip's direction as far as a target (B, 3) mm lies ahead.
+        """
+        beam = parts[laser]
+        ahead = ((target_mm - beam.tip_mm) * beam.tip_direction).sum(1, keepdim=True).clamp(min=0.0)
+        tip, end = beam.tip_mm[:, None], (beam.tip_mm + ahead * beam.tip_direction)[:, None]
+        away = [
+            segment_distance(tip, end, part.line_mm[:, :-1], part.line_mm[:, 1:]).amin(1)
+            - self.geometry.radius_mm(name)
+            for name, part in parts.items()
+            if name != laser
+        ]
+        return torch.stack(away).amin(0)
 
     def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor, watched: Tensor) -> SceneState:
         lines = {name: part.line_mm for name, part in parts.items()}

@@ -1,0 +1,142 @@
+"""Run the tutorials: every block of code in docs/tutorials, in order, and write what it prints.
+
+    python docs/run_tutorials.py [NAME...]           run pages; stop at the first block that fails
+    python docs/run_tutorials.py --write [NAME...]   also renew their outputs and pictures
+
+Each page runs in an empty folder of its own. What a block is, its fence says:
+
+- `bash`: lines for the shell, in which `surgisoft` is the one of this Python;
+- `python`: Python; all blocks of a page share their names;
+- any language with `title="FILE"`: the content of a file;
+- `text` behind a block that runs: what it printed, which --write renews;
+- `python needs="MODULE"`: is left out where the module is not installed, and said so.
+
+A picture of a page, `![...](images/NAME.png)`, is the file NAME.png that its blocks left in the
+folder; --write copies it, at most `MOST_PIXELS` wide.
+"""
+
+import contextlib
+import importlib.util
+import io
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+PAGES = Path(__file__).resolve().parent / "tutorials"
+MOST_PIXELS = 1000
+"""Widest picture that is kept; all pictures together stay below 2 MB."""
+COLOURS = 128
+"""Colours of a picture that is kept."""
+PICTURE = re.compile(r"\]\(images/([\w-]+\.png)\)")
+BLOCK = re.compile(r"^```(?P<info>[^\n]*)\n(?P<body>.*?)^```\n", re.S | re.M)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the pages that are named, or all of them."""
+    write = "--write" in arguments
+    names = [name for name in arguments if not name.startswith("-")]
+    pages = [PAGES / f"{name}.md" for name in names] or sorted(PAGES.glob("*.md"))
+    for page in pages:
+        if page.name == "index.md":
+            continue
+        began = time.perf_counter()
+        with tempfile.TemporaryDirectory(prefix="tutorial-") as folder:
+            text = run_page(page.read_text(), Path(folder), page.name)
+            pictures = PICTURE.findall(text)
+            for name in pictures:
+                made = Path(folder) / name
+                if not made.is_file():
+                    print(f"{page.name}: no block made {name}", file=sys.stderr)
+                    return 1
+                if write:
+                    keep(made, PAGES / "images" / name)
+        if write:
+            page.write_text(text)
+        print(f"{page.name}: {time.perf_counter() - began:.0f} s")
+    return 0
+
+
+def run_page(text: str, folder: Path, name: str) -> str:
+    """The page with the outputs of its blocks; raises SystemExit for one that fails."""
+    names: dict = {"__name__": "tutorial"}
+    said = None
+
+    def run(block: re.Match) -> str:
+        nonlocal said
+        info, body = block["info"], block["body"]
+        language = info.split(" ")[0]
+        title = re.search(r'title="([^"]+)"', info)
+        needs = re.search(r'needs="([^"]+)"', info)
+        if language == "text" and not title:
+            answer, said = block[0] if said is None else f"```text\n{said}```\n", None
+            return answer
+        said = None
+        if title:
+            (folder / title[1]).parent.mkdir(parents=True, exist_ok=True)
+            (folder / title[1]).write_text(body)
+        elif needs and importlib.util.find_spec(needs[1]) is None:
+            print(f"{name}: a block was left out, {needs[1]} is not installed")
+        elif language == "bash":
+            said = shell(body, folder, name)
+        elif language == "python":
+            said = python(body, folder, names, name)
+        return block[0]
+
+    return BLOCK.sub(run, text)
+
+
+def shell(lines: str, folder: Path, page: str) -> str:
+    """What lines print in bash."""
+    with tempfile.TemporaryDirectory() as programs:
+        (Path(programs) / "surgisoft").write_text(
+            f'#!/bin/sh\nexec "{sys.executable}" -m surgisoft "$@"\n'
+        )
+        (Path(programs) / "surgisoft").chmod(0o755)
+        path = f"{programs}{os.pathsep}{Path(sys.executable).parent}{os.pathsep}"
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", lines],
+            cwd=folder,
+            env={**os.environ, "PATH": path + os.environ["PATH"]},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    if done.returncode:
+        sys.exit(f"{page}: code {done.returncode} of\n{lines}{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def python(source: str, folder: Path, names: dict, page: str) -> str:
+    """What a block of Python prints; its names stay in `names`."""
+    out, before = io.StringIO(), Path.cwd()
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))
+    try:
+        with contextlib.redirect_stdout(out):
+            exec(compile(source, f"{page}, a block of Python", "exec"), names)
+    finally:
+        os.chdir(before)
+        sys.path.remove(str(folder))
+    return out.getvalue()
+
+
+def keep(made: Path, place: Path) -> None:
+    """Copy a picture, no wider than the page and with few colours."""
+    from PIL import Image
+
+    place.parent.mkdir(exist_ok=True)
+    picture = Image.open(made).convert("RGB")
+    if picture.width > MOST_PIXELS:
+        height = round(picture.height * MOST_PIXELS / picture.width)
+        picture = picture.resize((MOST_PIXELS, height), Image.Resampling.LANCZOS)
+    shutil.rmtree(place, ignore_errors=True)
+    picture.quantize(COLOURS).save(place, optimize=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

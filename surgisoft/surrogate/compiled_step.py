@@ -1,0 +1,203 @@
+"""A time step of a HAW-NN, with or without hysteresis, in two compiled parts and its products.
+
+`Chain.step` is the reference: it takes every effect and network, and is differentiable. Here the
+memories and directions of all arms are one compiled loop in front of the network's matrix products.
+Both agree to rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from surgisoft.compiled import compiled
+from surgisoft.surrogate.arm import ArmState
+from surgisoft.surrogate.effects.hysteresis import Hysteresis
+from surgisoft.surrogate.model import ArmModel
+from surgisoft.surrogate.networks import HawNN
+
+
+class CompiledStep:
+    """Steps of one arm model on the CPU, without gradients.
+
+    Constants are taken from the model again whenever its parameters or buffers have changed.
+    """
+
+    def __init__(
+        self, model: ArmModel, network: HawNN, name: str | None, hysteresis: Hysteresis | None
+    ):
+        """Parts of the model: network, and name and effect of its hysteresis, None without."""
+        self.model, self.name, self._network, self._hysteresis = model, name, network, hysteresis
+        self._tensors = [*model.parameters(), *model.buffers()]
+        self._seen: list[tuple[int, int]] = []
+        self._constants: list[np.ndarray] = []
+
+    @classmethod
+    def of(cls, model: ArmModel) -> CompiledStep | None:
+        """The compiled step of a model; None where only the reference can step it."""
+        network, effects = model.network, dict(model.effects)
+        name, effect = next(iter(effects.items()), (None, None))
+        if type(network) is not HawNN or network.prior is not None or len(effects) > 1:
+            return None
+        if not (effect is None or type(effect) is Hysteresis):
+            return None
+        tensors = [*model.parameters(), *model.buffers()]
+        if any(t.device.type != "cpu" for t in tensors):
+            return None
+        if any(t.is_floating_point() and t.dtype != torch.float32 for t in tensors):
+            return None
+        return cls(model, network, name, effect)
+
+    def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
+        """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
+        network = self._network
+        count, chambers = pressure.shape
+        memory = pressure.new_empty(count, 0) if self.name is None else state.memory[self.name]
+        after, anchor = torch.empty_like(memory), torch.empty_like(pressure)
+        direction = torch.empty_like(pressure)
+        x = pressure.new_empty(count, chambers * (2 if network.directions else 1))
+        arrays = [
+            _array(t) for t in (pressure, state.anchor, state.direction, anchor, direction, x)
+        ]
+        seen = [(t.data_ptr(), 0 if t.is_inference() else t._version) for t in self._tensors]
+        if seen != self._seen:
+            self._seen, self._constants = seen, self._read()
+        if self.name is None:
+            _advance(*arrays, *self._constants)
+        else:
+            _advance_with_plays(*arrays, *self._constants, _array(memory), _array(after))
+        for layer in network.layers:
+            if isinstance(layer, nn.Linear):
+                x = torch.addmm(layer.bias, x, layer.weight.t())
+            else:
+                x = nn.functional.silu(x, inplace=True)
+        points = torch.addcmul(network.mean, x, network.scale).view(count, network.key_points, 3)
+        held = {} if self.name is None else {self.name: after}
+        return ArmState(pressure, anchor, direction, held), points
+
+    def _read(self) -> list[np.ndarray]:
+        """Constants of the compiled loops."""
+        model, network = self.model, self._network
+        chain = (model.still, model.idle, model.band)
+        constants = [_array(t) for t in (*chain, network.centre, network.half_range, network.use)]
+        return constants + ([] if self._hysteresis is None else _plays(self._hysteresis))
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    """A tensor as an array that shares its memory."""
+    return tensor.detach().contiguous().numpy()
+
+
+def _plays(effect: Hysteresis) -> list[np.ndarray]:
+    """Constants of an effect's play operators: lines, radii, weights and slopes."""
+    weight = effect.turned[effect.turns] if effect.ring else effect.weight
+    slope = torch.zeros_like(weight) if effect.ring else effect.slope
+    origin = effect.lines(effect.origin)
+    parts = (effect.centre, effect.half_range, effect.use, effect.linear, effect.bent, origin)
+    return [_array(t) for t in (*parts, effect.radius, weight, slope)]
+
+
+@compiled
+def _direct(b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band):
+    """Chamber pressure, and the direction of change after the step; see `scan.direction_step`."""
+    chamber = idle[m] if still[m] else pressure[b, m]
+    moved = min(max(anchor[b, m], chamber - band[m]), chamber + band[m])
+    new_anchor[b, m] = moved
+    if moved > anchor[b, m]:
+        new_direction[b, m] = np.float32(1.0)
+    elif moved < anchor[b, m]:
+        new_direction[b, m] = np.float32(-1.0)
+    else:
+        new_direction[b, m] = direction[b, m]
+    return chamber
+
+
+@compiled
+def _advance(
+    pressure,
+    anchor,
+    direction,
+    new_anchor,
+    new_direction,
+    x,
+    still,
+    idle,
+    band,
+    centre,
+    half_range,
+    use,
+):
+    """Fill directions (B, m) and the network's inputs (B, m or 2 m) for arms without memory."""
+    count, chambers = pressure.shape
+    for b in range(count):
+        for m in range(chambers):
+            chamber = _direct(
+                b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band
+            )
+            x[b, m] = (chamber - centre[m]) / half_range[m]
+            if x.shape[1] > chambers:
+                x[b, chambers + m] = new_direction[b, m] * use[m]
+
+
+@compiled
+def _advance_with_plays(
+    pressure,
+    anchor,
+    direction,
+    new_anchor,
+    new_direction,
+    x,
+    still,
+    idle,
+    band,
+    centre,
+    half_range,
+    use,
+    play_centre,
+    play_half,
+    play_use,
+    linear,
+    bent,
+    origin,
+    radius,
+    weight,
+    slope,
+    memory,
+    after,
+):
+    """As `_advance` for arms with hysteresis: memory (B, L, J) to after; see `Hysteresis`."""
+    count, chambers = pressure.shape
+    lines, radii = len(linear), len(radius)
+    chamber, scaled = np.empty(chambers, np.float32), np.empty(chambers, np.float32)
+    shift = np.empty(chambers, np.float32)
+    lags = np.empty(radii, np.float32)
+    for b in range(count):
+        for m in range(chambers):
+            chamber[m] = _direct(
+                b, m, pressure, anchor, direction, new_anchor, new_direction, still, idle, band
+            )
+            scaled[m] = (chamber[m] - play_centre[m]) / play_half[m] * play_use[m]
+            shift[m] = np.float32(0.0)
+        for line in range(lines):
+            u = np.float32(0.0)
+            for m in range(chambers):
+                mixed = linear[line, m]
+                for other in range(chambers):
+                    mixed += bent[line, m, other] * scaled[other]
+                u += mixed * scaled[m]
+            away = u - origin[line]
+            for j in range(radii):
+                value = min(max(memory[b, line, j], u - radius[j]), u + radius[j])
+                after[b, line, j] = value
+                lags[j] = value - u
+            for m in range(chambers):
+                total = np.float32(0.0)
+                for j in range(radii):
+                    total += (weight[m, line, j] + slope[m, line, j] * away) * lags[j]
+                shift[m] += total
+        for m in range(chambers):
+            effective = chamber[m] + play_half[m] * shift[m]
+            x[b, m] = (effective - centre[m]) / half_range[m]
+            if x.shape[1] > chambers:
+                x[b, chambers + m] = new_direction[b, m] * use[m]

@@ -1,0 +1,92 @@
+"""The compiled world against the reference in tensor operations, over whole episodes."""
+
+import pytest
+import torch
+
+from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.camera import seen_from
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.registry import TASKS, make_task
+from surgisoft.tasks.world.scene import ENDOSCOPE, SceneEngine
+
+AGREE_MM = 1e-4
+"""Largest difference of a place (mm): rounding of float32 at 100 mm, some ten steps of it."""
+EPISODES = 2
+LOOK_EVERY = 200
+"""Steps between two comparisons of the scenes."""
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_compiled_arms_agree_with_the_reference_over_whole_episodes(name):
+    task, random = make_task(name), torch.Generator().manual_seed(1)
+    plain = {arm: body.reference() for arm, body in task.world.arms.items()}
+    around, other, dt_s = task.world.scene, None, task.world.config.dt_s
+    if around is not None:
+        radii = around.geometry.radii_mm
+        other = BatchedScene(around.geometry.bodies, radii, engine="torch")
+    episodes = Episodes(task)
+    with torch.inference_mode():
+        state = episodes.seeded(4, EPISODES)
+        expected = dict(state.world.arms)
+        for step in range(task.steps):
+            actions = {
+                arm: torch.randn(EPISODES, body.chambers, generator=random)
+                for arm, body in plain.items()
+            }
+            stream = state.world.stream
+            state, _ = episodes.step(state, actions)
+            for arm, body in plain.items():
+                stream, expected[arm] = body.step(stream, expected[arm], actions[arm], dt_s)
+                part, true = state.world.arms[arm], expected[arm]
+                for field in ("points_mm", "line_mm", "tip_direction", "seen_mm", "pressure"):
+                    off = (getattr(part, field) - getattr(true, field)).abs().max()
+                    assert off < AGREE_MM, (arm, field, step)
+                assert torch.equal(part.arm.direction, true.arm.direction)
+            if other is not None and step % LOOK_EVERY == 0:
+                assert_scenes_agree(around, other, state.world)
+
+
+def assert_scenes_agree(around, other, world):
+    """The compiled scene's state is what the engine in tensor operations finds."""
+    lines = {name: part.line_mm for name, part in world.arms.items()}
+    scene, found = world.scene, other.clearance(lines)
+    for field in ("bodies_mm", "arms_mm", "self_mm"):
+        off = (getattr(scene.clearance, field) - getattr(found, field)).abs()
+        assert off.numel() == 0 or off.max() < AGREE_MM, field
+    if not isinstance(around, SceneEngine):
+        return
+    for laser in around.lasers:
+        beam, seen = world.arms[laser], scene.hits[laser]
+        hit = other.cast(beam.tip_mm, beam.tip_direction, around.beam_mm, lines, own=laser)
+        assert torch.equal(hit.struck, seen.struck)
+        assert (hit.point_mm - seen.point_mm).abs().max() < AGREE_MM
+        assert (hit.normal - seen.normal).abs().max() < AGREE_MM
+    looks = (around.looks_mm[scene.watched], around.look_normals[scene.watched])
+    for name in around.endoscopes:
+        at = (world.arms[name].tip_mm, world.arms[name].tip_direction)
+        view = seen_from(other, around.work_camera, *at, *looks, lines, own=name)
+        assert torch.equal(view.visible, scene.views[name].visible)
+        assert torch.equal(view.hidden, scene.views[name].hidden)
+        assert (view.axis_error_mm - scene.views[name].axis_error_mm).abs().max() < AGREE_MM
+
+
+def test_lines_of_sight_are_hidden_where_a_ray_meets_something():
+    """A camera that looks at the lesion past the other arm, against rays cast one by one."""
+    task, count, random = make_task("circle_ablation"), 64, torch.Generator().manual_seed(2)
+    around, parts = task.world.scene, Episodes(task).seeded(0, count).world.arms
+    lines = {
+        name: part.line_mm + 15.0 * torch.randn(count, 1, 3, generator=random)
+        for name, part in parts.items()
+    }
+    eye = lines[ENDOSCOPE][:, -1]
+    axis = around.centre_mm - eye + 6.0 * torch.randn(count, 3, generator=random)
+    axis = torch.nn.functional.normalize(axis, dim=1)
+    ring = around.looks_mm[0].expand(count, -1, 3), around.look_normals[0].expand(count, -1, 3)
+    other = BatchedScene(around.geometry.bodies, around.geometry.radii_mm, engine="torch")
+    views = [
+        seen_from(engine, around.camera, eye, axis, *ring, lines, own=ENDOSCOPE)
+        for engine in (around.geometry, other)
+    ]
+    assert 0 < views[1].hidden.sum() < views[1].visible.sum()
+    for field in ("visible", "hidden", "fraction"):
+        assert torch.equal(getattr(views[0], field), getattr(views[1], field)), field

@@ -1,0 +1,130 @@
+"""Two lasers and an endoscope: the scripted expert, the interlock of each beam, the shared ring."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene.spec import PHANTOM
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.two_laser_ring import LASERS, TwoLaserRing, TwoLaserRingConfig
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """The same ring in a third of the time."""
+    return TwoLaserRing(TwoLaserRingConfig(cut_s=15.0))
+
+
+@pytest.fixture(scope="module")
+def cut(quick):
+    """States and outcomes of two scripted episodes to the end of both."""
+    episodes = Episodes(quick)
+    states, outcomes = [episodes.seeded(0, 2)], []
+    with torch.inference_mode():
+        over = torch.zeros(2, dtype=torch.bool)
+        while not over.all() and len(outcomes) < 200:
+            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
+            states.append(state)
+            outcomes.append(outcome)
+            over |= outcome.done
+    return states, outcomes
+
+
+def with_arm(state, name, **fields):
+    arms = {**state.world.arms, name: replace(state.world.arms[name], **fields)}
+    return replace(state, world=replace(state.world, arms=arms))
+
+
+def with_scene(state, **fields):
+    scene = replace(state.world.scene, **fields)
+    return replace(state, world=replace(state.world, scene=scene))
+
+
+def test_the_script_cuts_the_ring_with_both_beams_in_half_the_time(quick, cut):
+    states, outcomes = cut
+    for i in range(2):
+        ends = [k for k, outcome in enumerate(outcomes) if outcome.terminated[i]]
+        assert ends, "ends by itself"
+        last = outcomes[ends[0]].measures
+        assert last["success"][i] == 1.0
+        assert min(o.measures["clearance_mm"][i] for o in outcomes[: ends[0] + 1]) > 1.0
+        done = states[ends[0] + 1].goal.done[i]
+        assert done.min() > 0.4 * quick.round, "each cuts about its half"
+        assert done.max() < 0.6 * quick.round
+    delivered = states[-1].world.scene.dose.delivered_j
+    fired = torch.stack([state.goal.fired for state in states[1:]]).sum(0)
+    assert (delivered <= 20.0 * 0.1 * fired + 1e-3).all()
+    assert (delivered >= 20.0 * 0.1 * (fired - 1)).all()
+
+
+def test_the_lasers_work_on_opposite_points(quick, cut):
+    state = cut[0][40]
+    share = [state.goal.share(k, quick.round) for k in (0, 1)]
+    moved = [state.goal.direction * state.goal.done[:, k] / quick.round for k in (0, 1)]
+    torch.testing.assert_close(share[1] - share[0], 0.5 + moved[1] - moved[0])
+    first, second = quick.targets_mm(state)
+    assert ((first - second).norm(dim=1) > 17.0).all(), "20 mm apart while both are as far"
+
+
+def test_each_beam_has_its_own_interlock(quick, cut):
+    """What stops one laser leaves the other on; what hides the lesion stops both."""
+    state = cut[0][40]
+    assert quick.released(state).all()
+    scene, goal = state.world.scene, state.goal
+    view = scene.views["endoscope"]
+    blind = with_scene(state, views={"endoscope": replace(view, fraction=0.0 * view.fraction)})
+    assert not quick.released(blind).any()
+    spot = (goal.share(1, quick.round) * view.visible.shape[1]).floor().long()
+    hidden = view.visible.clone()
+    hidden[torch.arange(2), spot % view.visible.shape[1]] = False
+    lost = with_scene(state, views={"endoscope": replace(view, visible=hidden)})
+    assert quick.released(lost).tolist() == [[True, False]] * 2
+    hits = scene.hits
+    struck = replace(hits["laser_1"], struck=torch.full((2,), 4, dtype=torch.int8))
+    blocked = with_scene(state, hits={**hits, "laser_1": struck})
+    assert quick.released(blocked).tolist() == [[False, True]] * 2
+    shifted = with_arm(
+        state, "laser_2",
+        seen_mm=state.world.arms["laser_2"].points_mm + torch.tensor([1.0, 1.0, 0.0]),
+    )  # fmt: skip
+    assert quick.released(shifted).tolist() == [[True, False]] * 2
+    still = {name: torch.zeros(2, 3) for name in quick.agents}
+    joules = state.world.scene.dose.delivered_j
+    after = quick.advance(blocked, still)
+    assert after.goal.fired.tolist() == [[False, True]] * 2
+    assert torch.equal(after.goal.done - goal.done, after.goal.fired.long())
+    spent = after.world.scene.dose.delivered_j - joules
+    torch.testing.assert_close(spent, torch.tensor([[0.0, 2.0]] * 2), rtol=1e-4, atol=1e-4)
+
+
+def test_no_beam_passes_near_another_arm(quick, cut):
+    """The endoscope lies across the path of the first laser, 9.5 mm off: 2 mm from skin to path."""
+    state = cut[0][40]
+    free = quick.beam_clearance_mm(state)
+    assert (free > quick.config.beam_mm).all()
+    arm = state.world.arms["laser_1"]
+    middle = arm.tip_mm + 20.0 * arm.tip_direction
+    across = torch.linalg.cross(arm.tip_direction, torch.eye(3)[2:].expand(2, 3))
+    across = torch.nn.functional.normalize(across, dim=1)
+    beside = torch.linalg.cross(arm.tip_direction, across)
+    count = state.world.arms["endoscope"].line_mm.shape[1]
+    along = torch.linspace(-40.0, 40.0, count)[None, :, None] * across[:, None]
+    line = (middle + 9.5 * beside)[:, None] + along
+    near = with_arm(state, "endoscope", line_mm=line)
+    clear = quick.beam_clearance_mm(near)
+    torch.testing.assert_close(clear[:, 0], torch.full((2,), 2.0), rtol=0, atol=1e-3)
+    assert quick.released(near).tolist() == [[False, bool(c >= 3.0)] for c in clear[:, 1]]
+    for laser in LASERS:
+        assert quick.rewards(near)[laser]["crossed"].tolist() == [-1.0, -1.0]
+        assert quick.rewards(state)[laser]["crossed"].tolist() == [0.0, 0.0]
+
+
+def test_other_scenes_are_one_line(tmp_path):
+    with pytest.raises(InputError, match="has the arms laser, endoscope, expected laser_1") as told:
+        make_task("two_laser_ring", TwoLaserRingConfig(scene=PHANTOM))
+    assert "\n" not in str(told.value)
+    with pytest.raises(InputError, match="beam_mm is 0"):
+        TwoLaserRingConfig(beam_mm=0.0)

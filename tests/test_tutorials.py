@@ -1,0 +1,82 @@
+"""The tutorials: their runner runs blocks in order, and their pictures stay small."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+spec = importlib.util.spec_from_file_location("run_tutorials", DOCS / "run_tutorials.py")
+tutorials = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(tutorials)
+
+PAGE = """# A page
+
+```toml title="a.toml"
+n = 3
+```
+
+```python
+import tomllib
+
+n = tomllib.loads(open("a.toml").read())["n"]
+```
+
+```python
+print(n + 1)
+```
+
+Words.
+
+```text
+old
+```
+
+```bash
+cat a.toml | sed -n 1,1p
+surgisoft --version | cut -c1-9
+```
+
+```text
+```
+
+```python needs="no_such_library"
+raise ValueError
+```
+
+```text
+kept
+```
+"""
+
+
+def test_blocks_run_in_order_and_outputs_are_renewed(tmp_path):
+    text = tutorials.run_page(PAGE, tmp_path, "page")
+    outputs = [block["body"] for block in tutorials.BLOCK.finditer(text) if block["info"] == "text"]
+    assert outputs == ["4\n", "n = 3\nsurgisoft\n", "kept\n"]
+    assert (
+        text.replace("4\n", "old\n").replace("n = 3\nsurgisoft\n```\n\n```p", "```\n\n```p") == PAGE
+    )
+    assert (tmp_path / "a.toml").read_text() == "n = 3\n"
+
+
+def test_a_block_that_fails_stops_the_page(tmp_path):
+    with pytest.raises(SystemExit, match="code 1"):
+        tutorials.run_page("```bash\nfalse | cat\n```\n", tmp_path, "page")
+    with pytest.raises(ZeroDivisionError):
+        tutorials.run_page("```python\n1 / 0\n```\n", tmp_path, "page")
+
+
+def test_every_picture_is_made_by_its_page_and_all_are_small():
+    pages = sorted((DOCS / "tutorials").glob("*.md"))
+    shown = {name for page in pages for name in tutorials.PICTURE.findall(page.read_text())}
+    kept = list((DOCS / "tutorials" / "images").iterdir())
+    assert shown == {path.name for path in kept}
+    assert sum(path.stat().st_size for path in kept) < 2_000_000
+
+
+def test_every_output_of_a_tutorial_was_written():
+    """Blocks of `text` are outputs: an empty one was never renewed."""
+    for page in (DOCS / "tutorials").glob("*.md"):
+        for block in tutorials.BLOCK.finditer(page.read_text()):
+            assert block["info"] != "text" or block["body"].strip(), page.name

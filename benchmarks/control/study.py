@@ -29,6 +29,7 @@ TASKS = (
     "track_body",
     "keyhole",
     "two_laser_ring",
+    "keyhole_ablation",
 )
 """Tasks that policies are trained for and evaluated on."""
 PLACES = ("simulation", "rig")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial import Delaunay
 
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.meshio import write_ply
@@ -119,6 +120,61 @@ def tray():
     return Mesh(corners, [face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
 
 
+WALL_MM = (145.0, 149.0)
+"""Lower and upper face of the wall above the liver (mm)."""
+PORT_MM = 24.0
+"""Diameter of a port across its axis (mm)."""
+PORTS = (
+    ((-77.9, -73.43, 158.95), (0.498355, 0.230894, -0.835662)),
+    ((30.64, -51.73, 171.39), (-0.375775, -0.353057, -0.856822)),
+)
+"""A point (mm) on each port's axis and the axis: the mounts of the two arms in `scene.toml`."""
+
+
+def wall(around=180, spacing_mm=10.0):
+    """A plate with two slanting ports (mesh, mm), `around` points on each rim.
+
+    Both faces have the same triangles, Delaunay's of the middle plane; their rims are shifted along
+    the axes of the ports.
+    """
+    turn = 2.0 * np.pi * np.arange(around) / around
+    x, y = np.arange(-130.0, 91.0, spacing_mm), np.arange(-130.0, 31.0, spacing_mm)
+    grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    rims, kept = [], np.ones(len(grid), dtype=bool)
+    for start, axis in PORTS:
+        axis = np.array(axis) / np.linalg.norm(axis)
+        slant = axis[:2] / np.linalg.norm(axis[:2])
+        across = np.array([-slant[1], slant[0]])
+        long = 0.5 * PORT_MM / abs(axis[2])
+        ring = long * np.cos(turn)[:, None] * slant + 0.5 * PORT_MM * np.sin(turn)[:, None] * across
+        heights = (*WALL_MM, np.mean(WALL_MM))
+        middles = [np.array(start[:2]) + (z - start[2]) / axis[2] * axis[:2] for z in heights]
+        rims.append([middle + ring for middle in middles])
+        kept &= np.linalg.norm(grid - middles[2], axis=1) > long + 0.5 * spacing_mm
+    flat = np.concatenate((*(rim[2] for rim in rims), grid[kept]))
+    triangles = Delaunay(flat).simplices
+    hole = np.any([(triangles // around == k).all(axis=1) for k in range(len(rims))], axis=0)
+    triangles = triangles[~hole]
+    a, b, c = (flat[triangles[:, k]] for k in range(3))
+    turned = np.cross(b - a, c - a) < 0.0
+    triangles[turned] = triangles[turned][:, ::-1]
+    faces = []
+    for k, z in enumerate(WALL_MM):
+        places = np.concatenate((*(rim[k] for rim in rims), grid[kept]))
+        faces.append(np.column_stack((places, np.full(len(places), z))))
+    edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+    inner = {(int(j), int(i)) for i, j in edges}
+    rim_edges = np.array([edge for edge in map(tuple, edges.tolist()) if edge not in inner])
+    i, j = rim_edges.T
+    above = len(flat)
+    sides = np.concatenate(
+        (np.stack((i, j, j + above), axis=1), np.stack((i, j + above, i + above), axis=1))
+    )
+    return Mesh(
+        np.concatenate(faces), np.concatenate((triangles[:, ::-1], triangles + above, sides))
+    )
+
+
 def mesh_of(field, spacing_mm, bounds_mm, rounds=40):
     """Vertices (V, 3) mm and faces (F, 3) of the field's zero level, evened out."""
     from skimage.measure import marching_cubes
@@ -179,7 +235,7 @@ def bodies(fineness=1.0):
     lowest = min(vertices[:, 2].min() for vertices, _ in standing.values())
     lift = np.array([0.0, 0.0, -lowest])
     meshes = {name: Mesh(vertices + lift, faces) for name, (vertices, faces) in standing.items()}
-    return meshes | {"tray": tray()}
+    return meshes | {"tray": tray(), "wall": wall()}
 
 
 def main(folder):

@@ -193,8 +193,13 @@ def rewards(
     state: TaskState,
     of_laser: Mapping[str, Tensor] | None = None,
     of_both: Mapping[str, Tensor] | None = None,
+    of_agent: Mapping[str, Mapping[str, Tensor]] | None = None,
 ) -> dict[str, dict[str, Tensor]]:
-    """Weighted reward terms, see `LaserWeights` and `EndoscopeWeights`, and those of the task."""
+    """Weighted reward terms, see `LaserWeights` and `EndoscopeWeights`, and those of the task.
+
+    of_laser, of_both: terms of the task for the laser and for both agents. of_agent: agent -> terms
+    of the task in which the agents differ.
+    """
     error, scene, config = beam_error_mm(task, state), state.world.scene, task.config
     view = scene.views[ENDOSCOPE]
     shared = {
@@ -212,7 +217,11 @@ def rewards(
         "look": 1.0 / (1.0 + view.axis_error_mm / config.far_mm),
         "view": view.fraction,
     }
-    found = {LASER: laser | shared, ENDOSCOPE: endoscope | shared}
+    own = of_agent or {}
+    found = {
+        LASER: {**laser, **shared, **own.get(LASER, {})},
+        ENDOSCOPE: {**endoscope, **shared, **own.get(ENDOSCOPE, {})},
+    }
     return {
         agent: weighted({f.name: terms[f.name] for f in fields(task.weights[agent])}, weights)
         for agent, terms in found.items()

@@ -20,6 +20,7 @@ from surgisoft.tasks.base import Task, TaskSpec
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
 from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
 from surgisoft.tasks.keyhole import KEYHOLE
+from surgisoft.tasks.keyhole_ablation import KEYHOLE_ABLATION
 from surgisoft.tasks.laser_plane import LASER_PLANE
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
@@ -35,6 +36,7 @@ TASKS: dict[str, TaskSpec] = {
     "contour_ablation": CONTOUR_ABLATION,
     "area_ablation": AREA_ABLATION,
     "two_laser_ring": TWO_LASER_RING,
+    "keyhole_ablation": KEYHOLE_ABLATION,
 }
 """Every task by name."""
 

@@ -75,6 +75,28 @@ class WorldConfig:
             raise InputError(f"world: samples is {self.samples}, expected at least 2")
 
 
+@dataclass(frozen=True)
+class Feed:
+    """Carriages that feed all arms in along their axes at the beginning of an episode."""
+
+    way_mm: float = 80.0
+    """Distance of each base behind its mount when an episode begins, mm."""
+    speed_mm_s: float = 10.0
+    """Speed of the feed until the bases are at their mounts, mm/s."""
+    wait_s: float = 5.0
+    """Time before the feed begins, in which the arms can be straightened, s."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= (0.0 if name == "wait_s" else 1e-3)):
+                raise InputError(f"feed: {name} is {value}, expected above 0 (wait_s: 0 or more)")
+
+    def move_mm(self, out_mm: Tensor, steps: Tensor, dt_s: float) -> Tensor:
+        """(B,) mm: the feed in a step of bases (B,) mm behind their mounts, after (B,) steps."""
+        begun = steps * dt_s >= self.wait_s - 0.5 * dt_s
+        return out_mm.clamp(max=self.speed_mm_s * dt_s) * begun
+
+
 @dataclass(frozen=True, eq=False)
 class WorldState:
     """The state of B environments."""
@@ -89,6 +111,8 @@ class WorldState:
     """The scene around them."""
     failed: Tensor
     """(B,) bool: an arm is not finite; the environment stays failed until it is reset."""
+    out_mm: Tensor | None = None
+    """(B,) mm: by how much the arms' bases are behind their mounts; None without a feed."""
 
     def donated(self) -> WorldState:
         """Copy of the state whose buffers a step or reset may overwrite.
@@ -108,13 +132,15 @@ class World:
         scene: SceneEngine | ObstacleEngine | None = None,
         device: str | torch.device = "cpu",
         passive: Sequence[str] = (),
+        feed: Feed | None = None,
     ):
         """Without a scene the arms bend in empty space: no clearance, no beam, no view.
 
-        passive: names of arms that no agent drives; they hold their commanded pressures.
+        passive: names of arms that no agent drives; they hold their commanded pressures. feed: how
+        the arms are fed in; None: their bases are at the mounts from the beginning.
         """
         self.config, self.device = config or WorldConfig(), torch.device(device)
-        self.passive = tuple(passive)
+        self.passive, self.feed = tuple(passive), feed
         self.scene = scene
         c = self.config
         self.arms: dict[str, Arm] = {
@@ -135,10 +161,17 @@ class World:
         parts = {}
         for name, arm in self.arms.items():
             stream, parts[name] = arm.start(stream)
+        out_mm = None
+        if self.feed:
+            out_mm = torch.full_like(stream.count, self.feed.way_mm, dtype=torch.float32)
+            for name, arm in self.arms.items():
+                part = fed(parts[name], -out_mm)
+                parts[name] = arm.posed(part, part.points_mm)
         scene = SceneState()
         if self.scene:
             stream, scene = self.scene.start(stream, parts)
-        return WorldState(stream, torch.zeros_like(stream.count), parts, scene, _not_finite(parts))
+        steps = torch.zeros_like(stream.count)
+        return WorldState(stream, steps, parts, scene, _not_finite(parts), out_mm)
 
     def reset(self, state: WorldState, mask: Tensor) -> WorldState:
         """Restart the environments where mask (B,) is set, each with its random number stream."""
@@ -166,8 +199,13 @@ class World:
         over the step.
         """
         dt_s, stream, parts = self.config.dt_s, state.stream, {}
+        out_mm, move_mm = state.out_mm, None
+        if self.feed and out_mm is not None:
+            move_mm = self.feed.move_mm(out_mm, state.steps, dt_s)
+            out_mm = out_mm - move_mm
         for name, arm in self.arms.items():
             part = state.arms[name]
+            part = part if move_mm is None else fed(part, move_mm)
             held = name in self.passive and name not in actions
             action = torch.zeros_like(part.command) if held else actions[name]
             stream, parts[name] = arm.step(stream, part, action, dt_s)
@@ -175,7 +213,20 @@ class World:
         if self.scene:
             scene = self.scene.step(scene, parts, power_w, dt_s)
         failed = state.failed | _not_finite(parts)
-        return WorldState(stream, state.steps + 1, parts, scene, failed)
+        return WorldState(stream, state.steps + 1, parts, scene, failed, out_mm)
+
+
+def fed(part: ArmPart, move_mm: Tensor) -> ArmPart:
+    """The arm with base and key points moved by (B,) mm along its base's axis."""
+    shift = move_mm[:, None] * part.mount[:, :3, 2]
+    mount = part.mount.clone()
+    mount[:, :3, 3] += shift
+    points, seen = part.points_mm + shift[:, None], part.seen_mm + shift[:, None]
+    belief = part.belief
+    if belief is not None:
+        # the feed is known to the observer
+        belief = replace(belief, offset_mm=belief.offset_mm + shift[:, None])
+    return replace(part, mount=mount, points_mm=points, seen_mm=seen, belief=belief)
 
 
 def _not_finite(parts: Mapping[str, ArmPart]) -> Tensor:
@@ -207,12 +258,13 @@ def scene_world(
     arm: str | Path | None = None,
     agents: Sequence[str] | None = None,
     plan: Plan | None = None,
+    feed: Feed | None = None,
 ) -> World:
     """World of a scene (or its folder): its bodies and its arms, named as in the scene.
 
     arm: a model for all arms instead of those that the scene names, as for `named_arm`. agents:
     names of the arms that a task drives, the others are passive; None: all arms. plan: what is to
-    be treated; None: a ring around the scene's lesion.
+    be treated; None: a ring around the scene's lesion. feed: see `World`.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
@@ -229,7 +281,7 @@ def scene_world(
     vary = config.randomisation
     around = SceneEngine(scene, config.scene_engine, device, engine, vary, plan)
     passive = [name for name in arms if name not in agents]
-    return World(arms, config, around, device, passive)
+    return World(arms, config, around, device, passive, feed)
 
 
 def check_arms(scene: Scene, agents: Sequence[str]) -> None:

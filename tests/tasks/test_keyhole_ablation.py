@@ -1,0 +1,131 @@
+"""Two arms through the ports of a wall: the feed, the scripted expert, the rims and success."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from surgisoft.errors import InputError
+from surgisoft.scene.spec import PHANTOM
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.keyhole_ablation import KeyholeAblation, KeyholeAblationConfig
+from surgisoft.tasks.world.world import Feed
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """The same ports and ring in a third of the time."""
+    return KeyholeAblation(KeyholeAblationConfig(feed=Feed(70.0, 20.0, wait_s=1.0), cut_s=15.0))
+
+
+@pytest.fixture(scope="module")
+def cut(quick):
+    """States and outcomes of two scripted episodes to the end of both."""
+    episodes = Episodes(quick)
+    states, outcomes = [episodes.seeded(0, 2)], []
+    with torch.inference_mode():
+        over = torch.zeros(2, dtype=torch.bool)
+        while not over.all() and len(outcomes) < 300:
+            state, outcome = episodes.step(states[-1], quick.script(states[-1]))
+            states.append(state)
+            outcomes.append(outcome)
+            over |= outcome.done
+    return states, outcomes
+
+
+def with_clearance(state, bodies_mm):
+    clearance = replace(state.world.scene.clearance, bodies_mm=bodies_mm)
+    scene = replace(state.world.scene, clearance=clearance)
+    return replace(state, world=replace(state.world, scene=scene))
+
+
+def test_the_script_enters_looks_and_cuts(quick, cut):
+    states, outcomes = cut
+    for i in range(2):
+        end = next(k for k, outcome in enumerate(outcomes) if outcome.terminated[i])
+        last = outcomes[end].measures
+        assert last["success"][i] == 1.0
+        assert last["at_rim_s"][i] == 0.0
+        assert min(o.measures["rim_mm"][i] for o in outcomes[: end + 1]) > quick.config.rim_mm
+    fired = torch.stack([state.goal.fired for state in states])
+    assert not fired[:46].any(), "no beam before the arms are in"
+
+
+def test_the_feed_brings_the_bases_to_their_mounts_along_the_ports(quick, cut):
+    """By hand: 70 mm behind the mounts, 10 steps of waiting, 2 mm in a step; tips begin outside."""
+    states, _ = cut
+    lower = min(p[2] for p in quick.scene.geometry.bodies[-1].mesh.vertices_mm)
+    for name, arm in quick.world.arms.items():
+        axis = arm.pose[:3, 2]
+        for step in (0, 9, 10, 11, 30, 45, 60):
+            part = states[step].world.arms[name]
+            out = min(70.0, max(0.0, 70.0 - 2.0 * (step - 10)))
+            expected = arm.pose[:3, 3] - out * axis
+            torch.testing.assert_close(
+                part.mount[:, :3, 3], expected.expand(2, 3), rtol=0, atol=1e-3
+            )
+            torch.testing.assert_close(
+                states[step].world.out_mm, torch.full((2,), out), rtol=0, atol=1e-3
+            )
+            # the body hangs on its base: the first key point is the base
+            torch.testing.assert_close(part.points_mm[:, 0], part.mount[:, :3, 3], rtol=0, atol=0.5)
+        assert (states[0].world.arms[name].tip_mm[:, 2] > lower).all(), "outside at the beginning"
+        assert (states[50].world.arms[name].tip_mm[:, 2] < lower).all(), "inside after the feed"
+
+
+def test_reset_withdraws_the_arms_again(quick, cut):
+    state = cut[0][50]
+    again = Episodes(quick).reset(state, torch.tensor([True, False]))
+    assert again.world.out_mm.tolist() == [70.0, 0.0]
+    assert again.goal.at_rim.tolist() == [0, 0]
+
+
+def test_time_at_the_rim_is_counted_and_decides(quick, cut):
+    """The endoscope 0.5 mm from the wall: penalised alone, counted, and too long is no success."""
+    state = cut[0][-1]
+    bodies = state.world.scene.clearance.bodies_mm.clone()
+    wall = [body.name for body in quick.spec.bodies].index("wall")
+    assert bodies[0, :, wall].min() > 1.0
+    bodies[0, 1, wall] = 0.5
+    near = with_clearance(state, bodies)
+    reward, usual = quick.rewards(near), quick.rewards(state)
+    assert reward["endoscope"]["rim"].tolist() == [-1.0, 0.0]
+    assert reward["laser"]["rim"].tolist() == [0.0, 0.0]
+    assert usual["endoscope"]["rim"].tolist() == [0.0, 0.0]
+    assert quick.measures(near)["rim_mm"][0].item() == pytest.approx(0.5)
+    assert quick.measures(state)["success"][0] == 1.0
+    for steps, good in ((20, 1.0), (21, 0.0)):  # rim_s is 2 s, a step 0.1 s
+        held = replace(state, goal=replace(state.goal, at_rim=torch.tensor([steps, 0])))
+        assert quick.measures(held)["success"][0] == good
+    still = {name: torch.zeros(2, 3) for name in quick.agents}
+    wide = KeyholeAblation(replace(quick.config, rim_mm=5.0))
+    after = wide.advance(state, still)
+    assert (after.goal.at_rim - state.goal.at_rim).tolist() == [1, 1]
+
+
+def test_a_bent_arm_meets_the_rim_on_its_way_in(quick):
+    """Full pressure in one chamber while the feed runs: the tip leaves the port's axis, contact."""
+    episodes = Episodes(quick)
+    state = episodes.seeded(1, 1)
+    bend = {name: torch.tensor([[3.0, 0.0, 0.0]]) for name in quick.agents}
+    with torch.inference_mode():
+        for _ in range(50):
+            state, outcome = episodes.step(state, bend)
+            if outcome.terminated[0]:
+                break
+    assert outcome.terminated[0]
+    assert outcome.measures["collided"][0] == 1.0
+    assert outcome.measures["rim_mm"][0] < 0.0
+    assert state.world.out_mm[0] > 0.0
+    off = {a: quick.off_axis_mm(a, state.world.arms[a].points_mm).norm() for a in quick.agents}
+    assert max(off.values()) > 4.0, "the port leaves 4.5 mm on each side"
+
+
+def test_wrong_scenes_and_numbers_are_one_line():
+    with pytest.raises(InputError, match="liver, gallbladder, tray, expected the wall 'wall'"):
+        KeyholeAblation(KeyholeAblationConfig(scene=PHANTOM))
+    with pytest.raises(InputError, match="rim_mm is 0"):
+        KeyholeAblationConfig(rim_mm=0.0)
+    with pytest.raises(InputError, match="speed_mm_s is nan"):
+        Feed(speed_mm_s=np.nan)

@@ -89,7 +89,7 @@ FLOORS = {
     ),
     "scene": (
         ("frames",),
-        ("mesh", "capsules"),
+        ("mesh", "capsules", "moving"),
         ("meshio", "bvh", "plate"),
         ("rays",),
         ("field", "inside", "segmentation", "sight"),

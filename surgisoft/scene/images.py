@@ -26,6 +26,7 @@ from surgisoft.scene.bvh import STACK, build_tree
 from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import self_contact_gap_mm
 from surgisoft.scene.mesh import Body
+from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import Struck, capsule_entry, struck_of
 from surgisoft.scene.render import (
     ARM_COLOUR,
@@ -166,7 +167,7 @@ class BatchedRenderer:
         own: str | None = None,
         beams_mm: Tensor | None = None,
         lit: Tensor | None = None,
-        bodies: Mapping[str, Tensor] | None = None,
+        bodies: Mapping[str, Tensor] | Placement | None = None,
         dose: Tensor | None = None,
         lesion: Tensor | None = None,
         kinds: Sequence[str] = KINDS,
@@ -181,7 +182,7 @@ class BatchedRenderer:
         poses = poses.detach().double()
         count = len(poses)
         inward = torch.linalg.inv(torch.where(_finite(poses)[:, None, None], poses, torch.eye(4)))
-        maps = torch.stack([self._map(inward, n, bodies or {}) for n in range(len(self._names))])
+        maps = torch.stack([self._map(inward, n, bodies) for n in range(len(self._names))])
         names = list(arms or {})
         lines = [(arms or {})[name].detach().double() for name in names]
         ok = _finite(poses)
@@ -228,12 +229,14 @@ class BatchedRenderer:
         found = zip(KINDS, (rgb, depth, labels), strict=True)
         return Images(*(one if kind in kinds else None for kind, one in found))
 
-    def _map(self, inward: Tensor, n: int, bodies: Mapping[str, Tensor]) -> Tensor:
+    def _map(
+        self, inward: Tensor, n: int, bodies: Mapping[str, Tensor] | Placement | None
+    ) -> Tensor:
         """(B, 4, 4): a body's place at rest, world frame, to the cameras' frames."""
-        now = bodies.get(self._names[n])
+        now = None if bodies is None else bodies.get(self._names[n])
         if now is None:
             return inward
-        return inward @ now.detach().double() @ torch.linalg.inv(self._homes[n])
+        return inward @ now.detach().cpu().double() @ torch.linalg.inv(self._homes[n])
 
 
 def _finite(values: Tensor) -> Tensor:

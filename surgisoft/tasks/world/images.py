@@ -104,6 +104,7 @@ class EndoscopeImages:
         beams, lit = self._beams(arms, scene)
         dose = None if scene.dose is None else scene.dose.dose.cpu()
         lesion = None if scene.lesion is None else scene.lesion.cpu()
+        places = self._engine.placement(scene.breaths)
         found = {}
         for name in self._engine.endoscopes:
             eye = arms[name]
@@ -114,6 +115,7 @@ class EndoscopeImages:
                 name,
                 beams,
                 lit,
+                places,
                 dose=dose,
                 lesion=lesion,
                 kinds=self._kinds,

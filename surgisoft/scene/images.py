@@ -223,7 +223,7 @@ class BatchedRenderer:
             (count if "segmentation" in kinds else 0, *shape, 1), dtype=torch.uint8
         )
         out = (rgb.numpy(), depth.numpy(), labels.numpy())
-        cameras = (inward.numpy(), maps.contiguous().numpy(), ok.numpy())
+        cameras = (inward.contiguous().numpy(), maps.contiguous().numpy(), ok.numpy())
         given = (cameras, self._lens, self._inside, self._film, self._bodies, chains, beams, tissue)
         _over_rows(count, lambda first, last: draw_rows(first, last, *given, *out))
         found = zip(KINDS, (rgb, depth, labels), strict=True)

@@ -90,14 +90,17 @@ class Package:
         )
 
 
-def licence_of(metadata) -> str:
-    """SPDX expression of a package's metadata: License-Expression, classifiers, or License."""
+def licence_of(metadata, file: str = "") -> str:
+    """SPDX expression of a package's metadata: License-Expression, classifiers, or License.
+
+    file: text of its licence file, whose first line counts where the metadata state none.
+    """
     if metadata.get("License-Expression"):
         return metadata["License-Expression"]
     prefix = "License :: "
     stated = [c.split(" :: ")[-1] for c in metadata.get_all("Classifier", []) if prefix in c]
     stated = [one for one in stated if one != "OSI Approved"]
-    text = metadata.get("License") or ""
+    text = metadata.get("License") or ("" if stated else file)
     for one in [*stated, text.strip().splitlines()[0] if text.strip() else ""]:
         known = IN_WORDS.get(one.lower(), one)
         if Package("", "", known).compatible:
@@ -149,8 +152,15 @@ def installed() -> dict[str, Distribution]:
 def packages() -> list[Package]:
     """The installed packages with their licences."""
     return [
-        Package(name, one.version, licence_of(one.metadata)) for name, one in installed().items()
+        Package(name, one.version, licence_of(one.metadata, _licence_file(one)))
+        for name, one in installed().items()
     ]
+
+
+def _licence_file(package: Distribution) -> str:
+    """Text of a package's first licence file; empty where its metadata name none."""
+    names = package.metadata.get_all("License-File", [])
+    return (package.read_text(f"licenses/{names[0]}") or "") if names else ""
 
 
 def licences_page(some: list[Package]) -> str:

@@ -21,6 +21,8 @@ EXTRA_OF = {
     "elastica": "elastica",
     "serial": "serial",
     "distributed": "cluster",
+    "ezc3d": "lab",
+    "h5py": "lab",
     "mcap": "mcap",
     "mcap_ros2": "mcap",
     "nibabel": "segmentation",

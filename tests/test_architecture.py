@@ -89,7 +89,7 @@ FLOORS = {
     ),
     "scene": (
         ("frames",),
-        ("mesh", "capsules"),
+        ("mesh", "capsules", "moving"),
         ("meshio", "bvh", "plate"),
         ("rays",),
         ("field", "inside", "segmentation", "sight"),
@@ -141,6 +141,8 @@ ONLY_IN = {
     "fcl": "scene/collision",
     "elastica": "rig/elastica",
     "serial": "rig/drivers/serial_controller",
+    "ezc3d": "measurement/importing/readers/c3d",
+    "h5py": "measurement/importing/readers/arrays",
     "mcap": "measurement/importing/readers/mcap",
     "mcap_ros2": "measurement/importing/readers/mcap",
     "distributed": "workers",

@@ -24,7 +24,7 @@ from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.rays import RayHit
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import ArmPart
-from surgisoft.tasks.world.scene import SceneEngine
+from surgisoft.tasks.world.scene import SceneEngine, SceneState
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are computed."""
@@ -98,8 +98,11 @@ class _Notes:
     contact_differs: int = 0
     beam_differs: int = 0
     beam_off_mm: float = 0.0
-    closest: list[tuple[float, int, dict[str, ArmShape]]] = field(default_factory=list)
-    """(clearance in mm, step, arms) at the steps of least clearance by the batched geometry."""
+    closest: list[tuple[float, int, dict[str, ArmShape], CollisionChecker]] = field(
+        default_factory=list
+    )
+    """(clearance in mm, step, arms, checker with the bodies of the step) at the steps of least
+    clearance by the batched geometry."""
     proof: _Proof | None = None
     """The last exact clearance, where there was any."""
     collision_checks: int = 0
@@ -117,7 +120,7 @@ class ExactChecks:
                 f"task {task.name}: its world is empty, expected bodies to check against"
             )
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
-        self.checker = CollisionChecker(around.geometry.bodies)
+        self.around, self.checker = around, CollisionChecker(around.geometry.bodies)
         self.beam_mm = around.beam_mm if isinstance(around, SceneEngine) else math.nan
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
 
@@ -136,13 +139,22 @@ class ExactChecks:
         clearance = world.scene.clearance
         assert clearance is not None, "a world with bodies has a clearance"
         least, collides = clearance.least_mm[rows].tolist(), clearance.collides[rows].tolist()
-        folds = self._may_fold(lines)
+        folds, checkers = self._may_fold(lines), self._checkers(world.scene, rows)
         for n, number in enumerate(numbers):
             own = {name: line[n] for name, line in lines.items()}
             notes = self._notes[number]
-            self._look(notes, own, steps[n], least[n], collides[n], bool(folds[n]))
+            self._look(notes, own, steps[n], least[n], collides[n], bool(folds[n]), checkers[n])
         for laser, hit in world.scene.hits.items():
-            self._look_along(numbers, world.arms[laser], hit, rows, lines, laser)
+            self._look_along(numbers, world.arms[laser], hit, rows, lines, laser, checkers)
+
+    def _checkers(self, scene: SceneState, rows: torch.Tensor) -> list[CollisionChecker]:
+        """For each of the rows (R,) of the batch the checker with the bodies where they are."""
+        placement = None
+        if isinstance(self.around, SceneEngine):
+            placement = self.around.placement(scene.breaths)
+        if placement is None:
+            return [self.checker] * len(rows)
+        return [self.checker.moved(placement, row) for row in rows.tolist()]
 
     def _may_fold(self, lines: dict[str, np.ndarray]) -> np.ndarray:
         """(B,) bool: parts of an arm (B, K, 3) mm may touch one another."""
@@ -168,6 +180,7 @@ class ExactChecks:
         least_mm: float,
         collides: bool,
         folds: bool,
+        checker: CollisionChecker,
     ) -> None:
         """Check one pose of the arms (K, 3) mm; least_mm and collides: by the batched geometry."""
         notes.steps += 1
@@ -179,22 +192,33 @@ class ExactChecks:
             return
         arms = {name: ArmShape(line, self.radii[name]) for name, line in lines.items()}
         if close:
-            notes.closest = sorted([*notes.closest, (*place, arms)], key=lambda seen: seen[:2])
+            notes.closest = sorted(
+                [*notes.closest, (*place, arms, checker)], key=lambda seen: seen[:2]
+            )
             notes.closest = notes.closest[:CLOSEST]
-        found = False if shown else self._touches(notes, arms, step, least_mm, folds)
+        found = False if shown else self._touches(notes, arms, step, least_mm, folds, checker)
         notes.contact_differs += found != collides
 
     def _touches(
-        self, notes: _Notes, arms: dict[str, ArmShape], step: int, least_mm: float, folds: bool
+        self,
+        notes: _Notes,
+        arms: dict[str, ArmShape],
+        step: int,
+        least_mm: float,
+        folds: bool,
+        checker: CollisionChecker,
     ) -> bool:
-        """Whether FCL finds a contact; keeps a proof for the next steps, or the first contact."""
+        """Whether FCL finds a contact; keeps a proof for the next steps, or the first contact.
+
+        Among bodies that move no clearance proves anything about the next step.
+        """
         notes.collision_checks += 1
-        if least_mm >= PROVEN_FROM_MM and not folds:
+        if least_mm >= PROVEN_FROM_MM and not folds and checker is self.checker:
             notes.proof = self._proof(arms)
             if min(notes.proof.free_mm.values(), default=math.inf) > 0.0:
                 return False
             notes.proof = None
-        found = self.checker.collisions(arms)
+        found = checker.collisions(arms)
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         return bool(found)
@@ -217,10 +241,25 @@ class ExactChecks:
         rows: torch.Tensor,
         lines: dict[str, np.ndarray],
         laser: str,
+        checkers: list[CollisionChecker],
     ) -> None:
         """Compare the exact ends of a laser's beam with those of the batched geometry."""
         origin, aim = (v[rows].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
-        cast = self.checker.cast_each(origin, aim, self.beam_mm, lines, self.radii, laser)
+        if all(checker is self.checker for checker in checkers):
+            cast = self.checker.cast_each(origin, aim, self.beam_mm, lines, self.radii, laser)
+        else:
+            each = [
+                checker.cast_each(
+                    origin[n : n + 1],
+                    aim[n : n + 1],
+                    self.beam_mm,
+                    {name: line[n : n + 1] for name, line in lines.items()},
+                    self.radii,
+                    laser,
+                )
+                for n, checker in enumerate(checkers)
+            ]
+            cast = (np.concatenate([one[0] for one in each]), np.concatenate([o[1] for o in each]))
         struck, ends = hit.struck[rows].cpu().numpy(), hit.point_mm[rows].cpu().numpy()
         off = frames.norm(cast[1] - ends)
         for n, number in enumerate(numbers):
@@ -231,7 +270,7 @@ class ExactChecks:
                 notes.beam_off_mm = max(notes.beam_off_mm, float(off[n]))
 
     def _check(self, notes: _Notes) -> EpisodeCheck:
-        exact = [self.checker.clearance(arms).least_mm for _, _, arms in notes.closest]
+        exact = [checker.clearance(arms).least_mm for _, _, arms, checker in notes.closest]
         offs = [abs(mm - seen[0]) for mm, seen in zip(exact, notes.closest, strict=True)]
         return EpisodeCheck(
             contact=notes.contact,

@@ -95,15 +95,17 @@ def compare(
     from surgisoft.diagnosis.compare import compare_all
 
     models = [model, *others]
-    compared = compare_all(
-        models,
-        measured,
-        [each.name for each in models],
-        before=earlier,
-        paired=paired,
-        predictions=predictions,
-        error_mm=model_error,
-    )
+    with progress("compare") as tell:
+        compared = compare_all(
+            models,
+            measured,
+            [each.name for each in models],
+            tell,
+            before=earlier,
+            paired=paired,
+            predictions=predictions,
+            error_mm=model_error,
+        )
     result, rest = compared[0].result, compared[0].table
     arm = rest.model
     for one in compared:

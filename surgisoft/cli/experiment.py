@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from surgisoft.cli import app
+from surgisoft.cli import INTERRUPTED, app
 from surgisoft.cli.files import check_folder
 from surgisoft.cli.inputs import counted, read_context
 from surgisoft.cli.options import (
@@ -15,6 +15,7 @@ from surgisoft.cli.options import (
     ExperimentFile,
     Preflight,
     RigsOfArms,
+    with_effect_files,
 )
 from surgisoft.cli.progress import progress
 
@@ -83,7 +84,14 @@ def run(
     )
     with progress(f"experiment {spec.name}") as report:
         about = f"surgisoft experiment run {file.name}"
-        results, files = finish_experiment(spec, folder, processes, replays, about, report, cluster)
+        try:
+            results, files = finish_experiment(
+                spec, folder, processes, replays, about, report, cluster
+            )
+        except KeyboardInterrupt:
+            again = with_effect_files(f"surgisoft experiment run {file} -o {folder} --resume")
+            print(f"stopped; {folder} keeps the finished blocks; continue with: {again}")
+            raise typer.Exit(INTERRUPTED) from None
     if context is not None:
         from surgisoft.credibility.of_experiment import assess_experiment
         from surgisoft.credibility.page import write_report

@@ -36,6 +36,7 @@ from surgisoft.errors import InputError
 from surgisoft.files import json_safe
 from surgisoft.measurement.histories import check_fits
 from surgisoft.measurement.recordings import Recording, load_recordings
+from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.effects import known_effects
 from surgisoft.surrogate.interval import coverage_of
 from surgisoft.surrogate.model import ArmModel
@@ -287,11 +288,13 @@ def compare_all(
     models: Sequence[Model],
     recordings: Recordings,
     names: Sequence[str] | None = None,
+    progress: Progress = silent,
     **options,
 ) -> list[Compared]:
     """Compare several models with the same recordings; `options` are those of `compare`.
 
-    names: names of the models, which default to those of their folders.
+    names: names of the models, which default to those of their folders. progress: called with the
+    number of models that are done.
     """
     if names is None:
         names = [
@@ -299,7 +302,10 @@ def compare_all(
             for i, m in enumerate(models, 1)
         ]
     measured = load_recordings(recordings)
-    results = [compare(model, measured, **options) for model in models]
+    results = []
+    for done, (model, name) in enumerate(zip(models, names, strict=True)):
+        progress(done, len(models), name)
+        results.append(compare(model, measured, **options))
     sizes = {table.measured_mm.shape for _, table in results}
     if len(sizes) > 1:
         listed = ", ".join(

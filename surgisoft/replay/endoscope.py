@@ -85,12 +85,18 @@ def jpegs(log: EpisodeLog, name: str, rows: np.ndarray, report: Progress = silen
 
     camera, arm = log.cameras[name], log.arms[name]
 
-    bodies = [Body(b.name, b.role, Mesh(b.vertices_mm, b.faces)) for b in log.bodies]
     low, high = camera.range_mm
-    renderer = Renderer(bodies, Camera(camera.fov_rad, (low, high)), PIXELS, PIXELS)
+    optics, moves = (
+        Camera(camera.fov_rad, (low, high)),
+        any(b.motion is not None for b in log.bodies),
+    )
+    renderer = None
     paint, files = _Paint(log), []
     poses = frames.pose_from_z(arm.line_mm[:, -1].astype(float), arm.tip_direction)
     for row in rows:
+        if renderer is None or moves:
+            bodies = [Body(b.name, b.role, Mesh(b.moved_mm(row), b.faces)) for b in log.bodies]
+            renderer = Renderer(bodies, optics, PIXELS, PIXELS)
         shapes = {name: ArmShape(arm.line_mm[row], arm.radius_mm) for name, arm in log.arms.items()}
         picture = renderer.image(
             poses[row], shapes, name, _visible_beams(log, row), paint.at(int(row))
@@ -118,6 +124,7 @@ class _Paint:
     def __init__(self, log: EpisodeLog):
         self.dose = log.dose
         if self.dose is not None:
+            self.motion = log.body(self.dose.body).motion
             self.tree = cKDTree(self.dose.points_mm)
             self.low = self.dose.points_mm.min(axis=0) - SAMPLE_MM
             self.high = self.dose.points_mm.max(axis=0) + SAMPLE_MM
@@ -127,9 +134,13 @@ class _Paint:
         """The `paint` argument of `Renderer.image` for a row; None without a dose."""
         if self.dose is None:
             return None
+        motion = self.motion
+        to_rest = None if motion is None else np.linalg.inv(motion[row].astype(float))
         share = np.append(self.dose.at(row) / self.dose.threshold_j_per_mm2, 0.0)[:, None]
 
         def recolour(_faces, points, colours):
+            if to_rest is not None:  # the dose is stored in the frame of the organ at rest
+                points = frames.apply(to_rest, points)
             near = ((points >= self.low) & (points <= self.high)).all(axis=1)
             _, sample = self.tree.query(points[near], distance_upper_bound=SAMPLE_MM)
             heat, base = share[sample], colours[near]

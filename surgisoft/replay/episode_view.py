@@ -246,7 +246,7 @@ def write_replay(
         columns = Columns(recording, log.time_s)
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         moments = finite_rows(log, MOTION_HZ)
-        _log_bodies(columns, log)
+        _log_bodies(columns, log, moments)
         for name, arm in log.arms.items():
             log_arm(columns, name, arm, moments)
         _log_paths(columns, log, moments)
@@ -280,8 +280,9 @@ def finite_rows(log: EpisodeLog, rate_hz: float) -> np.ndarray:
     return rows[np.all(finite, axis=0)]
 
 
-def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
-    """Log every body once; the organ's faces around the lesion separately, coloured by dose."""
+def _log_bodies(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
+    """Log every body once, and its motion in the log's `rows`; the organ's faces around the lesion
+    separately, coloured by dose."""
     for body in log.bodies:
         mesh, entity = Mesh(body.vertices_mm, body.faces), f"/bodies/{body.name}"
         kept = np.ones(len(mesh.faces), dtype=bool)
@@ -297,6 +298,15 @@ def _log_bodies(columns: Columns, log: EpisodeLog) -> None:
             albedo_factor=ROLE_COLOURS[body.role],
         )
         columns.recording.log(entity, plain, static=True)
+        if body.motion is not None:
+            _log_motion(columns, entity, body.motion, rows)
+
+
+def _log_motion(columns: Columns, entity: str, motion: np.ndarray, rows: np.ndarray) -> None:
+    """Log how an entity and what is below it moves: affine maps (T, 4, 4), mm."""
+    maps = motion[rows].astype(np.float32)
+    moving = rr.Transform3D.columns(translation=maps[:, :3, 3], mat3x3=maps[:, :3, :3])
+    columns.send(entity, rows, moving)
 
 
 def _log_dosed(
@@ -328,6 +338,9 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     if planned:
         plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[PLAN_MM])
         columns.recording.log("/path/planned", plan, static=True)
+        organ = None if log.dose is None else log.body(log.dose.body).motion
+        if organ is not None and log.paths_mm:
+            _log_motion(columns, "/path/planned", organ, rows)
     for entity, went, on in _trails(log):
         shown = np.isfinite(went).all(1) & on
         ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from surgisoft.scene.distance import (
 )
 from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
+from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import (
     RayHit,
     Struck,
@@ -52,6 +54,8 @@ LONGEST_SEGMENT_MM = 6.0
 """Longer segments of a centreline are divided before the distance to the bodies is taken (mm)."""
 MOST_PARTS = 256
 """No segment is cut into more parts than this."""
+SLOPE_MM = 0.05
+"""Shift of an arm by which the slope of its distance from a strained body is measured (mm)."""
 EXACT_WITHIN_MM = 5.0
 """Clearances below this are exact; larger ones have the field's interpolation error (mm)."""
 
@@ -108,7 +112,9 @@ class BatchedScene:
         return self.radii_mm[arm]
 
     def clearance(
-        self, arms: Mapping[str, torch.Tensor], poses: Mapping[str, torch.Tensor] | None = None
+        self,
+        arms: Mapping[str, torch.Tensor],
+        poses: Mapping[str, torch.Tensor] | Placement | None = None,
     ) -> BatchClearance:
         """Signed clearances of every pair; arms name -> (B, K, 3) mm, poses name -> (B, 4, 4)."""
         names = list(arms)
@@ -120,7 +126,10 @@ class BatchedScene:
         for n, (body, surface) in enumerate(zip(self.bodies, self._surfaces, strict=True)):
             turn, shift = self._inward(body, poses)
             for a, ((line, given), radius) in enumerate(zip(fine, radii, strict=True)):
-                bodies[:, a, n] = surface.clearance(
+                measure = surface.clearance
+                if isinstance(poses, Placement) and body.name in poses.at_rest:
+                    measure = partial(strained_clearance, surface)
+                bodies[:, a, n] = measure(
                     line, given, turn, shift, radius, self.exact_within_mm, self.horizon_mm
                 )
         pairs = [
@@ -140,7 +149,7 @@ class BatchedScene:
         range_mm: float,
         arms: Mapping[str, torch.Tensor] | None = None,
         own: str | None = None,
-        poses: Mapping[str, torch.Tensor] | None = None,
+        poses: Mapping[str, torch.Tensor] | Placement | None = None,
     ) -> RayHit:
         """First hits of rays (B, ..., 3), world frame; arms name -> (B, K, 3) stand in the way.
 
@@ -170,7 +179,7 @@ class BatchedScene:
             which = torch.where(nearer, n, which)
             face = torch.where(nearer, f, face)
             struck = torch.where(nearer, int(struck_of(body)), struck)
-            outward = surface.normals[f.clamp(min=0)] @ turn
+            outward = frames.normalise(surface.normals[f.clamp(min=0)] @ turn)
             normal = torch.where(nearer[..., None], outward, normal)
         for name, line in (arms or {}).items():
             radius, line = self.radius_mm(name), _held(line)
@@ -245,7 +254,7 @@ class BatchedScene:
         wanted: torch.Tensor,
         arms: Mapping[str, torch.Tensor] | None = None,
         own: str | None = None,
-        poses: Mapping[str, torch.Tensor] | None = None,
+        poses: Mapping[str, torch.Tensor] | Placement | None = None,
     ) -> torch.Tensor:
         """(B, M) bool: the wanted lines of sight that nothing crosses; with the compiled engine.
 
@@ -266,12 +275,12 @@ class BatchedScene:
         return clear
 
     def _inward(self, body: Body, poses) -> tuple[torch.Tensor, torch.Tensor]:
-        """World to body: rotations (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
-        pose = (poses or {}).get(body.name)
+        """World to body: linear maps (B or 1, 3, 3) and shifts (B or 1, 3), float64."""
+        pose = None if poses is None else poses.get(body.name)
         return self._at_home[body.name] if pose is None else self._inverse(pose.detach())
 
     def _inverse(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        inward = frames.invert(pose.to(self.device, torch.float64))
+        inward = torch.linalg.inv(pose.to(self.device, torch.float64))
         return inward[:, :3, :3].contiguous(), inward[:, :3, 3].contiguous()
 
     def _apart(self, first, second, radii: float) -> torch.Tensor:
@@ -288,6 +297,39 @@ class BatchedScene:
         out = torch.empty(len(line), dtype=line.dtype)
         chains_folded(line.numpy(), radius, gap, self.horizon_mm, out.numpy())
         return out
+
+
+def strained_clearance(
+    surface: CompiledSurface | TorchSurface,
+    lines: torch.Tensor,
+    given: torch.Tensor,
+    turn: torch.Tensor,
+    shift: torch.Tensor,
+    radius: float,
+    within: float,
+    horizon: float,
+) -> torch.Tensor:
+    """(B,) mm: clearance of arms from a body whose frame is a strained one, see `clearance`.
+
+    The surface is plane between the arm and its nearest point, so that a distance d along the
+    normal n of the body's frame is d / |T^T n| in the world, T the linear map from the world. n is
+    the slope of the distance as the arm is shifted (the envelope theorem), by forward differences.
+    """
+    place = (radius, within, horizon)
+    least = surface.clearance(lines, given, turn, shift, *place)
+    slope = torch.stack(
+        [
+            surface.clearance(lines, given, turn, shift + step, *place) - least
+            for step in SLOPE_MM * torch.eye(3, dtype=shift.dtype, device=shift.device)
+        ],
+        1,
+    ).to(turn.dtype)
+    size = slope.norm(dim=1, keepdim=True)
+    normal = slope / size.clamp(min=1e-9)
+    scale = (normal[:, None] @ turn)[:, 0].norm(dim=1)
+    found = (least + radius) / scale.to(least.dtype) - radius
+    known = (size[:, 0] > 0.5 * SLOPE_MM) & (least < horizon - SLOPE_MM)
+    return torch.where(known, found, least).clamp(max=horizon)
 
 
 class CompiledSurface:

@@ -30,7 +30,8 @@ from surgisoft.scene.capsules import (
     segment_distance,
 )
 from surgisoft.scene.inside import points_inside
-from surgisoft.scene.mesh import Body
+from surgisoft.scene.mesh import Body, Mesh
+from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import RayHit, Struck, struck_of
 
 PROBE_WIDTH_MM = 1e-3
@@ -227,6 +228,7 @@ class CollisionChecker:
         self.bodies = tuple(bodies)
         self.horizon_mm = float(horizon_mm)
         self._inward = [frames.invert(body.pose) for body in bodies]
+        self._levels: dict[tuple[int, int], tuple[Mesh, fcl.BVHModel]] = {}
         self._objects = [
             _placed(surface_model(body.mesh.vertices_mm, body.mesh.faces), body.pose)
             for body in bodies
@@ -235,6 +237,35 @@ class CollisionChecker:
     def __reduce__(self):
         """Pickle the bodies: FCL's objects cannot be pickled, so a copy builds its own."""
         return type(self), (self.bodies, self.horizon_mm)
+
+    def moved(self, placement: Placement, environment: int) -> CollisionChecker:
+        """The checker with the bodies where a placement puts them in one environment.
+
+        The strained surface of each level is built once and kept.
+        """
+        checker = object.__new__(type(self))  # `copy.copy` would build every surface anew
+        checker.__dict__.update(self.__dict__)
+        level = int(placement.level[environment])
+        rigid = placement.rigid[environment].detach().cpu().double().numpy()
+        strain = placement.strains[level].detach().cpu().double().numpy()
+        bodies, inward, objects = list(self.bodies), list(self._inward), list(self._objects)
+        for index, body in enumerate(self.bodies):
+            if body.name in placement.at_rest:
+                mesh, model = self._strained(index, level, strain)
+                bodies[index] = Body(body.name, body.role, mesh, rigid)
+                inward[index], objects[index] = frames.invert(rigid), _placed(model, rigid)
+        checker.bodies, checker._inward, checker._objects = tuple(bodies), inward, objects
+        return checker
+
+    def _strained(self, index: int, level: int, strain: np.ndarray) -> tuple[Mesh, fcl.BVHModel]:
+        """Mesh in the world frame at rest, strained (4, 4), and FCL's tree over it."""
+        known = self._levels.get((index, level))
+        if known is None:
+            mesh = self.bodies[index].world_mesh
+            mesh = Mesh(frames.apply(strain, mesh.vertices_mm), mesh.faces)
+            known = mesh, surface_model(mesh.vertices_mm, mesh.faces)
+            self._levels[index, level] = known
+        return known
 
     def inside(self, body: int, points_mm: np.ndarray) -> np.ndarray:
         """(N,) bool: world points (N, 3) mm inside body number `body`; never in an open mesh."""
@@ -474,9 +505,9 @@ def ray_triangles(
 class ExactScene:
     """Clearances and ray hits by FCL with the interface of `batched.BatchedScene`.
 
-    FCL evaluates one environment after the other. Bodies stand where the scene puts them. `arms`
-    maps a name to centrelines (B, K, 3) mm, world frame. An environment whose arm or ray is not
-    finite gets nan clearances and missed rays.
+    FCL evaluates one environment after the other. Bodies stand where the scene puts them, but for
+    those that `poses` move. `arms` maps a name to centrelines (B, K, 3) mm, world frame. An
+    environment whose arm or ray is not finite gets nan clearances and missed rays.
     """
 
     def __init__(
@@ -495,14 +526,16 @@ class ExactScene:
             raise unknown_name("arm", arm, self.radii_mm)
         return self.radii_mm[arm]
 
-    def clearance(self, arms: Mapping[str, torch.Tensor]) -> BatchClearance:
+    def clearance(
+        self, arms: Mapping[str, torch.Tensor], poses: Placement | None = None
+    ) -> BatchClearance:
         """Signed clearances of every pair; arms name -> (B, K, 3) mm."""
         names, first = list(arms), next(iter(arms.values()))
         pairs = list(combinations(names, 2))
         found = np.full((len(first), len(names) * (len(self.bodies) + 1) + len(pairs)), np.nan)
-        for row, shapes in zip(found, self._shapes(arms), strict=True):
+        for i, (row, shapes) in enumerate(zip(found, self._shapes(arms), strict=True)):
             if shapes is not None:
-                exact = self.checker.clearance(shapes)
+                exact = self._checker(poses, i).clearance(shapes)
                 row[:] = [
                     *(exact.bodies_mm[name, body.name] for name in names for body in self.bodies),
                     *(exact.arms_mm[pair] for pair in pairs),
@@ -520,6 +553,7 @@ class ExactScene:
         range_mm: float,
         arms: Mapping[str, torch.Tensor] | None = None,
         own: str | None = None,
+        poses: Placement | None = None,
     ) -> RayHit:
         """First hits of rays (B, ..., 3), world frame, as a `RayHit` of (B, ...) tensors."""
         origins, aims = _numpy(origins_mm), _numpy(directions)
@@ -527,8 +561,8 @@ class ExactScene:
         hits = [
             _missed(o, d, range_mm)
             if near is None or not (np.isfinite(o).all() and np.isfinite(d).all())
-            else self.checker.cast(o, d, range_mm, near, own)
-            for o, d, near in zip(origins, aims, shapes, strict=True)
+            else self._checker(poses, i).cast(o, d, range_mm, near, own)
+            for i, (o, d, near) in enumerate(zip(origins, aims, shapes, strict=True))
         ]
         parts = {name: np.stack([getattr(hit, name) for hit in hits]) for name in vars(hits[0])}
         held = {name: torch.as_tensor(part, device=self.device) for name, part in parts.items()}
@@ -539,6 +573,10 @@ class ExactScene:
                 for name, part in held.items()
             }
         )
+
+    def _checker(self, poses: Placement | None, environment: int) -> CollisionChecker:
+        """The checker with the bodies of one environment."""
+        return self.checker if poses is None else self.checker.moved(poses, environment)
 
     def _shapes(self, arms: Mapping[str, torch.Tensor]) -> list[dict[str, ArmShape] | None]:
         """Each environment's arms; None where one of them is not finite."""

@@ -295,7 +295,8 @@ def rays_to_body(
     """First hits of rays (N, 3) on a body, where they are nearer than t (N,) mm.
 
     `each` rays belong to one environment; turns (B or 1, 3, 3) and shifts (B or 1, 3): world to
-    body. Writes struck, body and face (N,), distance t (N,) and normal n (N, 3), world frame.
+    body, rigid or with strain. Writes struck, body and face (N,), distance t (N,) and normal n
+    (N, 3), world frame.
     """
     triangles, starts, lower, upper = tree
     nodes, entry = np.empty(STACK, np.int64), np.empty(STACK)
@@ -309,9 +310,13 @@ def rays_to_body(
         distance, found = _nearest_face(p, d, t[k], triangles, starts, lower, upper, nodes, entry)
         if found >= 0:
             t[k], face[k], body[k], struck[k] = distance, order[found], which, kind
-            out = normals[order[found]]
+            out, size = normals[order[found]], 0.0
             for i in range(3):
                 n[k, i] = turn[0, i] * out[0] + turn[1, i] * out[1] + turn[2, i] * out[2]
+                size += n[k, i] * n[k, i]
+            if abs(size - 1.0) > 1e-9:  # a strained body
+                for i in range(3):
+                    n[k, i] /= math.sqrt(size)
 
 
 @compiled

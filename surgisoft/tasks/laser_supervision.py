@@ -67,6 +67,10 @@ def _centred(task: LaserTask, state: TaskState, within: float) -> Tensor:
     return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
 
 
+def _seen(task: LaserTask, state: TaskState, within: float) -> Tensor:
+    return _view(state).fraction >= max(within, task.spec.limits.view_fraction)
+
+
 def _aimed(task: LaserTask, state: TaskState, within: float) -> Tensor:
     return laser_work.measured_error_mm(task, state) <= within
 
@@ -103,6 +107,7 @@ HOW = (
 LASER_EXPERIMENT = ExperimentTask(
     conditions={
         "centred": Condition("optical axis this near to the lesion (mm), in sight", 1.0, _centred),
+        "seen": Condition("this share of what is to be seen is seen (0..1)", 0.0, _seen),
         "aimed": Condition("beam's axis this near to its target (mm)", 0.5, _aimed),
         "cut": Condition("this share of the ring is cut (0..1)", 1.0, completed),
         "retracted": Condition("laser arm's chambers this near to rest (kPa)", 1.0, _retracted),

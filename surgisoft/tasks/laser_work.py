@@ -143,11 +143,19 @@ def _off_target_mm(task: LaserTask, state: TaskState, points_mm: Tensor) -> Tens
 
 
 def beam_released(task: LaserTask, state: TaskState) -> Tensor:
-    """(B,) bool: as far as is measured the beam is near its target and meets the organ, and the
-    endoscope's picture shows enough. The true pose of the arms does not enter."""
-    seen = state.world.scene.views[ENDOSCOPE].fraction >= task.spec.limits.view_fraction
+    """(B,) bool: as far as is measured the beam is near its target and meets the organ, the
+    endoscope's picture shows enough, and all arms keep the scene's clearance. The true pose of the
+    arms does not enter into where the beam goes."""
+    scene, limits = state.world.scene, task.spec.limits
+    seen = scene.views[ENDOSCOPE].fraction >= limits.view_fraction
     near = measured_error_mm(task, state) <= task.config.fire_mm
-    return seen & near & on_organ(task, state)
+    return seen & arms_clear(task, state) & near & on_organ(task, state)
+
+
+def arms_clear(task: Any, state: TaskState) -> Tensor:
+    """(B,) bool: all arms keep the scene's clearance and touch nothing; no beam is on otherwise."""
+    scene = state.world.scene
+    return (scene.clearance.least_mm >= task.spec.limits.clearance_mm) & ~scene.clearance.collides
 
 
 def on_organ(task: LaserTask, state: TaskState) -> Tensor:
@@ -156,7 +164,7 @@ def on_organ(task: LaserTask, state: TaskState) -> Tensor:
     if all(torch.equal(part.seen_mm, part.points_mm) for part in parts.values()):
         return scene.hits[LASER].on_organ  # what is measured is the truth: the ray was cast already
     seen = {name: task.world.arms[name].posed(part, part.seen_mm) for name, part in parts.items()}
-    return task.world.scene.aimed(seen, LASER).on_organ
+    return task.world.scene.aimed(seen, LASER, scene.breaths).on_organ
 
 
 def blocks(

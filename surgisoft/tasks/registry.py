@@ -17,6 +17,7 @@ from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
 from surgisoft.tasks.base import Task, TaskSpec
+from surgisoft.tasks.breathing_ablation import BREATHING_ABLATION
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
 from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
 from surgisoft.tasks.keyhole import KEYHOLE
@@ -35,6 +36,7 @@ TASKS: dict[str, TaskSpec] = {
     "circle_ablation": CIRCLE_ABLATION,
     "contour_ablation": CONTOUR_ABLATION,
     "area_ablation": AREA_ABLATION,
+    "breathing_ablation": BREATHING_ABLATION,
     "two_laser_ring": TWO_LASER_RING,
     "keyhole_ablation": KEYHOLE_ABLATION,
 }

@@ -18,7 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
 from surgisoft.tasks.circle_ablation import RING_DIRECTION, RING_PLACE
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
-from surgisoft.tasks.laser_work import BEAM_ERROR, VIEW, VIEW_ERROR, pointing
+from surgisoft.tasks.laser_work import BEAM_ERROR, VIEW, VIEW_ERROR, arms_clear, pointing
 from surgisoft.tasks.observations import (
     TIME,
     Block,
@@ -282,7 +282,8 @@ class TwoLaserRing:
 
     def released(self, state: TaskState[SharedCut]) -> Tensor:
         """(B, 2) bool: as far as is measured the beam is near its target, clear of the other arms
-        and meets the organ, and the endoscope sees its target and enough of the ring."""
+        and meets the organ, the endoscope sees its target and enough of the ring, and all arms
+        keep the scene's clearance."""
         fraction = state.world.scene.views[ENDOSCOPE].fraction
         seen = (fraction >= self.spec.limits.view_fraction)[:, None] & self.spots_seen(state)
         near = self.measured_errors_mm(state) <= self.config.fire_mm
@@ -290,6 +291,7 @@ class TwoLaserRing:
         exact = arms is state.world.arms  # the rays were cast already
         hit = [hits[n] if exact else self.scene.aimed(arms, n) for n in LASERS]
         clear = self.beam_clearance_mm(state, arms) >= self.config.beam_mm
+        clear = clear & arms_clear(self, state)[:, None]
         return seen & near & clear & torch.stack([one.on_organ for one in hit], 1)
 
     def advance(

@@ -152,7 +152,8 @@ def test_one_name_means_one_thing_in_every_command():
         if "--output" in option.opts:
             assert kind == (option.metavar or "a metavar", False, True), command
             continue
-        for name in set(option.opts) - {"--map", "--resume"}:  # a file here, a choice there
+        # A file, a run or a model here, a choice there.
+        for name in set(option.opts) - {"--map", "--resume", "--preflight"}:
             assert told.setdefault(name, kind) == kind, f"{name} of {command}"
 
 
@@ -300,3 +301,19 @@ def test_next_experiment_records_on_a_simulated_rig_and_asks_a_person_at_a_real_
     assert run([*command, "--rig", "virtual:seed=3"]) == 0
     recording = load_recording(new)
     assert recording.gravity == pytest.approx([0.0, -0.42, 0.9075], abs=1e-3), "rolled by 90 deg"
+
+
+def test_an_interrupted_experiment_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    from types import SimpleNamespace
+
+    from surgisoft.experiments import session
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    started = SimpleNamespace(name="liver"), tmp_path
+    monkeypatch.setattr(session, "start_experiment", lambda *_, **__: started)
+    monkeypatch.setattr(session, "finish_experiment", interrupted)
+    assert run(["experiment", "run", "liver"]) == 130
+    said = capsys.readouterr().out
+    assert f"continue with: surgisoft experiment run liver -o {tmp_path} --resume" in said

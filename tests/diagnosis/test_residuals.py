@@ -5,7 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surgisoft.diagnosis.residuals import held_out_rows, model_discrepancy, problem_of
+from surgisoft.diagnosis.residuals import (
+    held_out_rows,
+    model_discrepancy,
+    problem_of,
+    residual_table,
+)
 from surgisoft.measurement.histories import arm_spec, history_of
 from surgisoft.measurement.noise import known_noise
 from surgisoft.surrogate.fit import FitConfig, fit
@@ -81,3 +86,18 @@ def test_the_last_quarter_is_held_out():
     many = replace(few, run=np.repeat(np.arange(40), 10))
     assert held_out_rows([many]).tolist() == expected.tolist()
     assert held_out_rows([few, many]).tolist() == [*expected, *expected]
+
+
+def test_a_view_shows_the_rows_of_its_part_alone():
+    """In the table, in its history and in the problem; missing key points stay missing."""
+    pressure = walk(1200)
+    made = recording(np.zeros(len(pressure)), pressure)
+    table, held = residual_table(still_model(), [made]), held_out_rows([made])
+    for part, shown in (("training", ~held), ("held_out", held)):
+        only = table.only(part)
+        seen = np.isfinite(only.measured_mm).all((1, 2))
+        assert (seen == shown).all()
+        inside = only.history.rows(only.history.key_points).isfinite().numpy().all((1, 2))
+        assert (inside == shown).all()
+        assert shown[table.view(part).index.numpy()].all()
+    assert not held[table.training().index.numpy()].any()

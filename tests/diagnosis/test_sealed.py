@@ -17,6 +17,8 @@ from surgisoft.measurement.recordings import Recording
 from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.checkpoint import default_arm
 from surgisoft.surrogate.model import ArmModel
+from tests.diagnosis.synthetic import recording as synthetic_recording
+from tests.diagnosis.synthetic import resting_together, still_model
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,32 @@ def test_the_next_experiment(pair):
         for each in pair
     ]
     assert advice[0].to_json() == advice[1].to_json()
+
+
+@pytest.fixture(scope="module")
+def resting() -> tuple[Recording, Recording]:
+    """A recording with rests, whose scatter shows the noise; the same, noisier where held out."""
+    pressure = resting_together(3000)
+    made = synthetic_recording(0.3 * (pressure[:, 0] - 5.0), pressure, noise_mm=None)
+    held, rng = held_out_rows([made]), np.random.default_rng(2)
+    points = made.key_points_mm.copy()
+    points[held] += rng.normal(0.0, 20.0, points[held].shape)
+    return made, replace(made, key_points_mm=points)
+
+
+def test_the_noise_that_an_identification_counts_with(resting):
+    """Were the held-out rests looked at, the median of all rests would be a larger noise."""
+    problems = [identification_problem(still_model(), [each]) for each in resting]
+    assert problems[0].table.floor.source == "holds"
+    assert problems[0].floor_mm == problems[1].floor_mm
+    assert problems[0].history.noise_mm == problems[1].history.noise_mm
+    assert residual_table(still_model(), [resting[1]]).floor != problems[1].table.floor
+
+
+def test_the_noise_of_an_amended_model(resting):
+    results = [amend(still_model(), [each], "misalignment", refit="never") for each in resting]
+    assert results[0].alone.floor == results[1].alone.floor
+    assert results[0].training == results[1].training
 
 
 def test_held_out_rows_are_opened_once(pair):

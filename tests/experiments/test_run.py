@@ -103,7 +103,7 @@ def test_the_report_is_self_contained_and_fits_a_telephone(whole, tmp_path):
 def test_list_names_what_is_shipped(capsys):
     assert run(["experiment", "list"]) == 0
     out = capsys.readouterr().out
-    for name in ("liver", "multi_lesion", "fault", "sweep"):
+    for name in ("liver", "multi_lesion", "fault", "sweep", "contours", "area", "breathing"):
         assert f"{name}.toml: " in out
 
 

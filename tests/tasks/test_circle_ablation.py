@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.tasks import laser_work
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
+from surgisoft.tasks.laser_work import safety
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
@@ -77,7 +79,7 @@ def test_the_beam_waits_until_the_ring_is_seen(cut):
     assert states[60].goal.fired.all()
 
 
-@pytest.mark.parametrize("what", ["view", "aim", "blocked"])
+@pytest.mark.parametrize("what", ["view", "aim", "blocked", "close", "contact", "nothing known"])
 def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
     """A state in which the beam fires, changed in one respect."""
     state = rows(cut[0][80], torch.tensor([0]))
@@ -89,6 +91,11 @@ def test_each_part_of_the_interlock_stops_the_beam(quick, cut, what):
         scene = replace(scene, views={"endoscope": low})
     elif what == "blocked":
         scene = replace(scene, hits={"laser": replace(scene.hit, struck=torch.tensor([4]))})
+    elif what in ("close", "contact", "nothing known"):
+        least = {"close": quick.spec.limits.clearance_mm - 1e-3, "contact": 50.0}
+        touch = torch.tensor([what == "contact"])
+        close = torch.tensor([least.get(what, math.nan)])
+        scene = replace(scene, clearance=SimpleNamespace(least_mm=close, collides=touch))
     else:
         goal = replace(goal, done=goal.done + 3)
     changed = replace(state, goal=goal, world=replace(state.world, scene=scene))
@@ -133,6 +140,8 @@ def test_a_collision_ends_the_episode_and_is_no_success(quick):
     state = replace(state, world=replace(state.world, scene=hit))
     assert quick.ended(state).tolist() == [False, True]
     assert quick.measures(state)["success"].tolist() == [0.0, 0.0]
+    whole = torch.tensor([True, True])
+    assert safety(state, whole)["success"].tolist() == [1.0, 0.0]
     for terms in quick.rewards(state).values():
         assert terms["contact"].tolist() == [0.0, -1.0]
 

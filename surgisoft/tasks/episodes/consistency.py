@@ -69,7 +69,11 @@ SHAPES: dict[type, dict[str, tuple[Shape, str]]] = {
         "sample": (("C",), "i"),
         "dose_j_per_mm2": (("C",), "f"),
     },
-    BodyLog: {"vertices_mm": (("V", 3), "f"), "faces": (("F", 3), "i")},
+    BodyLog: {
+        "vertices_mm": (("V", 3), "f"),
+        "faces": (("F", 3), "i"),
+        "motion": (("T", 4, 4), "f"),
+    },
     Event: {},
 }
 """Shape and kind (floating point, integer, truth value) of every array of a log and its parts."""
@@ -95,7 +99,7 @@ INTEGERS = {EpisodeLog: ("seed", "episode"), DoseLog: ("stations",)}
 FINITE = {
     EpisodeLog: ("time_s", "path_mm"),
     ArmLog: ("mount",),
-    BodyLog: ("vertices_mm",),
+    BodyLog: ("vertices_mm", "motion"),
     DoseLog: ("points_mm", "normals", "areas_mm2", "offset_mm", "dose_j_per_mm2"),
 }
 """Arrays without NaN; the other ones have it where something does not apply or has failed."""

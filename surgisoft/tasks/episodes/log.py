@@ -22,6 +22,7 @@ from surgisoft.tasks.episodes.parts import (
     DoseLog,
     Event,
 )
+from surgisoft.tasks.world.respiration import MOVING
 from surgisoft.tasks.world.scene import SceneEngine
 
 NO_DIAMETER_MM = 15.0
@@ -99,6 +100,10 @@ class EpisodeLog:
             for piece, back in zip(pieces, closed, strict=True)
             if len(piece)
         ]
+
+    def body(self, name: str) -> BodyLog:
+        """The body of that name."""
+        return next(body for body in self.bodies if body.name == name)
 
     @property
     def rows(self) -> int:
@@ -246,6 +251,8 @@ class EpisodeRecorder:
         for name, hit in near.hits.items():
             row |= {f"end/{name}": hit.point_mm, f"hits/{name}": hit.on_organ}
         row |= {f"view/{name}": view.fraction for name, view in near.views.items()}
+        if near.breaths is not None:
+            row["motion"] = self.task.world.scene.placement(near.breaths).map.float()
         if near.dose is not None:
             delivered = near.dose.delivered_j
             delivered = delivered.reshape(len(delivered), -1).unbind(1)
@@ -297,7 +304,10 @@ class EpisodeRecorder:
             "clearance_mm": rows["clearance"],
             "views": _below(rows, "view/"),
             "dose": self._dose_log(near) if near.lasers else None,
-            "bodies": tuple(_body(body) for body in near.geometry.bodies),
+            "bodies": tuple(
+                _body(body, rows.get("motion") if body.role in MOVING else None)
+                for body in near.geometry.bodies
+            ),
         }
 
     def _beam_log(self, name: str, rows: Mapping[str, np.ndarray]) -> BeamLog:
@@ -356,10 +366,10 @@ def _limits(near: SceneEngine) -> dict[str, float]:
     return {name: float(getattr(limits, name)) for name in vars(limits)}
 
 
-def _body(body) -> BodyLog:
+def _body(body, motion: np.ndarray | None = None) -> BodyLog:
     mesh = body.world_mesh
     vertices, faces = mesh.vertices_mm.astype(np.float32), mesh.faces.astype(np.int32)
-    return BodyLog(body.name, body.role, vertices, faces)
+    return BodyLog(body.name, body.role, vertices, faces, motion)
 
 
 if TYPE_CHECKING:

@@ -143,6 +143,14 @@ class BodyLog:
     role: str
     """`organ`, `keep-out` or `support`."""
     vertices_mm: np.ndarray
-    """(V, 3) mm, world frame."""
+    """(V, 3) mm, world frame; of a body that moves at rest."""
     faces: np.ndarray
     """(F, 3) int32."""
+    motion: np.ndarray | None = None
+    """(T, 4, 4): world frame at rest to world frame in each row, affine, mm; None: at rest."""
+
+    def moved_mm(self, row: int) -> np.ndarray:
+        """(V, 3) mm: the vertices in a row of the log."""
+        if self.motion is None:
+            return self.vertices_mm
+        return self.vertices_mm @ self.motion[row, :3, :3].T + self.motion[row, :3, 3]

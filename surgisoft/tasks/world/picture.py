@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from torch import Tensor
@@ -55,10 +56,10 @@ class WorldPicture:
         away = reach / (FILLED * math.tan(0.5 * FIELD_RAD))
         place = middle + away * FROM / np.linalg.norm(FROM)
         self._pose = frames.look_at(place, middle)
-        camera = Camera(FIELD_RAD, (0.0, 2.0 * away))
-        self._renderer = Renderer(
-            bodies, camera, width, height, lamp_half_mm=2.0 * away, round_view=False
-        )
+        self._scene, self._bodies = scene, bodies
+        self._optics = (Camera(FIELD_RAD, (0.0, 2.0 * away)), width, height)
+        self._lamp_half_mm = 2.0 * away
+        self._renderer = self._renderer_of(bodies)
 
     def image(self, state: WorldState, reference_mm: Tensor | None = None) -> np.ndarray:
         """(height, width, 3) uint8: the first environment of a state.
@@ -73,7 +74,26 @@ class WorldPicture:
         if reference_mm is not None:
             point = reference_mm[0, -1].cpu().double().numpy()
             glow = np.stack([point, point + np.array([0.0, 0.0, 0.1])])
-        return self._renderer.image(self._pose, arms, beam_mm=glow, beam_radius_mm=GLOW_MM)
+        renderer = self._renderer
+        if state.scene.breaths is not None and isinstance(self._scene, SceneEngine):
+            renderer = self._renderer_of(self._moved(self._scene, state))
+        return renderer.image(self._pose, arms, beam_mm=glow, beam_radius_mm=GLOW_MM)
+
+    def _renderer_of(self, bodies: Sequence[Body]) -> Renderer:
+        return Renderer(bodies, *self._optics, lamp_half_mm=self._lamp_half_mm, round_view=False)
+
+    def _moved(self, scene: SceneEngine, state: WorldState) -> list[Body]:
+        """The bodies where they are in the first environment."""
+        placement = scene.placement(state.scene.breaths)
+        assert placement is not None, "a scene with breaths has bodies that move"
+        now = placement.map[0].cpu().numpy()
+        moved = []
+        for body in self._bodies:
+            mesh = body.world_mesh
+            if body.name in placement.at_rest:
+                mesh = Mesh(frames.apply(now, mesh.vertices_mm), mesh.faces)
+            moved.append(Body(body.name, body.role, mesh))
+        return moved
 
 
 def _floor() -> Body:

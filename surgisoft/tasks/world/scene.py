@@ -18,11 +18,13 @@ from surgisoft.scene.capsules import BatchClearance, segment_distance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mesh import Body
+from surgisoft.scene.moving import Placement
 from surgisoft.scene.rays import RayHit
 from surgisoft.scene.spec import PHANTOM as PHANTOM
 from surgisoft.tasks.world.arm import ArmPart, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.respiration import Breaths, OrganMotion, Respiration
 from surgisoft.tasks.world.treatment import Plan, rings
 
 GEOMETRIES = ("batched", "fcl")
@@ -59,6 +61,8 @@ class SceneState:
     watched: Tensor | None = None
     """(B,) int64: number of the points that the endoscopes have to see from the next step on; a
     task sets it where its target moves, and it begins with the lesion's number."""
+    breaths: Breaths | None = None
+    """Respiration of the organ; None: it does not move."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
@@ -132,10 +136,13 @@ class SceneEngine:
         engine: str | None = None,
         vary: Randomisation = NOT_RANDOMISED,
         plan: Plan | None = None,
+        respiration: Respiration | None = None,
+        time_s: float = 0.0,
     ):
         """`engine` is as for `BatchedScene`: compiled on the CPU, torch anywhere.
 
         plan: what is to be treated; None: rings around the scene's lesion (`treatment.rings`).
+        respiration: how the organ moves; None: not at all. time_s: longest episode, s, for it.
         """
         config, spec, self.device = config or SceneEngineConfig(), scene.spec, torch.device(device)
         radii = {name: 0.5 * mount.diameter_mm for name, mount in spec.arms.items()}
@@ -145,6 +152,10 @@ class SceneEngine:
         self.camera = spec.camera.camera()
         self.beam_mm = spec.laser.standoff_mm[1] + BEAM_BEYOND_MM
         self.organ = scene.bodies.index(scene.organ)
+        self.motion: OrganMotion | None = None
+        if respiration is not None:
+            about = np.array(scene.spec.lesion.centre_mm)
+            self.motion = OrganMotion(respiration, scene.bodies, about, time_s, self.device)
         treated = (plan or rings)(scene, vary, config.band_mm, config.view_points)
         self.work_camera = self.camera
         if treated.field_rad is not None:
@@ -175,7 +186,10 @@ class SceneEngine:
         if self.lesions > 1:
             stream, draw = stream.uniform(0.0, float(self.lesions))
             lesion = draw.long().clamp(max=self.lesions - 1)
-        scene = self._look(parts, lesion, lesion)
+        breaths = None
+        if self.motion is not None:
+            stream, breaths = self.motion.start(stream)
+        scene = self._look(parts, lesion, lesion, breaths)
         if not self.lasers:
             return stream, scene
         dose = self.ablation.start(*self._beams(scene, parts), lesion)
@@ -189,7 +203,8 @@ class SceneEngine:
         dt_s: float,
     ) -> SceneState:
         """The scene after the arms moved and the beams swept with `power_w` for dt_s."""
-        after = self._look(parts, scene.lesion, scene.watched)
+        breaths = None if scene.breaths is None else scene.breaths.after(dt_s)
+        after = self._look(parts, scene.lesion, scene.watched, breaths)
         if scene.dose is None:
             return replace(after, donated=scene.donated)
         beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
@@ -209,11 +224,23 @@ class SceneEngine:
         in_place = scene.donated and overwritable(dose.dose)
         return self.ablation.reset(dose, mask, *beams, in_place, scene.lesion)
 
-    def aimed(self, parts: Mapping[str, ArmPart], laser: str = LASER) -> RayHit:
+    def placement(self, breaths: Breaths | None, ahead_s: float = 0.0) -> Placement | None:
+        """Where the moving bodies are, `ahead_s` seconds from now; None where nothing moves."""
+        if breaths is None or self.motion is None:
+            return None
+        return self.motion.placement(self.motion.displacement_mm(breaths, ahead_s)[0])
+
+    def aimed(
+        self, parts: Mapping[str, ArmPart], laser: str = LASER, breaths: Breaths | None = None
+    ) -> RayHit:
         """Where the beam of a laser ends, (B,), with the arms as in `parts`."""
+        return self._aimed(parts, laser, self.placement(breaths))
+
+    def _aimed(self, parts: Mapping[str, ArmPart], laser: str, poses: Placement | None) -> RayHit:
         lines = {name: part.line_mm for name, part in parts.items()}
         beam = parts[laser]
-        return self.collision.cast(beam.tip_mm, beam.tip_direction, self.beam_mm, lines, own=laser)
+        place = (beam.tip_mm, beam.tip_direction, self.beam_mm, lines, laser)
+        return self.collision.cast(*place, poses)
 
     def path_clearance_mm(
         self, parts: Mapping[str, ArmPart], laser: str, target_mm: Tensor
@@ -233,18 +260,31 @@ class SceneEngine:
         ]
         return torch.stack(away).amin(0)
 
-    def _look(self, parts: Mapping[str, ArmPart], lesion: Tensor, watched: Tensor) -> SceneState:
+    def _look(
+        self,
+        parts: Mapping[str, ArmPart],
+        lesion: Tensor,
+        watched: Tensor,
+        breaths: Breaths | None,
+    ) -> SceneState:
         lines = {name: part.line_mm for name, part in parts.items()}
-        clearance = self.collision.clearance(lines)
-        hits = {name: self.aimed(parts, name) for name in self.lasers}
-        ring = (self.looks_mm[watched], self.look_normals[watched])
-        views = {name: self._seen(parts[name], name, ring, lines) for name in self.endoscopes}
-        return SceneState(clearance, hits, None, views, lesion, watched)
+        poses = self.placement(breaths)
+        clearance = self.collision.clearance(lines, poses)
+        hits = {name: self._aimed(parts, name, poses) for name in self.lasers}
+        points, normals = self.looks_mm[watched], self.look_normals[watched]
+        if poses is not None:
+            points, normals = poses.points(points), poses.normals(normals)
+        ring = (points, normals)
+        views = {n: self._seen(parts[n], n, ring, lines, poses) for n in self.endoscopes}
+        return SceneState(clearance, hits, None, views, lesion, watched, breaths)
 
-    def _seen(self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines) -> View:
+    def _seen(
+        self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines, poses: Placement | None
+    ) -> View:
         """What an endoscope sees of the ring's points and normals (B, M, 3)."""
         at = (eye.tip_mm, eye.tip_direction)
-        return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name)
+        moved = {} if poses is None else {"poses": poses}
+        return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name, **moved)
 
     def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
         """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.
@@ -252,10 +292,14 @@ class SceneEngine:
         With L lasers (B, L, 3), (B, L, 3) and (B, L), in the order of `lasers`.
         """
         each = []
+        poses = self.placement(scene.breaths)
         for name in self.lasers:
-            hit = scene.hits[name]
+            hit, aim = scene.hits[name], parts[name].tip_direction
             on = hit.on_organ & (hit.body == self.organ)
-            each.append((hit.point_mm, parts[name].tip_direction, on))
+            point = hit.point_mm
+            if poses is not None:  # the dose is stored in the frame of the organ at rest
+                point, aim = poses.at_rest_of(point), poses.directions_at_rest(aim)
+            each.append((point, aim, on))
         if len(each) == 1:
             return each[0]
         return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))

@@ -32,6 +32,7 @@ from surgisoft.tasks.world.arm import (
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream
+from surgisoft.tasks.world.respiration import Respiration
 from surgisoft.tasks.world.scene import (
     ObstacleEngine,
     Power,
@@ -255,13 +256,16 @@ def scene_world(
     arm: str | Path | None = None,
     agents: Sequence[str] | None = None,
     plan: Plan | None = None,
+    respiration: Respiration | None = None,
+    time_s: float = 0.0,
     feed: Feed | None = None,
 ) -> World:
     """World of a scene (or its folder): its bodies and its arms, named as in the scene.
 
     arm: a model for all arms instead of those that the scene names, as for `named_arm`. agents:
     names of the arms that a task drives, the others are passive; None: all arms. plan: what is to
-    be treated; None: a ring around the scene's lesion. feed: see `World`.
+    be treated; None: a ring around the scene's lesion. respiration: how the organ moves, in
+    episodes of up to time_s seconds; None: not at all. feed: see `World`.
     """
     config = config or WorldConfig()
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
@@ -276,7 +280,8 @@ def scene_world(
             _check_length(model, mount, scene, arm)
         arms[arm_name] = Mounted(model, pose, shaft_mm=mount.shaft_mm)
     vary = config.randomisation
-    around = SceneEngine(scene, config.scene_engine, device, engine, vary, plan)
+    given = (config.scene_engine, device, engine, vary, plan, respiration, time_s)
+    around = SceneEngine(scene, *given)
     passive = [name for name in arms if name not in agents]
     return World(arms, config, around, device, passive, feed)
 

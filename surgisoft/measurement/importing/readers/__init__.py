@@ -10,7 +10,15 @@ from pathlib import Path
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.importing.readers import lerobot, mcap, motive, parquet, text
+from surgisoft.measurement.importing.readers import (
+    arrays,
+    c3d,
+    lerobot,
+    mcap,
+    motive,
+    parquet,
+    text,
+)
 
 AUTO = "auto"
 """The format that stands for: by the name's ending, else text."""
@@ -22,17 +30,24 @@ READERS: dict[str, Reader] = {
     "parquet": parquet.READER,
     "motive": motive.READER,
     "mcap": mcap.READER,
+    "c3d": c3d.READER,
+    "matlab": arrays.MATLAB,
+    "hdf5": arrays.HDF5,
     "lerobot": lerobot.READER,
 }
 """The readers of this package."""
 
+BINARY = ("c3d", "matlab", "hdf5")
+"""Readers whose files are never text: a text with their ending is read as text."""
+
 NOT_READ = {
-    "c3d": "a C3D file (motion capture)",
     "bag": "a ROS bag",
     "db3": "a ROS 2 bag in SQLite ('ros2 bag convert' makes MCAP of it)",
-    "mat": "a MATLAB file",
-    "h5": "an HDF5 file",
-    "hdf5": "an HDF5 file",
+    "trc": "a TRC file (OpenSim)",
+    "mot": "a motion file of OpenSim",
+    "vsk": "a Vicon skeleton",
+    "tdms": "a LabVIEW TDMS file",
+    "npz": "NumPy arrays",
     "xlsx": "an Excel workbook",
     "xls": "an Excel workbook",
 }
@@ -73,7 +88,7 @@ def chosen(path: Path, role: FileRole) -> Reader:
         return reader(role.format)
     for name in formats()[1:]:
         if path.suffix.lower() in (known := reader(name)).suffixes:
-            return known
+            return known if name not in BINARY or _is_binary(path) else text.READER
     kind = NOT_READ.get(path.suffix.lower().removeprefix("."))
     if kind and _is_binary(path):
         raise InputError(f"{path}: {kind}, which no reader reads; {ADVICE}")

@@ -1,0 +1,238 @@
+"""The interlock as a property: whatever policies do, the beam is never on where it must not be."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from benchmarks.interlock import TIGHT_MM, Audit, attack, laser_tasks, varied
+from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.errors import InputError
+from surgisoft.experiments.phases import RUNNING, PhasedTask
+from surgisoft.experiments.spec import load_experiment
+from surgisoft.rig import SafeRig, VirtualRig
+from surgisoft.rig.safety import RigStopped, Safety
+from surgisoft.tasks.base import Episodes
+from surgisoft.tasks.path_following import FollowConfig
+from surgisoft.tasks.registry import TASKS
+from surgisoft.tasks.track import TrackConfig, track_circle
+from tests.experiments.tiny import TINY, write
+
+RIG = RigConfig(seed=1, settle_s=0.2)
+
+
+LONGER = {"contour_ablation", "keyhole_ablation"}
+"""Tasks that `python -m benchmarks.interlock` attacks and the suite does not: their beam is
+released by the same function as that of circle_ablation, and they take longer until it is on."""
+
+
+@pytest.mark.parametrize("name", sorted({*laser_tasks()} - LONGER))
+def test_no_policy_turns_the_beam_on_where_it_must_be_off(name):
+    """A clearance that the expert just keeps, late actions, noise and displaced mounts."""
+    found = attack(varied(name, clearance_mm=TIGHT_MM), 8, 62, seed=1, warm=42)
+    assert found.broken == []
+    assert found.fired > 10, "the beam has to be on at times, or nothing is tested"
+    for reason in ("out of sight", "too close", "off the path"):
+        assert found.unsafe[reason] > 0, reason
+
+
+def test_no_policy_turns_the_beam_on_where_it_must_be_off_on_the_rig():
+    moved = on_rig(varied("circle_ablation", clearance_mm=TIGHT_MM), RIG)
+    found = attack(moved, 2, 60, seed=3, without=("NaN",), warm=42)
+    assert found.broken == []
+    assert found.fired > 5
+
+
+@pytest.fixture(scope="module")
+def phased(tmp_path_factory):
+    """A circle ablation in two phases, of which the second permits the beam."""
+    text = TINY.replace("time_s = 0.5", f"time_s = 9.0\nclearance_mm = {TIGHT_MM}")
+    spec = load_experiment(write(tmp_path_factory.mktemp("spec"), text))
+    base = varied("circle_ablation")
+    return PhasedTask(TASKS[base.name].experiment.supervise(base), spec), base, spec
+
+
+def test_an_experiments_limit_holds_in_all_its_phases(phased):
+    task, base, spec = phased
+    audit = Audit(base, clearance_mm=spec.limits.clearance_mm)
+    found = attack(task, 8, 62, seed=1, warm=42, audit=audit, base=base)
+    assert found.broken == []
+    assert found.fired > 10
+    assert found.unsafe["too close"] > 5
+
+
+class Drawn:
+    """A supervision whose answers are drawn; keeps whether the beam was let on."""
+
+    def __init__(self, base, sight, clearance, collides, fires):
+        self.task, self.clearance_limit_mm = base, 1.0
+        self.answers = sight, clearance, collides, fires
+        self.let_on = None
+
+    def in_sight(self, state):
+        return self.answers[0]
+
+    def clearance_mm(self, state):
+        return self.answers[1]
+
+    def collides(self, state):
+        return self.answers[2]
+
+    def fires(self, state):
+        return self.answers[3]
+
+    def fired(self, state):
+        return state.goal.fired
+
+    def advance(self, state, actions, fired):
+        self.let_on = fired
+        return state
+
+
+GOOD = {
+    "sight": True,
+    "clearance": 25.0,
+    "collides": False,
+    "fires": True,
+    "phase": 1,
+    "reason": RUNNING,
+    "failed": False,
+}
+"""A state in which the beam may be on."""
+BAD = {
+    "sight": st.just(False),
+    "clearance": st.one_of(
+        st.sampled_from([TIGHT_MM - 1e-3, 1.0, 0.0, -5.0, math.nan, -math.inf]),
+        st.floats(-5.0, TIGHT_MM - 1e-3),
+    ),
+    "collides": st.just(True),
+    "fires": st.just(False),
+    "phase": st.sampled_from([0, 2]),
+    "reason": st.sampled_from([1, 2, 3]),
+    "failed": st.just(True),
+}
+"""For each condition what keeps the beam off, whatever the others are."""
+ROW = st.sets(st.sampled_from(sorted(BAD)), max_size=2).flatmap(
+    lambda names: st.fixed_dictionaries({name: BAD[name] for name in names})
+)
+
+
+@pytest.fixture(scope="module")
+def start(phased):
+    return Episodes(phased[0]).seeded(0, 4)
+
+
+@settings(deadline=None)
+@example(flaws=[{}, {"sight": False}, {"collides": True}, {"failed": True}], room=0.0)
+@example(flaws=[{}, {"clearance": math.nan}, {"fires": False}, {"reason": 1}], room=0.0)
+@given(flaws=st.lists(ROW, min_size=4, max_size=4), room=st.floats(0.0, 100.0))
+def test_the_beam_needs_every_condition_at_once(phased, start, flaws, room):
+    """Phase, no abort, sight, clearance, no contact, finite arms, and the task itself."""
+    _, base, spec = phased
+    drawn = [GOOD | {"clearance": TIGHT_MM + room} | flaw for flaw in flaws]
+    column = {name: torch.tensor([row[name] for row in drawn]) for name in GOOD}
+    names = ("sight", "clearance", "collides", "fires")
+    supervision = Drawn(base, *(column[name] for name in names))
+    task = PhasedTask(supervision, spec)
+    goal = replace(start.goal, phase=column["phase"], reason=column["reason"])
+    world = replace(start.world, failed=column["failed"])
+    task.advance(replace(start, goal=goal, world=world), {})
+    assert supervision.let_on.tolist() == [not flaw for flaw in flaws]
+
+
+def test_a_command_that_is_no_number_ends_an_episode_with_the_beam_off():
+    task = varied("circle_ablation")
+    episodes = Episodes(task)
+    state = episodes.seeded(0, 2)
+    bad = {name: torch.zeros(2, 3) for name in task.agents}
+    bad["laser"][0, 1] = math.nan
+    state, outcome = episodes.step(state, bad)
+    assert outcome.terminated.tolist() == [True, False]
+    assert not task.fires(state)[0]
+    after, _ = episodes.step(state, {name: torch.zeros(2, 3) for name in task.agents})
+    assert not after.goal.fired[0]
+    assert float(after.world.scene.dose.delivered_j[0]) == 0.0
+
+
+class Bench:
+    """A real bench as far as anyone can tell: a simulated arm, and what its valves were sent."""
+
+    def __init__(self):
+        self.inner = VirtualRig(0)
+        for name in ("unit", "chambers", "key_planes", "limits", "period_s", "arm", "payload_g"):
+            setattr(self, name, getattr(self.inner, name))
+        self.gravity = self.inner.gravity
+        self.sent, self.vents = [], 0
+
+    def reset(self):
+        self.inner.reset()
+
+    def command(self, pressures):
+        self.sent.append((self.inner.time_s, np.array(pressures)))
+        self.inner.command(pressures)
+
+    def wait(self, seconds):
+        self.inner.wait(seconds)
+
+    def read(self):
+        return self.inner.read()
+
+    def vent(self):
+        self.vents += 1
+
+
+BRIEF = TrackConfig(FollowConfig(loop_s=2.0, approach_s=1.0))
+SHAPES = {
+    "random": lambda rng, shape: rng.uniform(-3.0, 3.0, shape),
+    "one end": lambda rng, shape: np.full(shape, 100.0),
+    "back and forth": lambda rng, shape: rng.choice([-100.0, 100.0], shape),
+    "1e30": lambda rng, shape: rng.choice([-1e30, 1e30], shape),
+    "infinite": lambda rng, shape: rng.choice([-np.inf, np.inf], shape),
+    "NaN": lambda rng, shape: np.where(rng.random(shape) < 0.3, np.nan, 1.0),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_pressure_and_rate_on_a_real_bench_keep_their_limits(shape):
+    """A policy of a task through the safety wrapper; NaN ends the run vented."""
+    bench, safety = Bench(), Safety(lowest=-8.0, highest=30.0, rate=40.0)
+    moved = on_rig(
+        track_circle(BRIEF), RigConfig(settle_s=0.2), lambda config, trial: SafeRig(bench, safety)
+    )
+    (arm,) = moved.world.arms.values()
+    rng, episodes = np.random.default_rng(0), Episodes(moved)
+
+    def drive():
+        with arm.real:
+            state = episodes.seeded(0, 1)
+            for _ in range(25):
+                action = torch.tensor(SHAPES[shape](rng, (1, 3)), dtype=torch.float32)
+                state, _ = episodes.step(state, {"arm": action})
+
+    if shape == "NaN":
+        with pytest.raises(RigStopped, match="no valid command for"):
+            drive()
+    else:
+        drive()
+    assert bench.vents >= 1
+    values = np.array([pressures for _, pressures in bench.sent])
+    times = np.array([time for time, _ in bench.sent])
+    assert np.isfinite(values).all()
+    assert values.min() >= -8.0
+    assert values.max() <= 30.0
+    # 40 kPa/s over any stretch, and one period's worth at its begin.
+    for ahead in (1, 5, 20):
+        moved_kPa = np.abs(values[ahead:] - values[:-ahead]).max(1)
+        passed = times[ahead:] - times[:-ahead]
+        assert (moved_kPa <= 40.0 * (passed + 2 * bench.period_s) + 1e-6).all()
+
+
+def test_a_command_that_is_no_number_never_reaches_the_virtual_rig():
+    moved = on_rig(track_circle(BRIEF), RigConfig(settle_s=0.2))
+    state = Episodes(moved).seeded(0, 1)
+    with pytest.raises(InputError, match="expected 3 finite pressures in kPa"):
+        Episodes(moved).step(state, {"arm": torch.full((1, 3), math.nan)})

@@ -179,11 +179,13 @@ def required(training: Training) -> dict[str, Work]:
         found["clearance"] += times(CAPSULE, segments**2 * arms * (arms - 1) / 2)
         found["clearance"] += times(CAPSULE, segments**2 / 2 * arms)
     if engine:
-        rays = around.rings_mm.shape[1]
+        # Points outside of the picture need no line of sight.
+        views = training.env.state.world.scene.views.values()
+        rays = sum((v.visible | v.hidden).float().sum(1).mean().item() for v in views)
         blocking = times(CAPSULE, segments * arms)
-        found["beam"] += times(TREE, 1) + blocking
+        found["beam"] += times(TREE + blocking, len(around.lasers))
         found["view"] += times(TREE, rays) + times(blocking, rays)
-        lit = math_pi_lit(around.ablation)
+        lit = samples_lit(around.ablation)
         found["dose"] += Work(scalar=60 * lit, bytes=lit * (7 * 8 + 3 * FLOAT))
         found["dose"] += Work(
             scalar=4 * around.ablation.patch.stations, bytes=FLOAT * around.ablation.patch.stations
@@ -227,7 +229,7 @@ def _arm_work(arm: ModelArm) -> Work:
     return found + Work(bytes=2 * FLOAT * (3 * points + 6 * arm.key_points + 12 * arm.chambers))
 
 
-def math_pi_lit(ablation: AblationMap) -> float:
+def samples_lit(ablation: AblationMap) -> float:
     """Samples that the beam lights at once."""
     patch = ablation.patch
     return np.pi * (REACH_WAISTS * ablation.waist_mm) ** 2 / float(np.mean(patch.areas_mm2))

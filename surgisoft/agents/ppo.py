@@ -9,11 +9,14 @@ with the joint observation in the critic as in MAPPO, Yu et al. 2022).
 from __future__ import annotations
 
 import contextlib
+import copy
+import functools
 import io
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -79,9 +82,25 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         for group in ppo.optimizer.param_groups:
             # One call for all weights instead of a dozen small ones for each.
             group["fused"] = True
+        each = ppo.storage.mini_batch_generator
+        ppo.storage.mini_batch_generator = functools.partial(gathered_once, each)
         ppo.train_mode()
         by_agent[agent] = ppo
     return by_agent
+
+
+def gathered_once(
+    generator: Callable[..., Iterator[Any]], batches: int, epochs: int
+) -> Iterator[Any]:
+    """rsl-rl's minibatches, gathered in the first epoch and given again in the others.
+
+    rsl-rl draws one order for all epochs but gathers every minibatch anew in each, which is a
+    tenth of an update.
+    """
+    held = list(generator(batches, 1))
+    for _ in range(epochs):
+        for batch in held:
+            yield copy.copy(batch)
 
 
 def set_noise(ppo: PPO, preset: Preset, progress: float) -> None:

@@ -45,7 +45,8 @@ def path_chart(log: EpisodeLog, title: str = "path over target") -> Picture:
     """Where the beam burnt (or the point went) over where it should, in the path's plane."""
     wanted = log.path_mm if len(log.path_mm) else log.target_mm
     always = np.ones(log.rows, bool)
-    done = [(beam.end_mm, beam.on) for beam in log.beams.values()] or [(log.actual_mm, always)]
+    done = [(log.at_rest_mm(beam.end_mm), beam.on) for beam in log.beams.values()]
+    done = done or [(log.actual_mm, always)]
     middle, plane = path_plane(wanted)
     flat = [(path - middle) @ plane for path in log.paths_mm or [wanted]]
     wide = 5.0 if log.one_ring else 2.5
@@ -178,22 +179,20 @@ def dose_map(log: EpisodeLog) -> Picture | None:
     if log.dose is None:
         return None
     from matplotlib.colors import LogNorm
+    from scipy.spatial import cKDTree
 
     dose = log.dose
-    share = dose.at(-1) / dose.threshold_j_per_mm2
     middle, plane = path_plane(log.path_mm)
     flat = (dose.points_mm - middle) @ plane
-    cell = max(MAP_CELL_MM, float(np.sqrt(2.0 * dose.areas_mm2.mean())))
-    x, y = flat.T
-    edges = tuple(np.arange(each.min(), each.max() + cell, cell) for each in (x, y))
-    area, total, inside, spared = (
-        np.histogram2d(x, y, edges, weights=dose.areas_mm2 * factor)[0]
-        for factor in (1.0, share, dose.zone == LESION, dose.zone == HEALTHY)
-    )
-    mean, inside, spared = (
-        np.divide(each, area, out=np.full_like(each, np.nan), where=area > 0.0)
-        for each in (total, inside, spared)
-    )
+    apart = float(np.sqrt(2.0 * dose.areas_mm2.mean()))
+    cell = max(MAP_CELL_MM, 0.5 * apart)
+    edges = tuple(np.arange(each.min(), each.max() + cell, cell) for each in flat.T)
+    middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
+    cells = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    _, sample = cKDTree(flat).query(cells, distance_upper_bound=2.0 * apart)
+    share = np.append(dose.at(-1) / dose.threshold_j_per_mm2, np.nan)
+    zone = np.append(dose.zone, HEALTHY)
+    mean, inside, spared = share[sample], zone[sample] == LESION, zone[sample] == HEALTHY
     least = dose.cut_j_per_mm2 / dose.threshold_j_per_mm2
     with drawing():
         figure, axis = plt.subplots(figsize=(2.0 * CHART[0], 4.2))
@@ -207,9 +206,8 @@ def dose_map(log: EpisodeLog) -> Picture | None:
             shading="flat",
         )
         axis.grid(visible=False)
-        middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
-        for share_of, colour, style in ((inside, INK, "-"), (spared, MUTED, "--")):
-            known = np.nan_to_num(share_of)
+        for area, colour, style in ((inside, INK, "-"), (spared, MUTED, "--")):
+            known = area.astype(float)
             if known.min() < 0.5 < known.max():
                 axis.contour(
                     *middles, known.T, [0.5], colors=colour, linewidths=0.9, linestyles=style

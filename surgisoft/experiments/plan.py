@@ -165,7 +165,7 @@ def rig_config(setting: Setting, place: Where, arms: Sequence[str]) -> RigConfig
 
 
 def scene_of(spec: Experiment, setting: Setting) -> Scene:
-    """The scene with the setting's lesion."""
+    """The scene with the setting's lesion, in place of its own and of its contours."""
     scene = open_scene(spec.scene)
     if setting.lesion is None:
         return scene
@@ -176,6 +176,7 @@ def scene_of(spec: Experiment, setting: Setting) -> Scene:
         path_mm=(),
     )
     moved = scene.with_lesion(lesion)
+    moved = dataclasses.replace(moved, spec=dataclasses.replace(moved.spec, contours=()))
     try:
         moved.ring  # noqa: B018  (an InputError where it does not lie on the organ)
     except InputError as error:

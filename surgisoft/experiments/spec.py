@@ -343,6 +343,10 @@ def _check_whole(spec: Experiment, where: Where) -> None:
         came = "missing" if spec.in_scene else f"got '{spec.scene}'"
         expected = "a scene's folder" if spec.in_scene else f"none: {spec.scenario} has no scene"
         raise (where / "scene").error(came, expected)
+    if spec.lesions and spec.in_scene and not getattr(spec.task, "at_lesion", True):
+        raise (where / "lesions").error(
+            f"{spec.scenario} treats contours here", "contours in [task], or no contours there"
+        )
     if spec.lesions and not spec.in_scene:
         raise (where / "lesions").error("got lesions", f"none: {spec.scenario} has no scene")
     defined = [driver.name for driver in spec.drivers]

@@ -118,7 +118,7 @@ class _Paint:
     def __init__(self, log: EpisodeLog):
         self.dose = log.dose
         if self.dose is not None:
-            self.motion = log.body(self.dose.body).motion
+            self.motion = log.organ_motion
             self.tree = cKDTree(self.dose.points_mm)
             self.low = self.dose.points_mm.min(axis=0) - SAMPLE_MM
             self.high = self.dose.points_mm.max(axis=0) + SAMPLE_MM

@@ -338,9 +338,8 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
     if planned:
         plan = rr.LineStrips3D(planned, colors=[PLAN_COLOUR], radii=[PLAN_MM])
         columns.recording.log("/path/planned", plan, static=True)
-        organ = None if log.dose is None else log.body(log.dose.body).motion
-        if organ is not None and log.paths_mm:
-            _log_motion(columns, "/path/planned", organ, rows)
+        if log.organ_motion is not None and log.paths_mm:
+            _log_motion(columns, "/path/planned", log.organ_motion, rows)
     for entity, went, on in _trails(log):
         shown = np.isfinite(went).all(1) & on
         ends = np.flatnonzero(shown[1:] & shown[:-1]) + 1
@@ -349,6 +348,8 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
             line = rr.LineStrips3D.from_fields(colors=REAL_COLOUR, radii=REAL_MM)
             columns.recording.log(entity, line, static=True)
             columns.send(entity, ends, rr.LineStrips3D.columns(strips=list(pieces)))
+            if log.organ_motion is not None:
+                _log_motion(columns, entity, log.organ_motion, rows)
     count = log.targets_mm.shape[1]
     style = rr.Points3D.from_fields(colors=PLAN_COLOUR, radii=0.55)
     columns.recording.log("/path/target", style, static=True)
@@ -361,12 +362,16 @@ def _log_paths(columns: Columns, log: EpisodeLog, rows: np.ndarray) -> None:
 def _trails(log: EpisodeLog) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Entity, place (T, 3) mm and shown (T,) bool of the actual path, of each beam's where several.
 
-    With a beam the path is shown while the beam is on.
+    With a beam the path is shown while the beam is on; on an organ that moves in its frame at rest.
     """
     if len(log.beams) > 1:
-        return [(f"{TRAIL}/{name}", beam.end_mm, beam.on) for name, beam in log.beams.items()]
+        return [
+            (f"{TRAIL}/{name}", log.at_rest_mm(beam.end_mm), beam.on)
+            for name, beam in log.beams.items()
+        ]
     always = np.ones(log.rows, dtype=bool)
-    return [(TRAIL, log.actual_mm, always if log.burning is None else log.burning)]
+    place = log.at_rest_mm(log.actual_mm) if log.beams else log.actual_mm
+    return [(TRAIL, place, always if log.burning is None else log.burning)]
 
 
 def _unbroken(points_mm: np.ndarray) -> list[np.ndarray]:

@@ -110,6 +110,11 @@ class AreaAblationConfig:
     world: WorldConfig = field(default_factory=WorldConfig)
     """The simulator and its domain randomization."""
 
+    @property
+    def at_lesion(self) -> bool:
+        """Whether the scene's lesion may be what is treated; not with outlines of one's own."""
+        return not self.outlines
+
     def __post_init__(self):
         positive = ("dose_j_per_mm2", "treated_share", "spot_mm", "pitch_mm", "speed_mm_s")
         others = ("time_s", "fire_mm", "approach_s", "fine_mm", "far_mm", "preview", "spared_mm")

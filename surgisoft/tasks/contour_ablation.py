@@ -70,6 +70,11 @@ class ContourAblationConfig:
     world: WorldConfig = field(default_factory=WorldConfig)
     """The simulator and its domain randomization."""
 
+    @property
+    def at_lesion(self) -> bool:
+        """Whether the scene's lesion may be what is treated; not with contours of one's own."""
+        return not self.contours
+
     def __post_init__(self):
         positive = ("speed_mm_s", "window_mm", "field_deg", "time_s", "fire_mm", "approach_s")
         laser_work.check_config(

@@ -18,7 +18,6 @@ from surgisoft.replay.colours import (
     BLANCHED,
     CHARRED,
     LESION_COLOUR,
-    LESION_TINT,
     ROLE_COLOURS,
     tissue_colours,
 )
@@ -29,7 +28,7 @@ from surgisoft.replay.surfaces import dosed_surface
 from surgisoft.replay.viewer import take_screenshot
 from surgisoft.scene.mesh import Mesh
 from surgisoft.scene.rays import EmbreeSurface
-from surgisoft.scene.render import BODY_COLOURS
+from surgisoft.scene.render import BODY_COLOURS, LESION_TINT
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.episodes.file import save_episode
 from surgisoft.tasks.episodes.log import EpisodeRecorder

@@ -17,6 +17,8 @@ from surgisoft.tasks.breathing_ablation import (
     BreathingAblationConfig,
     success_rule,
 )
+from surgisoft.tasks.episodes.file import load_episode, save_episode
+from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.respiration import Respiration, lujan
@@ -119,6 +121,28 @@ def test_the_expert_cuts_the_ring_while_it_moves(task, cut):
     assert np.quantile(np.abs(patch.offset_mm[burnt]), 0.99) < 0.6, "on the tissue, not in space"
     errors = torch.stack([outcome.measures["tissue_error_mm"] for outcome in outcomes])
     assert errors.nanmean() < 0.1
+
+
+def test_a_log_holds_the_motion_and_shows_the_cut_on_the_organ(task, cut, tmp_path):
+    """Ends of the beam lie on the ring of the organ at rest; in space they do not."""
+    states, outcomes = cut
+    recorder = EpisodeRecorder(task, states[0], driver="scripted", seed=0)
+    for state, outcome in zip(states[1:], outcomes, strict=True):
+        recorder.step(state, outcome, {})
+    save_episode(recorder.log(), tmp_path / "episode.npz")
+    log = load_episode(tmp_path / "episode.npz")
+    beam = log.beams["laser"]
+
+    def off_ring_mm(ends):
+        away = ends[beam.on][:, None] - log.path_mm
+        return np.linalg.norm(away, axis=2).min(axis=1)
+
+    assert off_ring_mm(log.at_rest_mm(beam.end_mm)).max() < 0.6
+    assert off_ring_mm(beam.end_mm).max() > 5.0
+    support, organ = log.body("tray"), log.body(log.dose.body)
+    assert support.motion is None
+    moved = organ.moved_mm(20) - organ.vertices_mm
+    assert abs(moved[:, 1].mean() - log.measures["breath_mm"][20]) < 1.0
 
 
 def test_both_engines_agree_over_whole_episodes(task, cut):

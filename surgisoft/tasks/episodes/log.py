@@ -106,6 +106,19 @@ class EpisodeLog:
         return next(body for body in self.bodies if body.name == name)
 
     @property
+    def organ_motion(self) -> np.ndarray | None:
+        """(T, 4, 4): motion of the organ with the dose, see `BodyLog`; None where it stays."""
+        return None if self.dose is None else self.body(self.dose.body).motion
+
+    def at_rest_mm(self, points_mm: np.ndarray) -> np.ndarray:
+        """(T, 3) mm: points of each row on the organ, where they lie while it is at rest."""
+        motion = self.organ_motion
+        if motion is None:
+            return points_mm
+        inward = np.linalg.inv(motion.astype(float))
+        return np.einsum("tij,tj->ti", inward[:, :3, :3], points_mm) + inward[:, :3, 3]
+
+    @property
     def rows(self) -> int:
         """Number T of rows."""
         return len(self.time_s)

@@ -42,11 +42,16 @@ def seen_from(*eyes, at=(0.0, 0.0, 0.0)):
 
 
 def test_depth_of_a_plane():
-    poses = seen_from((20.0, -10.0, 60.0), (30.0, 5.0, 80.0))
+    """From above, and from close to it, where the plane reaches behind the camera."""
+    above = seen_from((20.0, -10.0, 60.0), (30.0, 5.0, 80.0))
+    low = seen_from((-100.0, 0.0, 20.0), at=(-40.0, 3.0, 0.0))
+    poses = torch.cat((above, low))
     depth = BatchedRenderer([floor()], {}, CAMERA).draw(poses).depth_mm[..., 0].numpy()
     for pose, found in zip(poses.numpy(), depth, strict=True):
-        down = rays() @ pose[:3, :3].T
-        expected = np.where(in_circle(), -pose[2, 3] / down[..., 2], 0.0)
+        aims = rays() @ pose[:3, :3].T
+        expected = np.where(aims[..., 2] < 0.0, -pose[2, 3] / aims[..., 2], 0.0)
+        met = pose[:3, 3] + expected[..., None] * aims
+        expected *= in_circle() & (np.abs(met[..., :2]) <= 200.0).all(-1)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -95,7 +95,7 @@ FLOORS = {
         ("field", "inside", "segmentation", "sight"),
         ("distance", "torch_queries", "camera"),
         ("batched", "collision", "render"),
-        ("reach", "spec"),
+        ("reach", "spec", "images"),
         ("lesion", "repair"),
         ("contours",),
         ("dose_patch",),

@@ -30,6 +30,12 @@ class JointEnv:
 
     def __init__(self, task: Task, count: int, seed: int, action_kPa: float, first: int = 0):
         """Episodes `first` to `first + count - 1` of a seed, each at another point of its time."""
+        images = task.world.config.endoscope_images
+        if images.kinds:
+            raise InputError(
+                f"images is '{images.images}', but policies of this trainer see vectors only: "
+                "leave it empty, or train on surgisoft.batched_env"
+            )
         keep_freed_memory()
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
         self.episodes = Episodes(task, donate=True)

@@ -32,8 +32,6 @@ MEASURED_COLOUR = rgb(MEASURED_ON_DARK)
 PREDICTED_COLOUR = rgb(RED)
 """Colour of the body that one model predicts."""
 LESION_COLOUR = (214, 172, 118)
-LESION_TINT = 0.35
-"""Share of the lesion's colour that is mixed into the organ's inside the ring."""
 PLAN_COLOUR = (255, 214, 64)
 """Colour of the reference: ring, path, target."""
 REAL_COLOUR = (70, 225, 240)

@@ -10,7 +10,7 @@ import rerun as rr
 from scipy.spatial import cKDTree
 
 from surgisoft.progress import Progress, silent
-from surgisoft.replay.colours import CONE_COLOUR, LESION_TINT
+from surgisoft.replay.colours import CONE_COLOUR
 from surgisoft.replay.recording import Columns
 from surgisoft.replay.shapes import view_cone
 from surgisoft.scene import frames
@@ -18,7 +18,7 @@ from surgisoft.scene.camera import Camera
 from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.dose_patch import LESION
 from surgisoft.scene.mesh import Body, Mesh
-from surgisoft.scene.render import Renderer
+from surgisoft.scene.render import SAMPLE_MM, Renderer, stained
 from surgisoft.tasks.episodes.log import EpisodeLog
 
 PIXELS = 240
@@ -28,12 +28,6 @@ PICTURES_HZ = 2.5
 JPEG_QUALITY = 82
 CONE_MM = 16.0
 """Length of the drawn cone (mm)."""
-LESION_LINEAR = np.array([0.62, 0.34, 0.16])
-BLANCHED_LINEAR = np.array([0.62, 0.50, 0.42])
-CHARRED_LINEAR = np.array([0.015, 0.012, 0.010])
-"""Linear colours of tissue in the picture."""
-SAMPLE_MM = 0.4
-"""A pixel takes its dose from a sample within this distance (mm)."""
 
 
 def camera_entity(endoscope: str) -> str:
@@ -128,7 +122,7 @@ class _Paint:
             self.tree = cKDTree(self.dose.points_mm)
             self.low = self.dose.points_mm.min(axis=0) - SAMPLE_MM
             self.high = self.dose.points_mm.max(axis=0) + SAMPLE_MM
-            self.tint = LESION_TINT * np.append(self.dose.zone == LESION, False)[:, None]
+            self.lesion = np.append(self.dose.zone == LESION, False)
 
     def at(self, row: int):
         """The `paint` argument of `Renderer.image` for a row; None without a dose."""
@@ -136,17 +130,14 @@ class _Paint:
             return None
         motion = self.motion
         to_rest = None if motion is None else np.linalg.inv(motion[row].astype(float))
-        share = np.append(self.dose.at(row) / self.dose.threshold_j_per_mm2, 0.0)[:, None]
+        share = np.append(self.dose.at(row) / self.dose.threshold_j_per_mm2, 0.0)
 
         def recolour(_faces, points, colours):
             if to_rest is not None:  # the dose is stored in the frame of the organ at rest
                 points = frames.apply(to_rest, points)
             near = ((points >= self.low) & (points <= self.high)).all(axis=1)
             _, sample = self.tree.query(points[near], distance_upper_bound=SAMPLE_MM)
-            heat, base = share[sample], colours[near]
-            base = base + (LESION_LINEAR - base) * self.tint[sample]
-            pale = base + (BLANCHED_LINEAR - base) * np.clip(heat, 0.0, 1.0)
-            colours[near] = np.where(heat >= 1.0, CHARRED_LINEAR, pale)
+            colours[near] = stained(colours[near], self.lesion[sample], share[sample])
             return colours
 
         return {self.dose.body: recolour}

@@ -17,7 +17,6 @@ from surgisoft.replay.colours import (
     BACKGROUND,
     BEAM_COLOUR,
     LESION_COLOUR,
-    LESION_TINT,
     PLAN_COLOUR,
     REAL_COLOUR,
     ROLE_COLOURS,
@@ -34,6 +33,7 @@ from surgisoft.replay.shapes import creased, widest_apart
 from surgisoft.replay.surfaces import DosedSurface, dosed_surface
 from surgisoft.scene import frames
 from surgisoft.scene.mesh import Mesh
+from surgisoft.scene.render import LESION_TINT
 from surgisoft.tasks.episodes.log import DoseLog, EpisodeLog
 
 SCENE = "Scene"

@@ -30,6 +30,16 @@ BEAM_COLOUR = (0.15, 1.0, 0.35)
 """Linear colour of the aiming beam."""
 BEAM_RADIUS_MM = 0.4
 """Half-width of the beam's glow in the picture (mm)."""
+LESION_LINEAR = (0.62, 0.34, 0.16)
+"""Linear colour of a lesion."""
+LESION_TINT = 0.35
+"""Share of the lesion's colour that is mixed into the organ's inside the ring."""
+BLANCHED_LINEAR = (0.62, 0.50, 0.42)
+"""Linear colour of tissue just below the threshold of ablation."""
+CHARRED_LINEAR = (0.015, 0.012, 0.010)
+"""Linear colour of ablated tissue."""
+SAMPLE_MM = 0.4
+"""A pixel takes its dose from a sample within this distance (mm)."""
 BACKGROUND = (0.020, 0.008, 0.007)
 """Linear colour where a ray meets nothing: the dark of the body's cavity."""
 SHARP_COSINE = 0.8
@@ -145,6 +155,14 @@ class Renderer:
         light += beam[:, None] * np.array(BEAM_COLOUR)
         film = np.clip(light, 0.0, 1.0) ** (1.0 / 2.2) * self._inside[:, None]
         return (255.0 * film + 0.5).astype(np.uint8).reshape(self.height, self.width, 3)
+
+
+def stained(colours: np.ndarray, lesion: np.ndarray, heat: np.ndarray) -> np.ndarray:
+    """Linear colours (N, 3) of tissue by lesion (N,) bool and dose over threshold, heat (N,)."""
+    tint, heat = LESION_TINT * lesion[:, None], heat[:, None]
+    base = colours + (np.array(LESION_LINEAR) - colours) * tint
+    pale = base + (np.array(BLANCHED_LINEAR) - base) * np.clip(heat, 0.0, 1.0)
+    return np.where(heat >= 1.0, np.array(CHARRED_LINEAR), pale)
 
 
 def pixel_rays(camera: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import make_with
+from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.random_streams import joined, streams
 
 SPREAD = 7919
@@ -28,16 +29,17 @@ SPREAD = 7919
 class BatchedStep:
     """Results of a step of B environments; an environment whose episode ended has begun anew."""
 
-    observations: dict[str, Tensor]
-    """agent -> (B, D): of the new episode where one ended."""
+    observations: dict[str, Any]
+    """agent -> (B, D): of the new episode where one ended; with images a dict of this `vector` and
+    of the images (B, H, W, C)."""
     rewards: dict[str, Tensor]
     """agent -> (B,): sum of its weighted terms."""
     terminated: Tensor
     """(B,) bool: the task ended the episode, or an arm was no longer finite."""
     truncated: Tensor
     """(B,) bool: the time was out."""
-    final_observations: dict[str, Tensor]
-    """agent -> (B, D): before the reset, for the value of a truncated episode's last state."""
+    final_observations: dict[str, Any]
+    """agent -> the same: before the reset, for the value of a truncated episode's last state."""
     terms: dict[str, dict[str, Tensor]]
     """agent -> weighted reward term -> (B,)."""
     measures: dict[str, Tensor]
@@ -66,8 +68,12 @@ class BatchedEnv:
         self.agents = tuple(task.agents)
         self._episodes = Episodes(task, donate=True)
         self._spread = spread
+        world = task.world
+        self._images = images_of(world.scene, world.config.endoscope_images, task.name)
+        self.image_spaces = {} if self._images is None else dict(self._images.spaces)
         self._state: TaskState | None = None
-        seen = self.reset(seed)
+        self.reset(seed)
+        seen = self._episodes.observe(self._now)
         self.observation_sizes = {agent: value.shape[1] for agent, value in seen.items()}
         arms = {agent: task.world.arms[agent] for agent in self.agents}
         self.action_sizes = {agent: arm.chambers for agent, arm in arms.items()}
@@ -85,14 +91,15 @@ class BatchedEnv:
 
     @torch.inference_mode()
     def reset(self, seed: int = 0) -> dict[str, Tensor]:
-        """Begin all episodes; environment i has seed + i. Returns observations, agent -> (B, D)."""
+        """Begin all episodes; environment i has seed + i. Returns the observations, which
+        are those of a `BatchedStep`."""
         each = [streams(seed + i, 1, 0, self.device) for i in range(self.num_envs)]
         state = self._episodes.start(joined(each))
         if self._spread:
             steps = torch.arange(self.num_envs, device=self.device) * SPREAD % self.task.steps
             state = replace(state, world=replace(state.world, steps=steps))
         self._state = state
-        return self._episodes.observe(state)
+        return self._with_images(self._episodes.observe(state), self._drawn(state))
 
     @torch.inference_mode()
     def step(self, actions: Mapping[str, Tensor]) -> BatchedStep:
@@ -109,11 +116,16 @@ class BatchedEnv:
                 )
             held[agent] = actions[agent].to(self.device, torch.float32)
         state, outcome = self._episodes.step(self._now, held)
-        final = self._episodes.observe(state)
-        self._state = self._episodes.reset(state, outcome.done)
-        ended = bool(outcome.done.any())
+        images = self._drawn(state)
+        final = self._with_images(self._episodes.observe(state), images)
+        now = self._state = self._episodes.reset(state, outcome.done)
+        index, seen = outcome.done.nonzero()[:, 0], final
+        if len(index):
+            if self._images is not None:
+                images = self._images.renewed(images, now.world.arms, now.world.scene, index)
+            seen = self._with_images(self._episodes.observe(now), images)
         return BatchedStep(
-            observations=self._episodes.observe(self._state) if ended else final,
+            observations=seen,
             rewards=outcome.rewards,
             terminated=outcome.terminated,
             truncated=outcome.truncated,
@@ -121,6 +133,20 @@ class BatchedEnv:
             terms=outcome.terms,
             measures=outcome.measures,
         )
+
+    def _drawn(self, state: TaskState) -> dict[str, Tensor]:
+        """The endoscopes' images (B, H, W, C); none where the configuration asks for none."""
+        if self._images is None:
+            return {}
+        return self._images.of(state.world.arms, state.world.scene)
+
+    def _with_images(
+        self, vectors: dict[str, Tensor], images: Mapping[str, Tensor]
+    ) -> dict[str, Any]:
+        """Each agent's observation; the agents share the images."""
+        if self._images is None:
+            return vectors
+        return {agent: {VECTOR: vector, **images} for agent, vector in vectors.items()}
 
     @property
     def _now(self) -> TaskState:
@@ -138,6 +164,8 @@ def batched_env(
     arm: str | Path | None = None,
     geometry: str | None = None,
     spread: bool = False,
+    images: str | None = None,
+    image_pixels: int | None = None,
 ) -> BatchedEnv:
     """Many episodes of a task in one batch, tensors in and out, for any number of agents.
 
@@ -145,5 +173,5 @@ def batched_env(
     `BatchedEnv`.
     """
     if isinstance(task, str):
-        task = make_with(task, config, device, scene, arm, geometry)
+        task = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
     return BatchedEnv(task, num_envs, seed, spread)

@@ -7,12 +7,23 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
+from gymnasium.spaces import Dict as DictSpace
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
+from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.picture import WorldPicture
 from surgisoft.tasks.world.random_streams import joined, streams
+
+
+def in_one(observation: Any) -> Any:
+    """The observation of the only environment of a batch of one."""
+    if isinstance(observation, dict):
+        return {name: value[0] for name, value in observation.items()}
+    return observation[0]
+
 
 Bounds = tuple[Any, Any, tuple[int, ...], Any]
 """Lowest value, highest value, shape and dtype: the arguments of a Gymnasium Box."""
@@ -57,11 +68,27 @@ class NumpyAdapter:
 
     def __init__(self, task: Task):
         self.task, self.episodes = task, Episodes(task, donate=True)
-        first = self.observations(self.seeded([0]))
+        first = self.vectors(self.seeded([0]))
         self._width = {agent: seen.shape[1] for agent, seen in first.items()}
+        world = task.world
+        self.images = images_of(world.scene, world.config.endoscope_images, task.name)
+
+    def observation_space(self, agent: str) -> Box | DictSpace:
+        """The space of one agent's observation in one environment.
+
+        A Box (D,); with images a Dict of it, `vector`, and a Box for each image.
+        """
+        vector = Box(*self.observation_bounds(agent))
+        if self.images is None:
+            return vector
+        images = {
+            name: Box(one.low, one.high, one.shape, one.dtype)
+            for name, one in self.images.spaces.items()
+        }
+        return DictSpace({VECTOR: vector, **images})
 
     def observation_bounds(self, agent: str) -> Bounds:
-        """Bounds of one agent's observation in one environment."""
+        """Bounds of one agent's vector of observations in one environment."""
         return -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (self._width[agent],), np.float32
 
     def action_bounds(self, agent: str) -> Bounds:
@@ -100,6 +127,22 @@ class NumpyAdapter:
         return self.episodes.step(state, held)
 
     @torch.inference_mode()
-    def observations(self, state: TaskState) -> dict[str, np.ndarray]:
-        """Observations, agent -> (B, D) float32, as arrays that the caller may change."""
+    def observations(self, state: TaskState) -> dict[str, Any]:
+        """Observations by agent, as arrays that the caller may change.
+
+        (B, D) float32; with images a dict of it, `vector`, and (B, H, W, C) for each image.
+        """
+        vectors = self.vectors(state)
+        if self.images is None:
+            return vectors
+        drawn = self.images.of(state.world.arms, state.world.scene)
+        found = {}
+        for agent, vector in vectors.items():
+            images = {name: one.cpu().numpy().copy() for name, one in drawn.items()}
+            found[agent] = {VECTOR: vector, **images}
+        return found
+
+    @torch.inference_mode()
+    def vectors(self, state: TaskState) -> dict[str, np.ndarray]:
+        """Observations without images, agent -> (B, D) float32."""
         return {agent: seen.cpu().numpy() for agent, seen in self.episodes.observe(state).items()}

@@ -8,11 +8,18 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.spaces import Dict as DictSpace
 from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed
+from surgisoft.tasks.numpy_adapter import (
+    RGB_ARRAY,
+    NumpyAdapter,
+    Pictures,
+    entropy_seed,
+    in_one,
+)
 from surgisoft.tasks.registry import make_with
 
 
@@ -20,7 +27,8 @@ class SurgicalEnv(ParallelEnv):
     """A task as a PettingZoo environment; agents are arms by name.
 
     Actions are changes of the commanded pressure (m,) float32, kPa. Observations are (D,) float32;
-    `surgisoft.tasks.describe` lists their entries. Each agent's info holds its weighted reward
+    `surgisoft.tasks.describe` lists their entries; with images they are dicts of that `vector` and
+    of (H, W, C) arrays. Each agent's info holds its weighted reward
     terms, and the task's measures where they apply.
     """
 
@@ -35,13 +43,14 @@ class SurgicalEnv(ParallelEnv):
         self.task, self._adapter, self._state = task, NumpyAdapter(task), None
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
-        self._observed = {a: Box(*self._adapter.observation_bounds(a)) for a in task.agents}
+        self._observed = {a: self._adapter.observation_space(a) for a in task.agents}
         self._acted = {a: Box(*self._adapter.action_bounds(a)) for a in task.agents}
-        low = np.concatenate([self._observed[a].low for a in task.agents])
+        each = [Box(*self._adapter.observation_bounds(a)) for a in task.agents]
+        low = np.concatenate([box.low for box in each])
         self.state_space = Box(low, -low)
 
-    def observation_space(self, agent: str) -> Box:
-        """The Box of an agent's observation (D,)."""
+    def observation_space(self, agent: str) -> Box | DictSpace:
+        """The Box of an agent's observation (D,); with images a Dict of it and of their Boxes."""
         return self._observed[agent]
 
     def action_space(self, agent: str) -> Box:
@@ -91,8 +100,8 @@ class SurgicalEnv(ParallelEnv):
         return observations, rewards, terminated, truncated, infos
 
     def state(self) -> np.ndarray:
-        """(sum of D,) the concatenated observations of all agents, for centralised critics."""
-        seen = self._adapter.observations(self._state)
+        """(sum of D,) the concatenated vectors of all agents, for centralised critics."""
+        seen = self._adapter.vectors(self._state)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
     def render(self) -> np.ndarray | None:
@@ -102,9 +111,9 @@ class SurgicalEnv(ParallelEnv):
     def close(self) -> None:
         """Do nothing: the environment holds no resources."""
 
-    def _observations(self) -> dict[str, np.ndarray]:
+    def _observations(self) -> dict[str, Any]:
         seen = self._adapter.observations(self._state)
-        return {agent: seen[agent][0] for agent in self.agents}
+        return {agent: in_one(seen[agent]) for agent in self.agents}
 
 
 def parallel_env(
@@ -115,6 +124,8 @@ def parallel_env(
     arm: str | Path | None = None,
     geometry: str = "fcl",
     render_mode: str | None = None,
+    images: str | None = None,
+    image_pixels: int | None = None,
 ) -> SurgicalEnv:
     """The named task as a PettingZoo ParallelEnv.
 
@@ -122,6 +133,8 @@ def parallel_env(
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
     exact collision checker, or `batched`, the faster engine of training, for contact and for the
     beam's hit; near contact the two agree to 0.1 mm. render_mode: `rgb_array`, for pictures by
-    `render`, or None.
+    `render`, or None. images: `rgb`, `depth`, `segmentation` with commas in between: what the
+    endoscope shows, in observations that are then dicts; image_pixels: its width and height.
     """
-    return SurgicalEnv(make_with(task, config, device, scene, arm, geometry), render_mode)
+    built = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
+    return SurgicalEnv(built, render_mode)

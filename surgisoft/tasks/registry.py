@@ -63,12 +63,14 @@ def make_with(
     scene: str | Path | None = None,
     arm: str | Path | None = None,
     geometry: str | None = None,
+    images: str | None = None,
+    image_pixels: int | None = None,
 ) -> Task:
     """Build the named task with fields of its config changed; None leaves one as it is.
 
     config: the task's whole config, or a TOML file with fields of it; None: its default one. scene:
     a scene's folder. arm: an arm model's folder or `default`. geometry: `fcl` or `batched`, see
-    `world.scene.GEOMETRIES`.
+    `world.scene.GEOMETRIES`. images, image_pixels: see `world.images.ImageConfig`.
     """
     default = config_of(name)
     if isinstance(config, str | Path):
@@ -79,7 +81,13 @@ def make_with(
             f"config of '{name}' is of type {type(config).__name__}, expected "
             f"{type(default).__name__} or the path of a TOML file"
         )
-    changes = {"scene": scene, "arm": arm, "geometry": geometry}
+    changes = {
+        "scene": scene,
+        "arm": arm,
+        "geometry": geometry,
+        "images": images,
+        "image_pixels": image_pixels,
+    }
     given = {field: value for field, value in changes.items() if value is not None}
     return make_task(name, with_fields(config, **given), device)
 

@@ -6,8 +6,9 @@ one.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -15,11 +16,13 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from torch import Tensor
 
 from surgisoft.environments import register
-from surgisoft.errors import InputError
-from surgisoft.tasks.base import Task
-from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed
+from surgisoft.errors import InputError, unknown_name
+from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed, in_one
+from surgisoft.tasks.observations import ObservationBlocks
 from surgisoft.tasks.registry import make_with
 
 
@@ -30,16 +33,62 @@ def _adapter(
     scene: str | Path | None,
     arm: str | Path | None,
     geometry: str | None,
+    agent: str | None,
+    images: str | None,
+    image_pixels: int | None,
 ) -> tuple[NumpyAdapter, str]:
-    """The adapter of a task of one agent, and that agent; arguments as for `registry.make_with`."""
+    """The adapter of a task of one agent, and that agent; arguments as for `registry.make_with`.
+
+    agent: the one that learns in a task of several, see `OneAgent`.
+    """
     if isinstance(task, str):
-        task = make_with(task, config, device, scene, arm, geometry)
+        task = make_with(task, config, device, scene, arm, geometry, images, image_pixels)
+    if agent is not None:
+        task = one_agent(task, agent)
     if len(task.agents) != 1:
         raise InputError(
             f"task '{task.name}' has agents {', '.join(task.agents)}, expected one; use "
-            "surgisoft.parallel_env"
+            "surgisoft.parallel_env, or name one with agent="
         )
     return NumpyAdapter(task), task.agents[0]
+
+
+class OneAgent:
+    """A task of several agents in which one acts, and the scripted expert drives the others.
+
+    All else is the task's own. The expert sees the true state, see `Task.script`.
+    """
+
+    def __init__(self, task: Task, agent: str):
+        self._task, self.agents = task, (agent,)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "_task":
+            raise AttributeError(name)
+        return getattr(self._task, name)
+
+    def advance(self, state: TaskState, actions: Mapping[str, Tensor]) -> TaskState:
+        """Advance one step; the agents without an action follow the scripted expert."""
+        return self._task.advance(state, {**self._task.script(state), **actions})
+
+    def observe(self, state: TaskState) -> dict[str, Tensor]:
+        """The agent's observation, (B, D)."""
+        return {agent: self._task.observe(state)[agent] for agent in self.agents}
+
+    def blocks(self, state: TaskState) -> dict[str, ObservationBlocks]:
+        """The blocks of the agent's observation."""
+        return {agent: self._task.blocks(state)[agent] for agent in self.agents}
+
+    def rewards(self, state: TaskState) -> dict[str, dict[str, Tensor]]:
+        """The agent's weighted reward terms."""
+        return {agent: self._task.rewards(state)[agent] for agent in self.agents}
+
+
+def one_agent(task: Task, agent: str) -> Task:
+    """The task with `agent` as its only one; the scripted expert drives the others."""
+    if agent not in task.agents:
+        raise unknown_name("agent", agent, task.agents)
+    return cast(Task, OneAgent(task, agent))
 
 
 class SingleEnv(gymnasium.Env):
@@ -59,18 +108,24 @@ class SingleEnv(gymnasium.Env):
         arm: str | Path | None = None,
         geometry: str | None = None,
         render_mode: str | None = None,
+        agent: str | None = None,
+        images: str | None = None,
+        image_pixels: int | None = None,
     ):
         """The task's name, and changes to its config as for `registry.make_with`; or a task.
 
-        render_mode: `rgb_array`, for pictures by `render`, or None.
+        render_mode: `rgb_array`, for pictures by `render`, or None. agent: the one that acts, in a
+        task of several: the scripted expert drives the others. images, image_pixels: as for
+        `parallel_env`.
         """
-        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry)
+        shown = (agent, images, image_pixels)
+        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
         self._pictures = Pictures(self._adapter.task, render_mode)
         self.render_mode = render_mode
         fps = round(1.0 / self._adapter.task.world.config.dt_s)
         self.metadata = {**self.metadata, "render_fps": fps}
         self._state = None
-        self.observation_space = Box(*self._adapter.observation_bounds(self._agent))
+        self.observation_space = self._adapter.observation_space(self._agent)
         self.action_space = Box(*self._adapter.action_bounds(self._agent))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
@@ -79,7 +134,7 @@ class SingleEnv(gymnasium.Env):
         if seed is None:
             seed = int(self.np_random.integers(2**63))
         self._state = self._adapter.seeded([seed])
-        return self._adapter.observations(self._state)[self._agent][0], {}
+        return in_one(self._adapter.observations(self._state)[self._agent]), {}
 
     def step(self, action: np.ndarray):
         """Advance one step: (observation, reward, terminated, truncated, info).
@@ -94,7 +149,7 @@ class SingleEnv(gymnasium.Env):
         info = {name: value.item() for name, value in outcome.terms[self._agent].items()}
         info |= {n: v.item() for n, v in outcome.measures.items() if v.isfinite().all()}
         return (
-            self._adapter.observations(self._state)[self._agent][0],
+            in_one(self._adapter.observations(self._state)[self._agent]),
             outcome.rewards[self._agent].item(),
             bool(outcome.terminated),
             bool(outcome.truncated),
@@ -120,13 +175,20 @@ class BatchedEnv(VectorEnv):
         scene: str | Path | None = None,
         arm: str | Path | None = None,
         geometry: str | None = None,
+        agent: str | None = None,
+        images: str | None = None,
+        image_pixels: int | None = None,
     ):
-        """The task's name, and changes to its config as for `registry.make_with`; or a task."""
+        """The task's name, and changes to its config as for `registry.make_with`; or a task.
+
+        agent, images and image_pixels are as for `SingleEnv`.
+        """
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}, expected 1 or more")
-        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry)
+        shown = (agent, images, image_pixels)
+        self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
         self._state, self.num_envs = None, num_envs
-        self.single_observation_space = Box(*self._adapter.observation_bounds(self._agent))
+        self.single_observation_space = self._adapter.observation_space(self._agent)
         self.single_action_space = Box(*self._adapter.action_bounds(self._agent))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -238,7 +238,10 @@ def test_a_c3d_file_with_a_lost_marker_and_analog_pressures(tmp_path):
     made["parameters"]["ANALOG"]["RATE"]["value"] = [100]
     made["parameters"]["ANALOG"]["LABELS"]["value"] = ("valve",)
     points = np.ones((4, 2, 8))
-    points[:3] = markers.transpose(2, 1, 0)
+    points[:3] = np.nan_to_num(markers).transpose(2, 1, 0)  # zeros where it was lost
+    residuals = np.zeros((1, 2, 8))
+    residuals[0, 1, 4] = -1.0
+    made["data"]["meta_points"]["residuals"] = residuals
     made["data"]["points"], made["data"]["analogs"] = points, pressure[None, None]
     made.write(str(tmp_path / "raw.c3d"))
     (tmp_path / "map.toml").write_text(

@@ -56,6 +56,8 @@ class SceneState:
     """Dose map of the tissue."""
     views: dict[str, View] = field(default_factory=dict)
     """What each endoscope sees of the ring, (B,), by the arm's name."""
+    lit: dict[str, Tensor] = field(default_factory=dict)
+    """Whether each laser's beam burnt in the last step, (B,) bool, by the arm's name."""
     lesion: Tensor | None = None
     """(B,) int64: number of the episode's lesion among those laid out."""
     watched: Tensor | None = None
@@ -193,7 +195,8 @@ class SceneEngine:
         if not self.lasers:
             return stream, scene
         dose = self.ablation.start(*self._beams(scene, parts), lesion)
-        return stream, replace(scene, dose=dose)
+        lit = {name: torch.zeros_like(lesion, dtype=torch.bool) for name in self.lasers}
+        return stream, replace(scene, dose=dose, lit=lit)
 
     def step(
         self,
@@ -210,7 +213,8 @@ class SceneEngine:
         beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
         in_place = scene.donated and overwritable(scene.dose.dose)
         dose = self.ablation.advance(scene.dose, *beams, power, dt_s, in_place)
-        return replace(after, dose=dose, donated=scene.donated)
+        lit = self._lit(power, scene.lesion)
+        return replace(after, dose=dose, lit=lit, donated=scene.donated)
 
     def fresh_dose(
         self,
@@ -276,7 +280,9 @@ class SceneEngine:
             points, normals = poses.points(points), poses.normals(normals)
         ring = (points, normals)
         views = {n: self._seen(parts[n], n, ring, lines, poses) for n in self.endoscopes}
-        return SceneState(clearance, hits, None, views, lesion, watched, breaths)
+        return SceneState(
+            clearance, hits, None, views, lesion=lesion, watched=watched, breaths=breaths
+        )
 
     def _seen(
         self, eye: ArmPart, name: str, ring: tuple[Tensor, Tensor], lines, poses: Placement | None
@@ -303,6 +309,12 @@ class SceneEngine:
         if len(each) == 1:
             return each[0]
         return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
+
+    def _lit(self, power: float | Tensor, like: Tensor) -> dict[str, Tensor]:
+        """Whether each laser burns with a power as `_power` gives it; `like` is (B,)."""
+        on = torch.as_tensor(power, device=self.device) > 0.0
+        on = on if on.ndim == 2 else on.expand(len(like))[:, None]
+        return dict(zip(self.lasers, on.unbind(1), strict=True))
 
     def _power(self, power_w: Power, like: Tensor) -> float | Tensor:
         """W: a number or (B,) for one laser, (B, L) for L lasers; `like` is (B,)."""

@@ -29,6 +29,7 @@ from surgisoft.tasks.world.arm import (
     Pneumatics,
     Randomisation,
 )
+from surgisoft.tasks.world.images import ImageConfig
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 from surgisoft.tasks.world.pytree import rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream
@@ -63,6 +64,8 @@ class WorldConfig:
     """The state observer of every simulated arm; on a rig the rig's own takes its place."""
     scene_engine: SceneEngineConfig = field(default_factory=SceneEngineConfig)
     """Resolution of the scene and its collision engine."""
+    endoscope_images: ImageConfig = field(default_factory=ImageConfig)
+    """The endoscope's image as a part of the observations."""
 
     FORMER_NAMES: ClassVar[dict[str, str]] = {"scenery": "scene_engine"}
 

@@ -49,9 +49,7 @@ def _read(path: Path, _: FileRole) -> RawTable:
     if not rate > 0.0:
         raise InputError(f"{path}: frame rate {rate:g} Hz, expected more than 0")
     markers = _labels(point, points.shape[1], "marker")
-    positions = points[:3].copy()
-    residual = np.asarray(content["data"]["meta_points"]["residuals"])[0]  # (n, T)
-    positions[:, residual < 0] = np.nan
+    positions = points[:3]  # NaN where the residual is negative, by ezc3d
     names, columns = [TIME], [np.arange(frames)[:, None] / rate]
     for number, marker in enumerate(markers):
         names += [f"{marker}.{axis}" for axis in "xyz"]

@@ -49,6 +49,12 @@ class CompiledStep:
             return None
         return cls(model, network, name, effect)
 
+    @property
+    def learns(self) -> bool:
+        """Whether a gradient by the model's parameters is asked for."""
+        return any(tensor.requires_grad for tensor in self._tensors)
+
+    @torch.no_grad()
     def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
         network = self._network

@@ -311,7 +311,8 @@ class ModelArm:
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
     ) -> tuple[Stream, ArmPart]:
         """Advance by dt_s seconds with changes (B, m) kPa of the commanded pressures."""
-        step = self._compiled_for(part.command, action)
+        inputs = (part.command, part.pressure, part.gain, part.mount, part.arm.pressure)
+        step = self._compiled_for(*inputs, action)
         if step is not None:
             part = self._stepped(step, part, action, dt_s)
         else:
@@ -355,7 +356,7 @@ class ModelArm:
         self, state: ArmState, pressure: Tensor, dt_s: Tensor | float
     ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m)."""
-        step, change = self._compiled_for(pressure), pressure - state.pressure
+        step, change = self._compiled_for(pressure, state.pressure), pressure - state.pressure
         if step is None:
             return self.model.step(state, change, dt_s)
         return step(state, state.pressure + change)
@@ -370,11 +371,20 @@ class ModelArm:
         return replace(part, points_mm=points_mm, line_mm=line, tip_direction=direction)
 
     def _compiled_for(self, *tensors: Tensor) -> CompiledStep | None:
-        """The compiled step where it may take these tensors; None where the reference has to."""
-        if self._compiled is None or torch.is_grad_enabled() or torch.compiler.is_compiling():
+        """The compiled step where it may take these tensors; None where the reference has to.
+
+        It has to where a gradient is asked for, and while a program is traced.
+        """
+        if self._compiled is None or torch.compiler.is_compiling() or torch.jit.is_tracing():
             return None
-        plain = all(type(t) is Tensor and t.dtype == torch.float32 for t in tensors)
-        return self._compiled if plain and not torch.jit.is_tracing() else None
+        graded = torch.is_grad_enabled()
+        if graded and self._compiled.learns:
+            return None
+        for tensor in tensors:
+            plain = type(tensor) is Tensor and tensor.dtype == torch.float32
+            if not plain or (graded and tensor.requires_grad):
+                return None
+        return self._compiled
 
     def _stepped(self, step: CompiledStep, part: ArmPart, action: Tensor, dt_s: float) -> ArmPart:
         """The part after a step with the action (B, m) kPa, all but what is measured."""

@@ -44,7 +44,7 @@ class PortLaserWeights:
     """Weights of the laser's reward terms; e is the distance of the beam from its target, mm; c is
     the distance of the own tip from the axis of its port, mm, while the arms enter."""
 
-    centred: float = 1.0
+    centred: float = 5.0
     """exp(-c / centred_mm) while the arms enter, 1 afterwards."""
     far: float = 1.0
     """1 / (1 + e / far_mm)."""
@@ -54,7 +54,7 @@ class PortLaserWeights:
     """exp(-e / fine_mm)."""
     cut: float = 1.0
     """1 while the beam is on, else 0."""
-    rim: float = -1.0
+    rim: float = -3.0
     """1 while the own body is nearer than rim_mm to the wall, else 0."""
     contact: float = -1.0
     """1 while the clearance of any arm is below the scene's limit, else 0."""
@@ -65,7 +65,7 @@ class PortEndoscopeWeights:
     """Weights of the endoscope's reward terms; e is the distance of the camera's axis from the
     ring's centre, mm; c is the distance of the own tip from the axis of its port, mm."""
 
-    centred: float = 1.0
+    centred: float = 5.0
     """exp(-c / centred_mm) while the arms enter, 1 afterwards."""
     look: float = 1.0
     """1 / (1 + e / far_mm)."""
@@ -73,7 +73,7 @@ class PortEndoscopeWeights:
     """Share of what is to be seen that the endoscope sees."""
     cut: float = 1.0
     """1 while the beam is on, else 0."""
-    rim: float = -1.0
+    rim: float = -3.0
     """1 while the own body is nearer than rim_mm to the wall, else 0."""
     contact: float = -1.0
     """1 while the clearance of any arm is below the scene's limit, else 0."""

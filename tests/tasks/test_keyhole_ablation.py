@@ -90,7 +90,9 @@ def test_time_at_the_rim_is_counted_and_decides(quick, cut):
     bodies[0, 1, wall] = 0.5
     near = with_clearance(state, bodies)
     reward, usual = quick.rewards(near), quick.rewards(state)
-    assert reward["endoscope"]["rim"].tolist() == [-1.0, 0.0]
+    weight = quick.weights["endoscope"].rim
+    assert weight < 0.0
+    assert reward["endoscope"]["rim"].tolist() == [weight, 0.0]
     assert reward["laser"]["rim"].tolist() == [0.0, 0.0]
     assert usual["endoscope"]["rim"].tolist() == [0.0, 0.0]
     assert quick.measures(near)["rim_mm"][0].item() == pytest.approx(0.5)

@@ -123,7 +123,9 @@ def test_no_beam_passes_near_another_arm(quick, cut):
 
 
 def test_other_scenes_are_one_line(tmp_path):
-    with pytest.raises(InputError, match="has the arms laser, endoscope, expected laser_") as caught:
+    with pytest.raises(
+        InputError, match="has the arms laser, endoscope, expected laser_"
+    ) as caught:
         make_task("two_laser_ring", TwoLaserRingConfig(scene=PHANTOM))
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="beam_mm is 0"):

@@ -55,7 +55,9 @@ def test_two_hidden_effects_are_found_added_and_judged(tmp_path, capsys):
     assert values["error_mm"]["after"] < 1.1 * values["error_mm"]["floor"]
     assert set(load_model(tmp_path / "new").effects) == {"creep", "gain_mismatch"}
     assert (tmp_path / "report" / "waterfall.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert "Rounds" in (tmp_path / "report" / "report.html").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "What it is worth" in page
+    assert "What was missing" in page
 
 
 def test_a_model_that_misses_nothing_is_left_alone(tmp_path, capsys):

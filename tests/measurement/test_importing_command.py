@@ -138,13 +138,17 @@ def test_every_shipped_map_is_valid():
 
 def test_examples_of_the_documentation_are_valid(tmp_path):
     blocks = re.findall(r"```toml\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
-    sidecar, example, bag = blocks
+    sidecar, example, *formats = blocks
     (tmp_path / "sidecar.toml").write_text(sidecar)
     assert read_sidecar(tmp_path / "sidecar.toml")["noise_mm"] == 0.08
     (tmp_path / "map.toml").write_text(example)
     assert load_map(str(tmp_path / "map.toml")).time.unit == "ms"
-    (tmp_path / "bag.toml").write_text(bag)
-    assert load_map(str(tmp_path / "bag.toml")).key_points.unit == "m"
+    units = []
+    for text in formats:
+        (tmp_path / "format.toml").write_text(text)
+        units.append(load_map(str(tmp_path / "format.toml")).key_points.unit)
+    assert units[:2] == ["m", "m"], "LeRobot, MCAP"
+    assert len(units) == 3, "C3D, MATLAB and HDF5 have one example"
 
 
 @pytest.mark.parametrize(

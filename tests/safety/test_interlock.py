@@ -25,7 +25,7 @@ from tests.experiments.tiny import TINY, write
 RIG = RigConfig(seed=1, settle_s=0.2)
 
 
-LONGER = {"contour_ablation", "keyhole_ablation"}
+LONGER = {"breathing_ablation", "contour_ablation", "keyhole_ablation"}
 """Tasks that `python -m benchmarks.interlock` attacks and the suite does not: their beam is
 released by the same function as that of circle_ablation, and they take longer until it is on."""
 

@@ -52,7 +52,7 @@ def save_episode(log: EpisodeLog, path: str | Path) -> None:
 def load_episode(path: str | Path) -> EpisodeLog:
     """Read a log that `save_episode` wrote; an InputError for anything else."""
     path = Path(path)
-    wanted = "expected an episode's log as 'surgisoft evaluate --log' writes it"
+    wanted = "expected an episode's log, such as one in 'logs' of an experiment's results"
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; {wanted}")
     try:

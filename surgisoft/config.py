@@ -89,6 +89,18 @@ class Where:
         return InputError(f"{place}: {field}{came}; expected {expected}")
 
 
+def path_beside(where: Where, text: str, what: str) -> Path:
+    """The file or folder that a field names, relative to its file; an InputError where none is."""
+    try:
+        found = (where.path.resolve().parent / text).resolve()
+        there = found.exists()
+    except (OSError, ValueError):  # too long a name, a zero byte
+        there = False
+    if not there:
+        raise where.error(f"there is no '{_short(text)}' beside this file", what)
+    return found
+
+
 def line_of(text: str, keys: tuple[str | int, ...]) -> int:
     """1-based line on which the field (or the nearest table above it) is written; 0 if unknown."""
     counts: dict[str, int] = {}

@@ -19,12 +19,13 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.fuzz.mutations import mutated
 from benchmarks.fuzz.targets import TARGETS, Target
+from surgisoft import apart
 from surgisoft.errors import InputError
 
 
@@ -45,22 +46,34 @@ class Limits:
 
 
 READ_ONLY_IMPORTS = (
+    "ezc3d",
+    "h5py",
+    "mcap.reader",
+    "mcap_ros2.decoder",
+    "nibabel",
+    "nrrd",
     "numba",
     "pyarrow.csv",
     "pyarrow.parquet",
     "rerun",
+    "scipy.io",
+    "skimage.measure",
     "torch",
     "trimesh",
     "surgisoft.agents.learned",
     "surgisoft.agents.report",
     "surgisoft.agents.training",
+    "surgisoft.credibility.context",
     "surgisoft.diagnosis.decision",
     "surgisoft.experiments.plan",
+    "surgisoft.experiments.results",
     "surgisoft.measurement.importing",
     "surgisoft.measurement.protocols",
     "surgisoft.replay.episode_view",
     "surgisoft.replay.show",
+    "surgisoft.rig.drivers.natnet",
     "surgisoft.scene.folder",
+    "surgisoft.scene.segmentation",
 )
 """Modules that the parent imports once for all workers."""
 
@@ -72,8 +85,14 @@ def fuzz(
     seed: int,
     limits: Limits,
     note: Callable[[dict], None],
+    planned: Mapping[str, int] | None = None,
+    done: Mapping[str, int] | None = None,
 ) -> None:
-    """Fuzz the named targets for some time; `note` is given the record of each batch."""
+    """Fuzz the named targets for some time; `note` is given the record of each batch.
+
+    planned: inputs of each target after which it is done, so that the run may end early. done:
+    inputs of each target that an earlier run has read; this one goes on behind them.
+    """
     os.environ.update(OMP_NUM_THREADS="1", MALLOC_ARENA_MAX="1")
     for name in READ_ONLY_IMPORTS:
         __import__(name)
@@ -81,25 +100,35 @@ def fuzz(
         corpus = folder / "corpus"
         for name in names:
             in_child(lambda name=name: make_corpus(corpus, name))
+        apart.started = forked
         end = time.monotonic() + seconds
-        queue, position = turns_of(names), dict.fromkeys(names, 0)
+        position = {name: (done or {}).get(name, 0) for name in names}
+        turns = turns_of(names)
         running: dict[int, Batch] = {}
-        while time.monotonic() < end or running:
+        while True:
+            left = [n for n in names if planned is None or position[n] < planned[n]]
+            if not running and (not left or time.monotonic() >= end):
+                return
             busy = {batch.target for batch in running.values()}
-            if len(running) < workers and time.monotonic() < end:
-                name = next(name for name in queue if name not in busy or len(names) <= len(busy))
-                batch = Batch(name, seed, position[name], corpus / name, folder, limits, end)
+            free = [n for n in left if n not in busy or (planned is None and len(left) < workers)]
+            if len(running) < workers and time.monotonic() < end and free:
+                if planned is None:
+                    name, last = next(n for n in turns if n in free), None
+                else:  # all targets reach the same share of what is planned
+                    name = min(free, key=lambda n: position[n] / planned[n])
+                    last = planned[name]
+                batch = Batch(name, seed, position[name], corpus / name, folder, limits, end, last)
                 running[batch.start()] = batch
                 # Numbers of another worker of the same target must not overlap.
-                position[name] += 1_000_000 if len(names) < workers else 0
+                position[name] += 1_000_000 if planned is None and len(names) < workers else 0
                 continue
             for pid in list(running):
                 record = running[pid].finished()
                 if record is not None:
-                    done = running.pop(pid)
-                    position[done.target] = max(position[done.target], record.pop("next"))
+                    batch = running.pop(pid)
+                    position[batch.target] = max(position[batch.target], record.pop("next"))
                     note(record)
-            time.sleep(0.1)
+            time.sleep(0.02)
 
 
 def turns_of(names: Sequence[str]) -> Iterator[str]:
@@ -187,12 +216,14 @@ class Batch:
     folder: Path
     limits: Limits
     end: float
+    last: int | None = None
+    """Number behind that of the last input; None: until the time of a worker is over."""
 
     def start(self) -> int:
         """Fork the worker; returns its process id."""
         self.now = mmap.mmap(-1, 16)
         self.now[:16] = struct.pack("<qd", self.first, time.monotonic())
-        self.out = Path(tempfile.mkdtemp(dir=self.folder))
+        self.out, self.began = Path(tempfile.mkdtemp(dir=self.folder)), time.monotonic()
         sys.stdout.flush()
         self.pid = os.fork()
         if self.pid == 0:
@@ -225,6 +256,7 @@ class Batch:
             "target": self.target,
             "first": self.first,
             "inputs": number - self.first,
+            "seconds": round(time.monotonic() - self.began, 2),
             "next": number,
             "findings": findings,
         }
@@ -245,7 +277,7 @@ class Batch:
         with (self.out / "findings.jsonl").open("w") as file:
             _limit(self.limits)
             number, end = self.first, min(self.end, time.monotonic() + self.limits.batch_s)
-            while time.monotonic() < end:
+            while time.monotonic() < end and number != self.last:
                 self.now[:16] = struct.pack("<qd", number, time.monotonic())
                 with inputs.put(number) as sample:
                     signal.setitimer(signal.ITIMER_PROF, self.limits.hang_s)
@@ -265,6 +297,34 @@ def _limit(limits: Limits) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
+
+
+def forked(module: str, path: Path) -> apart.Ended:
+    """`surgisoft.apart.started` where the process that reads is forked from this one.
+
+    It has imported the library already, so that an input takes the time of reading it.
+    """
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
+        pid = os.fork()
+        if pid == 0:
+            code = 1
+            try:
+                signal.setitimer(signal.ITIMER_PROF, 0.0)
+                os.dup2(out.fileno(), 1)
+                os.dup2(errors.fileno(), 2)
+                sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
+                code = apart.answer(module, path)
+                sys.stderr.flush()
+            except BaseException as error:
+                os.write(2, f"{type(error).__name__}: {error}".encode("utf-8", "replace"))
+            finally:
+                os._exit(code)
+        _, status, used = os.wait4(pid, 0)
+        if used.ru_utime + used.ru_stime > Limits.hang_s:
+            raise RuntimeError(f"the reading process computed for {used.ru_utime:.0f} s")
+        out.seek(0)
+        errors.seek(0)
+        return apart.Ended(os.waitstatus_to_exitcode(status), out.read(), errors.read())
 
 
 def examine(name: str, number: int, sample: Path, limits: Limits) -> dict | None:

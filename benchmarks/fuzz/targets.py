@@ -34,6 +34,8 @@ class Target:
     """Share of the time, relative to the other targets."""
     inputs: int = 5_000
     """Inputs of a million: more where a reader is quick."""
+    imports: tuple[str, ...] = ()
+    """Modules that a worker imports at once, for the processes that it forks."""
 
 
 def recording(rows: int = 60):
@@ -881,42 +883,42 @@ def read_results(sample: Path) -> None:
 
 
 TARGETS: dict[str, Target] = {
-    "recording": Target(make_recordings, read_recordings, weight=3, inputs=60_000),
+    "recording": Target(make_recordings, read_recordings, weight=3, inputs=30_000),
     "lerobot": Target(
         make_lerobot,
         read_lerobot,
         ("meta/info.json", "meta/*.toml", "data/*/*.parquet"),
-        inputs=25_000,
+        inputs=10_000,
     ),
-    "log": Target(make_logs, read_logged, weight=2, inputs=110_000),
-    "schedule": Target(make_schedule, read_schedule, weight=2, inputs=120_000),
-    "import": Target(make_raw, read_raw, weight=3, inputs=30_000),
-    "c3d": Target(make_c3d, read_raw, ("*.c3d",), inputs=20_000),
-    "matlab": Target(make_matlab, read_raw, ("*.mat",), inputs=20_000),
-    "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), inputs=20_000),
-    "mcap": Target(make_mcap, read_raw, ("*.mcap",), inputs=20_000),
+    "log": Target(make_logs, read_logged, weight=2, inputs=120_000),
+    "schedule": Target(make_schedule, read_schedule, weight=2, inputs=100_000),
+    "import": Target(make_raw, read_raw, weight=3, inputs=10_000),
+    "c3d": Target(make_c3d, read_raw, ("*.c3d",), imports=("ezc3d",)),
+    "matlab": Target(make_matlab, read_raw, ("*.mat",), imports=("scipy.io",)),
+    "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), inputs=10_000),
+    "mcap": Target(make_mcap, read_raw, ("*.mcap",), inputs=10_000),
     "model": Target(
-        make_models, read_model, ("config.json", "*.safetensors"), weight=2, inputs=80_000
+        make_models, read_model, ("config.json", "*.safetensors"), weight=2, inputs=30_000
     ),
-    "run": Target(make_runs, read_run, ("config.json", "*.pt"), weight=2, inputs=10_000),
+    "run": Target(make_runs, read_run, ("config.json", "*.pt"), weight=2, inputs=5_000),
     "resume": Target(make_runs, read_resumed, ("config.json", "last.pt"), weight=2),
-    "episode": Target(make_episodes, read_episode, weight=3, inputs=15_000),
+    "episode": Target(make_episodes, read_episode, weight=3, inputs=6_000),
     "charts": Target(make_episodes, read_charts),
     "replay": Target(make_episodes, read_replay),
-    "rrd": Target(make_replays, read_rrd, weight=0.5),
-    "scene": Target(make_scenes, read_scene, ("scene.toml", "*.csv"), inputs=15_000),
-    "segmentation": Target(make_segmentations, read_segmented, inputs=15_000),
+    "rrd": Target(make_replays, read_rrd, weight=0.5, imports=("rerun.chunk", "pyarrow.compute")),
+    "scene": Target(make_scenes, read_scene, ("scene.toml", "*.csv"), inputs=5_000),
+    "segmentation": Target(make_segmentations, read_segmented, inputs=20_000),
     "experiment": Target(
-        make_experiments, read_experiment, ("experiment.toml",), weight=2, inputs=10_000
+        make_experiments, read_experiment, ("experiment.toml",), weight=2, inputs=6_000
     ),
-    "results": Target(make_results, read_results, ("experiment.toml", "*.json"), inputs=10_000),
-    "context": Target(make_contexts, read_context, ("context.toml",), inputs=60_000),
+    "results": Target(make_results, read_results, ("experiment.toml", "*.json"), inputs=6_000),
+    "context": Target(make_contexts, read_context, ("context.toml",), inputs=80_000),
     "task": Target(make_tasks, read_task, weight=2, inputs=60_000),
-    "assignments": Target(make_assignments, read_assignments, inputs=60_000),
-    "mesh": Target(make_meshes, read_meshes, weight=2, inputs=80_000),
-    "decision": Target(make_decision, read_decision, inputs=80_000),
-    "bench": Target(make_benches, read_bench, inputs=60_000),
-    "packet": Target(make_frames, read_packet, inputs=90_000),
-    "lines": Target(make_lines, read_lines, inputs=35_000),
+    "assignments": Target(make_assignments, read_assignments, inputs=80_000),
+    "mesh": Target(make_meshes, read_meshes, weight=2, inputs=100_000),
+    "decision": Target(make_decision, read_decision, inputs=130_000),
+    "bench": Target(make_benches, read_bench, inputs=90_000),
+    "packet": Target(make_frames, read_packet, inputs=130_000),
+    "lines": Target(make_lines, read_lines, inputs=30_000),
 }
 """Every reader by name."""

@@ -12,6 +12,7 @@ Reading is bounded: a file of any content ends in a value or in one line, never 
 
 import dataclasses
 import difflib
+import functools
 import math
 import re
 import reprlib
@@ -166,7 +167,7 @@ def from_table(kind: type, table: object, where: Where):
     """Build the frozen dataclass `kind` from a TOML table; the error names the first bad field."""
     if not isinstance(table, dict):
         raise where.error(f"got {describe(table)}", f"a table [{where.field}]")
-    hints = typing.get_type_hints(kind, include_extras=True)
+    hints = _hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name in table:
         if name not in fields:
@@ -185,6 +186,12 @@ def from_table(kind: type, table: object, where: Where):
             )
     built = kind(**values)
     return built.checked(where) if hasattr(built, "checked") else built
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, typing.Any]:
+    """Types of the fields of a dataclass; to find them takes longer than to read a table."""
+    return typing.get_type_hints(kind, include_extras=True)
 
 
 def to_table(config: typing.Any) -> typing.Any:

@@ -32,6 +32,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=TARGETS, default=list(TARGETS))
     parser.add_argument("--log", type=Path, help="append counts and findings; what is "
                         "in it with the same seed is not read again")  # fmt: skip
+    parser.add_argument("--corpus", type=Path, help="keep the valid files here for the next run")
     parser.add_argument("--input", type=int, help="read this one input of --only again")
     parser.add_argument("--keep", type=Path, help="with --input: keep its files here")
     given = parser.parse_args()
@@ -63,7 +64,17 @@ def main() -> int:
             with given.log.open("a") as file:
                 file.write(json.dumps(batch | {"seed": given.seed}) + "\n")
 
-    fuzz(given.only, given.seconds, given.workers, given.seed, limits, note, planned, done)
+    fuzz(
+        given.only,
+        given.seconds,
+        given.workers,
+        given.seed,
+        limits,
+        note,
+        planned,
+        done,
+        given.corpus,
+    )
     seconds = time.monotonic() - began
     print(f"{sum(counts.values()):,} inputs in {seconds:.0f} s, seed {given.seed}:")
     for name in given.only:

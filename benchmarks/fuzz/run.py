@@ -55,17 +55,24 @@ def fuzz(
     note: Callable[[dict], None],
     planned: Mapping[str, int] | None = None,
     done: Mapping[str, int] | None = None,
+    kept: Path | None = None,
 ) -> None:
     """Fuzz the named targets for some time; `note` is given the record of each batch.
 
     planned: inputs of each target after which it is done, so that the run may end early. done:
-    inputs of each target that an earlier run has read; this one goes on behind them.
+    inputs of each target that an earlier run has read; this one goes on behind them. kept: folder
+    for the valid files, which are made where it lacks them; None: in memory, made anew.
     """
     os.environ.update(OMP_NUM_THREADS="1", MALLOC_ARENA_MAX="1")
     with scratch() as folder:
-        corpus = folder / "corpus"
+        corpus = kept or folder / "corpus"
+        makers: dict[Callable, str] = {}
         for name in names:
-            in_child(lambda name=name: make_corpus(corpus, name))
+            same = makers.setdefault(TARGETS[name].make, name)
+            if same != name and not (corpus / name).is_dir():
+                shutil.copytree(corpus / same, corpus / name)
+            elif not (corpus / name).is_dir():
+                in_child(lambda name=name: make_corpus(corpus, name))
         apart.started = forked
         end = time.monotonic() + seconds
         position = {name: (done or {}).get(name, 0) for name in names}

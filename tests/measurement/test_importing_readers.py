@@ -297,5 +297,5 @@ def test_an_hdf5_file_cannot_claim_gigabytes_or_other_files(tmp_path):
     with h5py.File(path, "w") as file:
         file.create_dataset("t", (40,), "f8", external=[(str(secret), 0, 320)])
         file["u"] = np.arange(3.0)
-    with pytest.raises(InputError, match="expected one of u$"):  # the other file is left out
+    with pytest.raises(InputError, match=r"expected one of u$"):  # the other file is left out
         import_files([path], load_map(write_map(tmp_path, "hdf5")), "r")

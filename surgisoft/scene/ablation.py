@@ -386,7 +386,7 @@ class LoneDose:
         patch, grid = dose_map.patch, dose_map.patch.buckets
         names = (*_SUMS, "last_point_mm", "last_direction", "last_on")
         self._arrays = {name: getattr(state, name).numpy().copy() for name in names}
-        dose, self.peak, band, self.zone_mm2, joule, self._delivered = (
+        dose, self._peak, band, self._zone_mm2, joule, self._delivered = (
             self._arrays[name] for name in _SUMS
         )
         began, ended, middle = (np.zeros((1, 3), np.float32) for _ in range(3))
@@ -398,10 +398,10 @@ class LoneDose:
             dose_map._counted,
             (patch.points_mm, patch.normals, patch.areas_mm2, dose_map._zones, dose_map._stations),
             (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts),
-            *(dose, self.peak, band, self.zone_mm2, joule),
+            *(dose, self._peak, band, self._zone_mm2, joule),
         )
-        self.station_mm = float(dose_map._ring_mm[state.ring[0]] / patch.stations)
-        """Length of ring of a station, mm."""
+        self._station_mm = float(dose_map._ring_mm[state.ring[0]] / patch.stations)
+        self._cut_dose = np.float32(dose_map.cut_dose)
 
     def advance(
         self, point_mm: np.ndarray, direction: np.ndarray, on: bool, power_w: float, dt_s: float
@@ -411,6 +411,11 @@ class LoneDose:
         if self._energy[0] > 0.0:
             _deposit(*self._deposit)
             self._delivered += self._energy
+
+    def progress(self) -> tuple[float, float, float]:
+        """Completion, largest gap (mm) and healthy tissue ablated (mm^2), see `RingReport`."""
+        completion, gap = _ring_progress(self._peak, self._cut_dose)
+        return completion, gap * self._station_mm, float(self._zone_mm2[0, HEALTHY])
 
     @property
     def state(self) -> AblationState:
@@ -455,7 +460,7 @@ def _sweep_to(
 
 
 @compiled
-def ring_progress(peak, cut_dose):
+def _ring_progress(peak, cut_dose):
     """Share of a ring's stations (1, N) that is cut, and stations of its longest uncut stretch."""
     count = peak.shape[1]
     cut, longest, run = 0, 0, 0

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from surgisoft.compiled import compiled
-from surgisoft.scene.ablation import HEALTHY, LoneDose, ring_progress
 from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.laser_work import ENDOSCOPE, LASER
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
@@ -90,8 +89,6 @@ class LoneRing:
         }
         self._scales = (np.float32(config.far_mm), np.float32(config.fine_mm))
         self._limits, self._power_w = spec.limits, spec.laser.power_w
-        self._dose: LoneDose = world.scene.dose
-        self._cut_dose = np.float32(task.scene.ablation.cut_dose)
         self.fired = bool(state.goal.fired[0])
         """The beam was on in the last step."""
         self._done = int(state.goal.done[0])
@@ -132,8 +129,7 @@ class LoneRing:
             self._seen[ENDOSCOPE],
             self._blocks[ENDOSCOPE],
         )
-        completion, gap = ring_progress(self._dose.peak, self._cut_dose)
-        self.completion, self.gap_mm = completion, gap * self._dose.station_mm
+        self.completion, self.gap_mm, self.healthy_mm2 = scene.dose.progress()
         close = self.least_mm < self._limits.clearance_mm
         _terms(
             self._errors[0],
@@ -190,7 +186,7 @@ class LoneRing:
             "pointing_error_mm": error if late else math.nan,
             "completion": self.completion,
             "largest_gap_mm": self.gap_mm,
-            "healthy_mm2": float(self._dose.zone_mm2[0, HEALTHY]),
+            "healthy_mm2": self.healthy_mm2,
             "view_fraction": float(self.fraction),
             "clearance_mm": self.least_mm,
             "collided": float(self.collides),

@@ -645,9 +645,11 @@ class GuidedChecker:
         known = {} if trees is None else trees
         self._trees = []
         for body in checker.bodies:
-            if id(body.mesh) not in known:
-                known[id(body.mesh)] = body.mesh, build_tree(body.mesh)
-            self._trees.append(known[id(body.mesh)][1].arrays)
+            mesh = body.mesh
+            held = known.get(id(mesh))
+            if held is None or held[0] is not mesh:  # a copy of the dict has ids of other meshes
+                held = known[id(mesh)] = mesh, build_tree(mesh)
+            self._trees.append(held[1].arrays)
         self._frames = [(inward[:3, :3].copy(), inward[:3, 3].copy()) for inward in checker._inward]
         self._work = (np.empty(STACK, np.int64), np.empty(STACK))
 

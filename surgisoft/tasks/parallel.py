@@ -52,6 +52,16 @@ class SurgicalEnv(ParallelEnv):
         low = np.concatenate([box.low for box in each])
         self.state_space = Box(low, -low)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy's state: arrays that share memory with one another cannot be copied one by one."""
+        return {**self.__dict__, "_batch": self._state, "_lone": self._lone is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on from a copy's state."""
+        self.__dict__.update(state)
+        batch = self._batch
+        self._lone = self._adapter.alone(batch) if state["_lone"] and batch is not None else None
+
     @property
     def _state(self) -> TaskState | None:
         """State of the episode, a batch of one; None before the first reset."""

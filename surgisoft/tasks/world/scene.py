@@ -363,7 +363,7 @@ class LoneSceneEngine:
         at = (arms[eye].tip_mm, arms[eye].tip_direction)
         self._look = sight.look(*at, *points, picture, SHORT_MM, eye)
         self.dose = engine.ablation.alone(scene.dose)
-        self._lit = False
+        self._lit = bool(scene.lit[laser][0])
         self._find()
 
     def step(self, power_w: float, dt_s: float) -> None:

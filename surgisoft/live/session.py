@@ -11,7 +11,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -361,7 +361,8 @@ class _Session:
                 self._shown(rig),
                 _begun(ThreadPoolExecutor(1)) as self._worker,
                 self._guarded(bench),
-                _real_time(),
+                _undisturbed(),
+                nullcontext() if clock.pace == "simulated" else _real_time_priority(),
             ):
                 try:
                     drive()
@@ -877,16 +878,15 @@ def _rehearse(place: Task, policy: Policy) -> None:
 
 
 @contextmanager
-def _real_time() -> Iterator[None]:
-    """Keep the garbage collector, other threads and other programs from delaying the loop."""
+def _undisturbed() -> Iterator[None]:
+    """Keep the interpreter's garbage collector and other threads from delaying the loop."""
     threads, interval = torch.get_num_threads(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
-        with _real_time_priority():
-            yield
+        yield
     finally:
         sys.setswitchinterval(interval)
         torch.set_num_threads(threads)

@@ -18,6 +18,7 @@ from surgisoft.tasks.base import Signal, TaskSpec, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import LaserWorkWeights
+from surgisoft.tasks.lone_ring import LoneRing
 from surgisoft.tasks.observations import Block, ObservationBlocks, joined
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut, point_on_closed
 from surgisoft.tasks.world.random_streams import Stream
@@ -184,6 +185,10 @@ class CircleAblation:
             "healthy_mm2": ring.healthy_mm2,
             **laser_work.safety(state, ring.completion >= 1.0),
         }
+
+    def alone(self, state: TaskState[RingCut]) -> LoneRing | None:
+        """The episode of a state of one environment, advanced without tensors; see `LoneRing`."""
+        return LoneRing.of(self, state)
 
     def trace(self, state: TaskState[RingCut]) -> tuple[Tensor, Tensor]:
         """Reference point on the ring and end of the beam, each (B, 1, 3) mm."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import math
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,8 +26,8 @@ MEMORY_BYTES = 4 << 30
 """Address space of the reading process, bytes; most of it is the libraries' own."""
 MEMORY_PER_BYTE = 20
 """Address space beyond that for each byte of the file."""
-PATIENCE_S = 120
-"""Longest processor time of the reading process, s."""
+PATIENCE_S, PATIENCE_S_PER_MB = 4.0, 1.0
+"""Longest processor time for reading a file, s, and s more for each MB of it."""
 REFUSED = 2
 """Exit status of a reading process that says in one line why it does not read the file."""
 
@@ -78,7 +80,8 @@ def packed(facts: Any, *arrays: np.ndarray) -> bytes:
     """Facts, as JSON, and arrays as the bytes of an .npz file."""
     out = io.BytesIO()
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
-    np.savez(out, facts=text, **{f"a{i}": array for i, array in enumerate(arrays)})
+    named: dict[str, Any] = {f"a{i}": array for i, array in enumerate(arrays)}
+    np.savez(out, facts=text, **named)
     return out.getvalue()
 
 
@@ -99,7 +102,8 @@ def limit(size: int) -> None:
     except ImportError:
         return
     most = MEMORY_BYTES + MEMORY_PER_BYTE * size
-    wanted = ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, PATIENCE_S))
+    longest_s = math.ceil(time.process_time() + PATIENCE_S + PATIENCE_S_PER_MB * 1e-6 * size)
+    wanted = ((resource.RLIMIT_AS, most), (resource.RLIMIT_CPU, longest_s))
     for kind, value in (*wanted, (resource.RLIMIT_CORE, 0)):
         hard = resource.getrlimit(kind)[1]
         value = value if hard == resource.RLIM_INFINITY else min(value, hard)

@@ -19,6 +19,9 @@ def as_bytes(path):
             raise ValueError("first line\nlast line")
         case "refused":
             raise InputError(f"{path}: has no frame; expected one")
+        case "endless":
+            while True:
+                pass
         case "memory":
             np.ones(1 << 32)
     return packed({"path": path.name}, np.arange(3.0), np.array([[1, 2]]))

@@ -1,5 +1,7 @@
 """Reading in a process of its own: whatever its end, it is one line here."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,14 @@ def test_every_end_is_one_line(tmp_path, way, said):
     assert str(caught.value).startswith(f"{path}: ")
     assert said in str(caught.value)
     assert str(caught.value).count(str(path)) == 1
+
+
+def test_a_reader_without_end_is_ended(tmp_path):
+    """Processor time is limited by the size of the file: 4 s for a small one."""
+    path = tmp_path / "a.txt"
+    path.write_text("endless")
+    with pytest.raises(InputError, match=f"status -{signal.SIGXCPU.value}"):
+        read(path)
 
 
 def test_nothing_that_a_process_writes_is_run(tmp_path):

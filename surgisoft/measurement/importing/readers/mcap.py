@@ -147,7 +147,8 @@ def _reader(path: Path, file: Any) -> Any:
             "pip install 'surgisoft[mcap]'"
         ) from None
     _check_chunks(path, file)
-    return make_reader(_Bounded(file))
+    bounded: Any = _Bounded(file)
+    return make_reader(bounded)
 
 
 def _table(path: Path, topic: str) -> tuple[list[str], np.ndarray]:

@@ -20,7 +20,8 @@ from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.tasks.base import MeasuredTask, Task, TaskState
+from surgisoft.tasks.base import Signal, Task, TaskState
+from surgisoft.tasks.world.world import fed
 
 
 @dataclass(frozen=True)
@@ -121,16 +122,16 @@ def _as_started(controller: Controller, first: TaskState, rigs: dict[str, Simula
     """Set limits and mounts of the episode in the controller's state."""
     low, high = ({name: rig.limits[:, end] for name, rig in rigs.items()} for end in (0, 1))
     controller.limit(low, high)
+    out_mm = first.world.out_mm
     for name, part in first.world.arms.items():
+        part = part if out_mm is None else fed(part, out_mm)
         controller.set(**{f"arms__{name}__mount": part.mount[0].numpy()})
 
 
 def _signals(task: Task, before: TaskState | None, after: TaskState) -> dict[str, float]:
     """The task's signals as they are in simulation."""
-    if not getattr(task, "signals", ()):
-        return {}
-    found = cast(MeasuredTask, task).true_signals(before, after)
-    return {name: float(value[0]) for name, value in found.items()}
+    signals: tuple[Signal, ...] = getattr(task, "signals", ())
+    return {each.name: float(each.true(task, before, after)[0]) for each in signals}
 
 
 def _anything(controller: Controller) -> dict[str, float]:

@@ -95,13 +95,21 @@ class Keyhole:
 
     name, agents = "keyhole", ("arm",)
     signals = (
-        Signal("clearance_mm", "least distance of the arm from the plate", "mm", -20.0, 100.0),
+        Signal(
+            "clearance_mm",
+            "least distance of the arm from the plate",
+            "mm",
+            -20.0,
+            100.0,
+            lambda task, before, after: after.world.scene.clearance.least_mm,
+        ),
         Signal(
             "at_target",
             "1 if the tip is within reach_mm of its target, else 0",
             "-",
             0.0,
             1.0,
+            lambda task, before, after: task.visited(before, after).float(),
             float("nan"),
         ),
     )
@@ -155,13 +163,11 @@ class Keyhole:
         """The arm's clearance; see `MeasuredTask.measured_scene`."""
         return measured_clearance(signals["clearance_mm"])
 
-    def true_signals(
+    def visited(
         self, before: TaskState[WaypointSequence] | None, after: TaskState[WaypointSequence]
-    ) -> dict[str, Tensor]:
-        """The signals of a simulated step; see `MeasuredTask.true_signals`."""
-        least = after.world.scene.clearance.least_mm
-        reached = after.goal.reached - (0 if before is None else before.goal.reached)
-        return {"clearance_mm": least, "at_target": reached.float()}
+    ) -> Tensor:
+        """(B,) int64: targets reached in the step from `before`, or since the episode began."""
+        return after.goal.reached - (0 if before is None else before.goal.reached)
 
     def advance_measured(
         self, state: TaskState[WaypointSequence], signals: Mapping[str, Tensor]

@@ -65,6 +65,8 @@ class SceneState:
     task sets it where its target moves, and it begins with the lesion's number."""
     breaths: Breaths | None = None
     """Respiration of the organ; None: it does not move."""
+    measured: dict[str, Tensor] = field(default_factory=dict)
+    """Signals (B,) by name, where the scene is not simulated but measured; see `base.Signal`."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
@@ -86,13 +88,6 @@ def only(by_arm: Mapping[str, Item], tool: str) -> Item:
         names = ", ".join(by_arm) or "none"
         raise InputError(f"arms with the tool '{tool}': {names}; expected one, or an arm's name")
     return next(iter(by_arm.values()))
-
-
-def measured_view(fraction: Tensor, endoscope: str = ENDOSCOPE) -> SceneState:
-    """A scene of which only the share (B,) of the ring that an endoscope sees is known."""
-    unknown = torch.full_like(fraction, torch.nan)
-    points = unknown[:, None].isfinite()
-    return SceneState(views={endoscope: View(points, points, fraction, *3 * (unknown,))})
 
 
 def measured_clearance(least_mm: Tensor) -> SceneState:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, clearance
 from surgisoft.tasks.laser_supervision import completed, laser_experiment
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -25,7 +25,6 @@ from surgisoft.tasks.laser_work import (
     LaserWorkWeights,
     RouteTask,
     check_config,
-    clearance,
     dose,
 )
 from surgisoft.tasks.observations import Block, ObservationBlocks

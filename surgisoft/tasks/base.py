@@ -15,7 +15,7 @@ from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
 from surgisoft.tasks.supervision import BEAMLESS, ExperimentTask
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
-from surgisoft.tasks.world.scene import SceneState
+from surgisoft.tasks.world.scene import BatchClearance, SceneState
 from surgisoft.tasks.world.world import World, WorldState
 
 Goal = TypeVar("Goal", bound=TensorDataclass)
@@ -115,6 +115,13 @@ class MeasuredTask(Task, Protocol):
 
     def advance_measured(self, state: TaskState, signals: Mapping[str, Tensor]) -> TaskState:
         """Advance one step after which the world is as measured, signals name -> (B,)."""
+
+
+def clearance(state: TaskState) -> BatchClearance:
+    """Clearances of all arms; of a task with bodies."""
+    found = state.world.scene.clearance
+    assert found is not None, "the task has bodies"
+    return found
 
 
 class DocumentedTask(Task, Protocol):

@@ -133,7 +133,7 @@ class TaskDescription:
 def describe(name: str, config: Any = None) -> TaskDescription:
     """The facts of the named task; it is built, and started once, to know its sizes."""
     spec = spec_of(name)
-    task: DocumentedTask = make_task(name, config)
+    task = make_task(name, config)
     return TaskDescription(
         name=name,
         summary=_summary(spec.build),

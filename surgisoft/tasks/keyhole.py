@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, clearance, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
 from surgisoft.tasks.trajectories.waypoints import (
@@ -101,7 +101,7 @@ class Keyhole:
             "mm",
             -20.0,
             100.0,
-            lambda task, before, after: after.world.scene.clearance.least_mm,
+            lambda task, before, after: clearance(after).least_mm,
         ),
         Signal(
             "at_target",
@@ -186,7 +186,7 @@ class Keyhole:
                 **body_blocks(self.arm, part),
                 TARGET: (route[:, -1] - tip).asinh(),
                 ONWARD: (onward - tip).asinh(),
-                CLEARANCE: state.world.scene.clearance.least_mm[:, None] / 10.0,
+                CLEARANCE: clearance(state).least_mm[:, None] / 10.0,
                 VISITS: state.goal.reached[:, None] / self.config.visits,
                 TIME: state.world.steps[:, None] / self.steps,
             }
@@ -198,7 +198,7 @@ class Keyhole:
 
     def rewards(self, state: TaskState[WaypointSequence]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `KeyholeWeights`."""
-        clear, tip = state.world.scene.clearance.least_mm, state.world.arms["arm"].tip_mm
+        clear, tip = clearance(state).least_mm, state.world.arms["arm"].tip_mm
         left = progress(self.route_mm(state), tip).remaining_mm
         terms = {
             "way": (-left / self.config.far_mm).exp(),
@@ -210,17 +210,17 @@ class Keyhole:
 
     def ended(self, state: TaskState[WaypointSequence]) -> Tensor:
         """When the arm touches the plate or itself."""
-        return state.world.scene.clearance.collides
+        return clearance(state).collides
 
     def measures(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
         """Remaining route, share of visits, clearance, collision and success."""
-        clearance, goal = state.world.scene.clearance, state.goal
-        done, hit = goal.reached >= self.config.visits, clearance.collides
+        found, goal = clearance(state), state.goal
+        done, hit = goal.reached >= self.config.visits, found.collides
         route = progress(self.route_mm(state), state.world.arms["arm"].tip_mm)
         return {
             "left_mm": route.remaining_mm,
             "visited": goal.reached / self.config.visits,
-            "clearance_mm": clearance.least_mm,
+            "clearance_mm": found.least_mm,
             "collided": hit.float(),
             "success": (done & ~hit).float(),
         }

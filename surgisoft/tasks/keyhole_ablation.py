@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskSpec, TaskState
+from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskSpec, TaskState, clearance
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -28,7 +28,6 @@ from surgisoft.tasks.laser_work import (
     LaserWorkWeights,
     RingTask,
     check_config,
-    clearance,
 )
 from surgisoft.tasks.observations import Block, ObservationBlocks
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut

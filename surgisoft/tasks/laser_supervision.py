@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.laser_work import LaserTask, clearance, view
+from surgisoft.tasks.base import TaskState, clearance
+from surgisoft.tasks.laser_work import LaserTask, view
 from surgisoft.tasks.supervision import NEVER, Condition, ExperimentTask, Row
 
 

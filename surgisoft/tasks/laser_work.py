@@ -21,10 +21,14 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.scene.ablation import AblationState, RingReport
-from surgisoft.scene.camera import View
-from surgisoft.scene.capsules import BatchClearance
-from surgisoft.tasks.base import Signal, TaskState, check_weights, term_names, weighted
+from surgisoft.tasks.base import (
+    Signal,
+    TaskState,
+    check_weights,
+    clearance,
+    term_names,
+    weighted,
+)
 from surgisoft.tasks.inverse_kinematics import Pointing
 from surgisoft.tasks.observations import (
     TIME,
@@ -39,7 +43,14 @@ from surgisoft.tasks.trajectories.routes import RouteProgress
 from surgisoft.tasks.world.arm import ArmPart
 from surgisoft.tasks.world.pytree import TensorDataclass
 from surgisoft.tasks.world.random_streams import Stream
-from surgisoft.tasks.world.scene import PHANTOM, SceneEngine, SceneState
+from surgisoft.tasks.world.scene import (
+    PHANTOM,
+    AblationState,
+    RingReport,
+    SceneEngine,
+    SceneState,
+    View,
+)
 from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 LASER, ENDOSCOPE = "laser", "endoscope"
@@ -207,13 +218,6 @@ def view(state: TaskState) -> View:
     return state.world.scene.view
 
 
-def clearance(state: TaskState) -> BatchClearance:
-    """Clearances of all arms."""
-    found = state.world.scene.clearance
-    assert found is not None, "a task with a laser has bodies"
-    return found
-
-
 def dose(state: TaskState) -> AblationState:
     """The dose map of the tissue."""
     found = state.world.scene.dose
@@ -297,6 +301,18 @@ class LaserTask(ABC, Generic[Progress]):
         return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
 
     @abstractmethod
+    def rewards(self, state: TaskState[Progress]) -> dict[str, dict[str, Tensor]]:
+        """Weighted reward terms of each agent."""
+
+    @abstractmethod
+    def trace(self, state: TaskState[Progress]) -> tuple[Tensor, Tensor]:
+        """Reference points and ends of the beams, each (B, L, 3) mm."""
+
+    @abstractmethod
+    def script(self, state: TaskState[Progress]) -> dict[str, Tensor]:
+        """Scripted expert, agent -> (B, m) kPa."""
+
+    @abstractmethod
     def measured_error_mm(self, state: TaskState[Progress]) -> Tensor:
         """(B,) mm: distance of the beam's axis from its target as measured or estimated, the
         largest one of several lasers."""
@@ -318,8 +334,7 @@ class LaserTask(ABC, Generic[Progress]):
         return self.report(state).completion >= 1.0
 
     def ended(self, state: TaskState[Progress]) -> Tensor:
-        """When the path is cut along its whole length, or an arm touches a body, another arm or
-        itself."""
+        """When the whole path is cut, or an arm touches a body, another arm or itself."""
         return self.finished(state) | clearance(state).collides
 
     def arms_clear(self, state: TaskState[Progress]) -> Tensor:
@@ -330,6 +345,8 @@ class LaserTask(ABC, Generic[Progress]):
     def measured_arms(self, state: TaskState[Progress]) -> Mapping[str, ArmPart]:
         """The arms with their bodies where they are measured; the state's own where exact."""
         arms = state.world.arms
+        if state.world.scene.measured:  # an exported controller poses them so
+            return arms
         if all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values()):
             return arms
         return {
@@ -373,7 +390,7 @@ class OneLaserTask(LaserTask[Progress]):
     """
 
     agents = AGENTS
-    signals = (VIEW_FRACTION, BEAM_ON)
+    signals: tuple[Signal, ...] = (VIEW_FRACTION, BEAM_ON)
 
     @abstractmethod
     def target_mm(self, state: TaskState[Progress], ahead: int = 0) -> Tensor:
@@ -579,7 +596,7 @@ class RouteTask(OneLaserTask[RouteProgress]):
     The config has `speed_mm_s`, the speed of the reference along a path with the beam on, mm/s.
     """
 
-    signals = (VIEW_FRACTION, RELEASED)
+    signals: tuple[Signal, ...] = (VIEW_FRACTION, RELEASED)
     leap_steps: float
     """Two targets farther apart than this many steps of the reference lie on different paths."""
 

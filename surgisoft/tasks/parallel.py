@@ -12,7 +12,7 @@ from gymnasium.spaces import Dict as DictSpace
 from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Task
+from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.numpy_adapter import (
     RGB_ARRAY,
     NumpyAdapter,
@@ -40,7 +40,8 @@ class SurgicalEnv(ParallelEnv):
             "is_parallelizable": True,
         }
         self.render_mode, self._pictures = render_mode, Pictures(task, render_mode)
-        self.task, self._adapter, self._state = task, NumpyAdapter(task), None
+        self.task, self._adapter = task, NumpyAdapter(task)
+        self._state: TaskState | None = None
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
         self._observed = {a: self._adapter.observation_space(a) for a in task.agents}
@@ -101,6 +102,8 @@ class SurgicalEnv(ParallelEnv):
 
     def state(self) -> np.ndarray:
         """(sum of D,) the concatenated vectors of all agents, for centralised critics."""
+        if self._state is None:
+            raise InputError("state before reset: call reset() first")
         seen = self._adapter.vectors(self._state)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
@@ -112,6 +115,7 @@ class SurgicalEnv(ParallelEnv):
         """Do nothing: the environment holds no resources."""
 
     def _observations(self) -> dict[str, Any]:
+        assert self._state is not None, "there is one after a reset"
         seen = self._adapter.observations(self._state)
         return {agent: in_one(seen[agent]) for agent in self.agents}
 

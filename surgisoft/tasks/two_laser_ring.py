@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, term_names, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, clearance, term_names, weighted
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
 from surgisoft.tasks.laser_work import (
     BEAM_ERROR,
@@ -31,7 +31,6 @@ from surgisoft.tasks.laser_work import (
     LaserTask,
     LaserWeights,
     check_config,
-    clearance,
     lesion,
     view,
 )

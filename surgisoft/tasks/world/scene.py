@@ -12,6 +12,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
+from surgisoft.scene.ablation import RingReport as RingReport
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import View, seen_from
 from surgisoft.scene.capsules import BatchClearance, segment_distance
@@ -189,7 +190,7 @@ class SceneEngine:
         scene = self._look(parts, lesion, lesion, breaths)
         if not self.lasers:
             return stream, scene
-        dose = self.ablation.start(*self._beams(scene, parts), lesion)
+        dose = self.ablation.start(*self._beams(scene, parts), ring=lesion)
         lit = {name: torch.zeros_like(lesion, dtype=torch.bool) for name in self.lasers}
         return stream, replace(scene, dose=dose, lit=lit)
 
@@ -202,13 +203,18 @@ class SceneEngine:
     ) -> SceneState:
         """The scene after the arms moved and the beams swept with `power_w` for dt_s."""
         breaths = None if scene.breaths is None else scene.breaths.after(dt_s)
-        after = self._look(parts, scene.lesion, scene.watched, breaths)
+        lesion, watched = scene.lesion, scene.watched
+        assert lesion is not None, "a state of `start` has a lesion"
+        assert watched is not None, "a state of `start` has what is watched"
+        after = self._look(parts, lesion, watched, breaths)
         if scene.dose is None:
             return replace(after, donated=scene.donated)
-        beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
+        beams, power = self._beams(after, parts), self._power(power_w, lesion)
         in_place = scene.donated and overwritable(scene.dose.dose)
-        dose = self.ablation.advance(scene.dose, *beams, power, dt_s, in_place)
-        lit = self._lit(power, scene.lesion)
+        dose = self.ablation.advance(
+            scene.dose, *beams, power_w=power, dt_s=dt_s, in_place=in_place
+        )
+        lit = self._lit(power, lesion)
         return replace(after, dose=dose, lit=lit, donated=scene.donated)
 
     def fresh_dose(
@@ -221,7 +227,7 @@ class SceneEngine:
         """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
         beams = self._beams(scene, parts)
         in_place = scene.donated and overwritable(dose.dose)
-        return self.ablation.reset(dose, mask, *beams, in_place, scene.lesion)
+        return self.ablation.reset(dose, mask, *beams, in_place=in_place, ring=scene.lesion)
 
     def placement(self, breaths: Breaths | None, ahead_s: float = 0.0) -> Placement | None:
         """Where the moving bodies are, `ahead_s` seconds from now; None where nothing moves."""
@@ -287,7 +293,9 @@ class SceneEngine:
         moved = {} if poses is None else {"poses": poses}
         return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name, **moved)
 
-    def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
+    def _beams(
+        self, scene: SceneState, parts: Mapping[str, ArmPart]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.
 
         With L lasers (B, L, 3), (B, L, 3) and (B, L), in the order of `lasers`.
@@ -303,7 +311,8 @@ class SceneEngine:
             each.append((point, aim, on))
         if len(each) == 1:
             return each[0]
-        return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
+        points, aims, on_organ = zip(*each, strict=True)
+        return torch.stack(points, 1), torch.stack(aims, 1), torch.stack(on_organ, 1)
 
     def _lit(self, power: float | Tensor, like: Tensor) -> dict[str, Tensor]:
         """Whether each laser burns with a power as `_power` gives it; `like` is (B,)."""

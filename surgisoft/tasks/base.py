@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -132,6 +133,41 @@ class DocumentedTask(Task, Protocol):
 
     def blocks(self, state: TaskState) -> dict[str, ObservationBlocks]:
         """agent -> the named blocks of its observation, in order."""
+
+
+class LoneEpisode(Protocol):
+    """One episode of a task, advanced in arrays that are allocated once.
+
+    A task may have a method `alone(state)` that gives one for the only environment of a state, or
+    None where it can be advanced by the task alone. The numbers are the task's own, to rounding.
+    """
+
+    def step(self, actions: Mapping[str, np.ndarray]) -> None:
+        """Advance one step; actions: agent -> (m,) changes of the commanded pressure, kPa."""
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:
+        """Agent -> (D,) float32, see `Episodes.observe`; arrays that the caller may change."""
+
+    @property
+    def terms(self) -> dict[str, dict[str, float]]:
+        """Agent -> weighted reward term, see `Outcome`."""
+
+    @property
+    def terminated(self) -> bool:
+        """See `Outcome`."""
+
+    @property
+    def truncated(self) -> bool:
+        """See `Outcome`."""
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Quantities for people; nan where one does not apply."""
+
+    @property
+    def state(self) -> TaskState:
+        """A copy of the present state."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from surgisoft.tasks.base import TaskSpec
+from surgisoft.tasks.base import TaskSpec, TaskState
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -19,6 +19,7 @@ from surgisoft.tasks.laser_work import (
     RingTask,
     check_config,
 )
+from surgisoft.tasks.lone_ring import LoneRing
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.random_streams import Stream
 
@@ -60,6 +61,10 @@ class CircleAblation(RingTask[RingCut]):
     def goal(self, stream: Stream) -> tuple[Stream, RingCut]:
         """Draw start and direction of the cut for each random number stream."""
         return draw_cut(stream)
+
+    def alone(self, state: TaskState[RingCut]) -> LoneRing | None:
+        """The episode of a state of one environment, advanced without tensors; see `LoneRing`."""
+        return LoneRing.of(self, state)
 
 
 CIRCLE_ABLATION = TaskSpec(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -14,15 +15,15 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
 from surgisoft.scene.ablation import RingReport as RingReport
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.camera import View, seen_from
+from surgisoft.scene.camera import LIFT_MM, SHORT_MM, View, seen_from
 from surgisoft.scene.capsules import BatchClearance, segment_distance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.moving import Placement
-from surgisoft.scene.rays import RayHit
+from surgisoft.scene.rays import RayHit, Struck
 from surgisoft.scene.spec import PHANTOM as PHANTOM
-from surgisoft.tasks.world.arm import ArmPart, Randomisation
+from surgisoft.tasks.world.arm import ArmPart, LoneArm, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.respiration import Breaths, OrganMotion, Respiration
@@ -217,6 +218,13 @@ class SceneEngine:
         lit = self._lit(power, lesion)
         return replace(after, dose=dose, lit=lit, donated=scene.donated)
 
+    def alone(self, scene: SceneState, arms: Mapping[str, LoneArm]) -> LoneSceneEngine | None:
+        """The scene of a state's only environment; None where only `step` can advance it."""
+        still = self.motion is None and self.geometry.compiled and len(arms) > 1
+        if not still or len(self.lasers) != 1 or len(self.endoscopes) != 1 or scene.dose is None:
+            return None
+        return LoneSceneEngine(self, scene, arms)
+
     def fresh_dose(
         self,
         dose: AblationState,
@@ -330,6 +338,101 @@ class SceneEngine:
             return each[0]
         held = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in each)
         return torch.stack([one.expand(len(like)) for one in held], 1)
+
+
+class LoneSceneEngine:
+    """The scene of one environment whose bodies do not move, in kept arrays.
+
+    Clearance and the beam's end come from the engine that the task's configuration names, lines of
+    sight from the batched one, as in `SceneEngine`. The arrays have a batch of one in front.
+    """
+
+    def __init__(self, engine: SceneEngine, scene: SceneState, arms: Mapping[str, LoneArm]):
+        assert scene.lesion is not None
+        assert scene.watched is not None
+        assert scene.dose is not None
+        self._engine, self._scene = engine, scene
+        laser, eye = engine.lasers[0], engine.endoscopes[0]
+        lines = {name: arm.line_mm for name, arm in arms.items()}
+        sight = engine.geometry.alone(lines)
+        own = engine.collision is engine.geometry
+        self.collision = sight if own else engine.collision.alone(lines)
+        self._aim = arms[laser].tip_direction
+        self.beam = self.collision.beam(arms[laser].tip_mm, self._aim, engine.beam_mm, laser)
+        camera, watched = engine.work_camera, int(scene.watched[0])
+        nearest, farthest = (float(far) for far in camera.range_mm)
+        picture = (LIFT_MM, 0.5 * camera.fov_rad, nearest, farthest)
+        points, normals = (
+            t[watched][None].contiguous().numpy() for t in (engine.looks_mm, engine.look_normals)
+        )
+        at = (arms[eye].tip_mm, arms[eye].tip_direction)
+        self._look = sight.look(*at, points, normals, picture, SHORT_MM, eye)
+        self.dose = engine.ablation.alone(scene.dose)
+        self._lit = bool(scene.lit[laser][0])
+        self._find()
+
+    def step(self, power_w: float, dt_s: float) -> None:
+        """The arms have moved, and the beam swept with power_w for dt_s."""
+        self._find()
+        on = self.on_organ and self.beam.body[0] == self._engine.organ
+        self.dose.advance(self.beam.point_mm, self._aim, on, power_w, dt_s)
+        self._lit = power_w > 0.0
+
+    def _find(self) -> None:
+        self.collision.clearance()
+        self.beam.cast()
+        self.view = self._look()
+
+    @property
+    def on_organ(self) -> bool:
+        """Whether the beam meets the organ."""
+        return bool(self.beam.struck[0] == Struck.ORGAN)
+
+    @property
+    def least_mm(self) -> float:
+        """Least clearance to bodies and between arms, mm."""
+        found = self.collision
+        return float(min(found.bodies_mm.min(), found.arms_mm.min()))
+
+    @property
+    def collides(self) -> bool:
+        """An arm touches a body, another arm or itself."""
+        found = self.collision
+        return bool(min(found.bodies_mm.min(), found.arms_mm.min(), found.self_mm.min()) < 0.0)
+
+    @property
+    def state(self) -> SceneState:
+        """A copy of the present state."""
+        found, beam, view = self.collision, self.beam, self.view
+        names = ("struck", "body", "face", "distance_mm", "point_mm", "normal", "incidence_rad")
+        hit = RayHit(**{name: _tensor(getattr(beam, name)) for name in names})
+        visible = _tensor(view.visible)
+        error, reach = _tensor(view.middle).unbind(1)
+        laser, eye = self._engine.lasers[0], self._engine.endoscopes[0]
+        return replace(
+            self._scene,
+            clearance=BatchClearance(
+                *map(_tensor, (found.bodies_mm, found.arms_mm, found.self_mm))
+            ),
+            hits={laser: hit},
+            dose=self.dose.state,
+            views={
+                eye: View(
+                    visible=visible,
+                    hidden=_tensor(view.wanted) & ~visible,
+                    fraction=visible.float().mean(-1),
+                    axis_error_rad=error,
+                    axis_error_mm=reach * error.clamp(0.0, 0.5 * math.pi).sin(),
+                    distance_mm=reach,
+                )
+            },
+            lit={laser: torch.tensor([self._lit])},
+        )
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    """A copy of an array as a tensor."""
+    return torch.from_numpy(array.copy())
 
 
 class ObstacleEngine:

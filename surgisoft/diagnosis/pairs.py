@@ -136,6 +136,8 @@ class Pairs:
     before_mm: np.ndarray
     """(N, n, 3) measured key points of the partner, corrected for the difference of the actuation,
     base frame, mm; NaN where there is none."""
+    body_mm: np.ndarray
+    """(N, n, 3) `before_mm`, also in rows of which AFTER does not show the key points."""
     correction_mm: np.ndarray
     """(N, n, 3) what the model says the difference of the actuation does, mm."""
     repeatability_mm: np.ndarray
@@ -596,8 +598,28 @@ def paired_table(after: ResidualTable, before: ResidualTable) -> tuple[ResidualT
         floor=Floor(float(np.sqrt(np.mean(noise**2))), "pairs"),
         paired_discrepancy_mm=pairs.discrepancy_mm,
         paired_tolerance_mm=pairs.tolerance_mm,
+        body_before_mm=body_before(after, pairs.body_mm),
     )
     return paired, pairs
+
+
+def body_before(after: ResidualTable, before_mm: np.ndarray) -> np.ndarray:
+    """(N, n, 3) key points of BEFORE along every row of AFTER, mm, without gaps.
+
+    before_mm: (N, n, 3) key points of the partners, NaN where there is none. In gaps the model
+    stands in, with what it got wrong at their ends.
+    """
+    wrong = before_mm - after.predicted_mm
+    filled = np.zeros_like(wrong)
+    for number in np.unique(after.run):
+        rows = np.flatnonzero(after.run == number)
+        for point in range(wrong.shape[1]):
+            seen = rows[np.isfinite(wrong[rows, point]).all(1)]
+            if len(seen):
+                filled[rows, point] = np.stack(
+                    [np.interp(rows, seen, axis[seen]) for axis in wrong[:, point].T], axis=1
+                )
+    return after.predicted_mm + filled
 
 
 def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
@@ -625,6 +647,7 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         partner_t_s=found.partner_t_s,
         after_mm=after.measured_mm,
         before_mm=after.measured_mm - change,
+        body_mm=measured_before + correction,
         correction_mm=correction,
         repeatability_mm=repeatability,
         source=source,

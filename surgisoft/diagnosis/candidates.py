@@ -75,6 +75,9 @@ class Candidate:
     """Whether the sensitivities make an effect that the model has already stronger."""
     fitted: bool = False
     """Whether its nonlinear parameters were fitted and not taken from a grid."""
+    removable: bool = False
+    """Whether the effect may also have been taken away, with amplitudes of the other sign: a load
+    that hung on the arm before."""
     spread: np.ndarray | None = None
     """(P, K) the effect's P amplitudes for each of the K that are fitted; None: they are the same.
     """
@@ -282,7 +285,7 @@ def _loads(problem: Problem, facts: ArmFacts, body: np.ndarray) -> list[Candidat
     # Rows of padding repeat the last one.
     effect = Payload(facts)
     still = effect.sensitivities(points, points.new_zeros(*shape[:2], 0))
-    answer = [Candidate("payload", effect, _rows(problem, still))]
+    answer = [Candidate("payload", effect, _rows(problem, still), removable=True)]
     if facts.gravity is None or not problem.table.timed.any():
         return answer
     beam = Beam.through(facts.rest_mm)
@@ -296,7 +299,7 @@ def _loads(problem: Problem, facts: ArmFacts, body: np.ndarray) -> list[Candidat
             _, acceleration = mode.follow(facts, points.flatten(2), history.dt_s)
             force = -acceleration.view(shape) / STANDARD_GRAVITY_MM_S2
             sensitivities = _rows(problem, moved + _pulled(beam, points, force))
-            answer.append(Candidate("payload", Payload(facts), sensitivities))
+            answer.append(Candidate("payload", Payload(facts), sensitivities, removable=True))
     return answer
 
 

@@ -84,6 +84,11 @@ def _near(quantity: Quantity) -> bool:
     return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
 
 
+def _all_near(effect: Effect) -> bool:
+    """Whether all parameters of an effect may turn out plausible."""
+    return all(_near(quantity) for quantity in effect.quantities())
+
+
 def _options_of(
     candidates: Sequence[Candidate], number: int = 0, first: int = 0
 ) -> Iterator[Option]:
@@ -233,9 +238,14 @@ class ModelSelection:
         reversals show must explain more than a function of the actuation does: on ramps that all
         begin at rest, loops can be summed to any such function.
         """
-        effect = self.in_place(self.single(option, base), base)
-        if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
-            return False
+        one = self.single(option, base)
+        effect = self.in_place(one, base)
+        if effect is not None and not _all_near(effect):
+            if not self.candidates[one.alone].removable:
+                return False
+            taken = self.candidates[one.alone].with_amplitudes(-self._amplitudes(one, base))
+            if taken is None or not _all_near(taken):
+                return False
         some = self.candidates[self.options[option.effect][0].alone].effect
         return (
             not hypothesis_of(some).needs_reversals
@@ -244,7 +254,7 @@ class ModelSelection:
 
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
-        amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+        amplitudes = self._amplitudes(option, base)
         part = (self.sensitivities[..., list(option.chosen)] @ amplitudes).reshape(
             len(self.sensitivities), -1
         )
@@ -279,9 +289,13 @@ class ModelSelection:
         """A single candidate's effect at the amplitudes that it is given beside a base."""
         key = (option.candidate, base)
         if key not in self.fitted:
-            amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+            amplitudes = self._amplitudes(option, base)
             self.fitted[key] = self.candidates[option.alone].with_amplitudes(amplitudes)
         return self.fitted[key]
+
+    def _amplitudes(self, option: Option, base: tuple[int, ...]) -> np.ndarray:
+        """(k,) amplitudes of an option beside a base."""
+        return self.validation.amplitudes(base + option.chosen)[len(base) :]
 
     def starts(self, scores: Sequence[Score]) -> list[tuple[str, Effect]]:
         """Effects, by name, in their best single candidate at their amplitudes: starts of a fit."""

@@ -302,6 +302,9 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
         verdict = replace(verdict, kind=kind, sentence=words)
         result = replace(result, next_command="")
     text = f"since {both.names}: {verdict.sentence}; {change.sentence}"
+    for score in found.first:
+        if score.effect in verdict.effects and found.selection.taken_away(score.option):
+            text += f"; there is less {score.effect} than before"
     track = None
     if both.used:
         track = both.track(found.problem, found.explained_mm(verdict.effects))

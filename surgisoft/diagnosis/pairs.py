@@ -641,7 +641,8 @@ class RepeatedShare:
     frequency_Hz: np.ndarray
     """(F,) frequencies, Hz."""
     share: np.ndarray
-    """(F, n) squared coherence of BEFORE and AFTER at each key point, 0 to 1."""
+    """(F, n) share of the power of each key point's motion that both recordings have in common, 0
+    to 1: the root of their squared coherence, which is the product of both shares."""
 
     def at(self, frequency_Hz: np.ndarray) -> np.ndarray:
         """(G, n) the share at other frequencies (G,)."""
@@ -652,22 +653,20 @@ class RepeatedShare:
     def of(self, motion_mm: np.ndarray, step_s: float) -> np.ndarray:
         """(T, n, 3) motion of one run (T, n, 3) with each frequency as far as it is repeated, mm.
 
-        The squared coherence is the product of the shares of power that both recordings have in
-        common; its root is the share of each where they have as much noise. The run is continued by
-        its mirror image, so that it ends where it begins.
+        The run is continued by its mirror image, so that it ends where it begins.
         """
         both = np.concatenate([motion_mm, motion_mm[::-1]])
-        weights = np.sqrt(self.at(np.fft.rfftfreq(len(both), step_s)))
+        weights = self.at(np.fft.rfftfreq(len(both), step_s))
         spectrum = np.fft.rfft(both, axis=0) * weights[..., None]
         return np.fft.irfft(spectrum, len(both), axis=0)[: len(motion_mm)]
 
 
 def repeated_share(after: ResidualTable, before_mm: np.ndarray) -> RepeatedShare:
-    """The squared coherence of the motion before and after, from the training rows.
+    """The share of the motion that BEFORE and AFTER have in common, from the training rows.
 
-    Any load, gain or lag changes a motion that both share by a linear filter, which leaves the
-    coherence at 1 (Bendat & Piersol 2010, ch. 6). Its estimate from K stretches is 1 / K too large
-    where there is none, which is taken off. Slower than LEAST_BINS / SPECTRUM_S, and where there
+    A load, gain or lag filters a motion linearly, which leaves the coherence at 1 (Bendat & Piersol
+    2010, ch. 6). The estimate of the squared coherence from K stretches is 1 / K too large where
+    there is none, which is taken off. Slower than LEAST_BINS / SPECTRUM_S, and where there
     are too few stretches at hand for an estimate, all slow and no fast motion counts as repeated.
     """
     points = before_mm.shape[1]
@@ -689,7 +688,7 @@ def repeated_share(after: ResidualTable, before_mm: np.ndarray) -> RepeatedShare
     share = np.clip((share - 1.0 / count) / (1.0 - 1.0 / count), 0.0, 1.0)
     frequency = np.fft.rfftfreq(length, step)
     share[frequency <= slow] = 1.0
-    return RepeatedShare(frequency, share)
+    return RepeatedShare(frequency, np.sqrt(share))
 
 
 def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
@@ -779,8 +778,8 @@ def free_motion(
     An arm that swings, vibrates or is measured with noise moves at frequencies that the actuation
     hardly contains: there BEFORE or AFTER shows FREE_POWER times the power that the model predicts,
     or more. No change of gain below 1 and no delay of a predicted motion has so much
-    (|1 - exp(i phi)|^2 is at most 4). What of the change there is not coherent with BEFORE counts
-    as noise of the pair: swings that every recording has otherwise. Power by the method of Welch
+    (|1 - exp(i phi)|^2 is at most 4). What BEFORE and AFTER do not have in common there counts as
+    noise of the pair: swings that every recording has otherwise. Power by the method of Welch
     (1967), in bands of a third of an octave.
     """
     points = change_mm.shape[1]
@@ -798,12 +797,12 @@ def free_motion(
     total = power / count
     frequency = np.fft.rfftfreq(length, step)
     band = np.floor(3.0 * np.log2(np.maximum(frequency, frequency[1]) / frequency[1])).astype(int)
-    own = total[:, 4] * (1.0 - repeated.at(frequency))
+    apart = (1.0 - repeated.at(frequency)) * total[:, :2].sum(1)
     free = np.zeros(points)
     for number in range(band[LEAST_BINS] + 1, band.max() + 1):
         before, later, predicted_before, predicted_later = total[band == number, :4].sum((0, 2))
         if before >= FREE_POWER * predicted_before or later >= FREE_POWER * predicted_later:
-            free += own[band == number].sum(0)
+            free += np.minimum(apart, total[:, 4])[band == number].sum(0)
     return np.sqrt(free)
 
 

@@ -238,19 +238,23 @@ class ModelSelection:
         reversals show must explain more than a function of the actuation does: on ramps that all
         begin at rest, loops can be summed to any such function.
         """
-        one = self.single(option, base)
-        effect = self.in_place(one, base)
-        if effect is not None and not _all_near(effect):
-            if not self.candidates[one.alone].removable:
-                return False
-            taken = self.candidates[one.alone].with_amplitudes(-self._amplitudes(one, base))
-            if taken is None or not _all_near(taken):
-                return False
+        effect = self.in_place(self.single(option, base), base)
+        if effect is not None and not _all_near(effect) and not self.taken_away(option, base):
+            return False
         some = self.candidates[self.options[option.effect][0].alone].effect
         return (
             not hypothesis_of(some).needs_reversals
             or self._static_share(option, base) <= SEARCH.most_static
         )
+
+    def taken_away(self, option: Option, base: tuple[int, ...] = ()) -> bool:
+        """Whether an effect is plausible as one that acted before and acts no more, or less."""
+        one = self.single(option, base)
+        effect, candidate = self.in_place(one, base), self.candidates[one.alone]
+        if effect is None or _all_near(effect) or not candidate.removable:
+            return False
+        mirrored = candidate.with_amplitudes(-self._amplitudes(one, base))
+        return mirrored is not None and _all_near(mirrored)
 
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""

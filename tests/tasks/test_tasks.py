@@ -25,9 +25,9 @@ from surgisoft.tasks.registry import (
     TASKS,
     config_from,
     config_of,
-    with_fields,
     make_task,
     read_config,
+    with_fields,
 )
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig

@@ -274,7 +274,7 @@ def diagnose(
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
-        result = since(result, both, found)
+        result = with_less(since(result, both, found), found)
     elif reason:
         cannot = [*without, *(each.effect for each in not_testable)]
         joint = fit_candidates_together(
@@ -312,6 +312,15 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     if both.used:
         track = both.track(found.problem, found.explained_mm(verdict.effects))
     return replace(result, change=both.change, track=track, verdict=replace(verdict, sentence=text))
+
+
+def with_less(result: Diagnosis, found: Findings) -> Diagnosis:
+    """The diagnosis of a change, which says where a named effect acts less than before."""
+    verdict, text = result.verdict, result.verdict.sentence
+    for score in found.first:
+        if score.effect in verdict.effects and found.selection.taken_away(score.option):
+            text += f"; there is less {score.effect} than before"
+    return replace(result, verdict=replace(verdict, sentence=text))
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

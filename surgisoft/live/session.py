@@ -82,6 +82,9 @@ REHEARSED = 3
 """Number of steps of a policy in simulation before the run."""
 PRIORITY = 20
 """Real-time priority of the loop, of 1 to 99; threads of the kernel have 50."""
+OLD_OBJECTS_KEPT = 1_000_000
+"""Threshold of the oldest generation of the garbage collector during a run: it is not looked at, as
+the samples that a run keeps are in it (after 140 s that took 60 ms, longer than a period)."""
 SWITCH_S = 5e-4
 """Longest time for which another thread may hold the interpreter during a run [s]."""
 
@@ -883,6 +886,8 @@ def _undisturbed() -> Iterator[None]:
     threads, interval = torch.get_num_threads(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*thresholds[:2], OLD_OBJECTS_KEPT)
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -890,6 +895,7 @@ def _undisturbed() -> Iterator[None]:
     finally:
         sys.setswitchinterval(interval)
         torch.set_num_threads(threads)
+        gc.set_threshold(*thresholds)
         with suppress(AttributeError):
             gc.unfreeze()
 

@@ -108,7 +108,7 @@ class LoneRing:
         self._find()
 
     def _fires(self) -> bool:
-        """See `laser_work.beam_released`; what is measured is the truth here."""
+        """See `OneLaserTask.released`; what is measured is the truth here."""
         limits = self._limits
         clear = self.least_mm >= limits.clearance_mm and not self.collides
         near = float(self._errors[0]) <= self.task.config.fire_mm

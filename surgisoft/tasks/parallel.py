@@ -140,6 +140,8 @@ class SurgicalEnv(ParallelEnv):
         if self._lone is not None:
             seen = self._lone.observations
             return np.concatenate([seen[agent] for agent in self.possible_agents])
+        if self._batch is None:
+            raise InputError("state before reset: call reset() first")
         seen = self._adapter.vectors(self._batch)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
@@ -153,6 +155,7 @@ class SurgicalEnv(ParallelEnv):
     def _observations(self) -> dict[str, Any]:
         if self._lone is not None:
             return self._lone.observations
+        assert self._batch is not None, "there is one after a reset"
         seen = self._adapter.observations(self._batch)
         return {agent: in_one(seen[agent]) for agent in self.agents}
 

@@ -253,7 +253,7 @@ class ModelArm:
         # A model of commanded pressure has the pumps' lag in it already.
         late = spec.actuation == "measured"
         self.pneumatics = pneumatics if late else replace(pneumatics, tau_s=0.0)
-        row = {"dtype": torch.float32, "device": device}
+        row: dict[str, Any] = {"dtype": torch.float32, "device": device}
         self.low, self.high = torch.tensor(spec.low, **row), torch.tensor(spec.high, **row)
         self.first = torch.tensor(start, **row)
         self.pose = mounted.pose.to(**row)
@@ -557,8 +557,10 @@ class LoneArm:
             "line_mm": self.line_mm,
             "tip_direction": self.tip_direction,
         }
-        copies = {name: torch.from_numpy(array.copy()) for name, array in held.items()}
-        seen = {"seen_mm": copies["points_mm"], "seen_kPa": copies["pressure"]}
+        copies: dict[str, Any] = {
+            name: torch.from_numpy(array.copy()) for name, array in held.items()
+        }
+        seen: dict[str, Any] = {"seen_mm": copies["points_mm"], "seen_kPa": copies["pressure"]}
         return replace(self._part, arm=self.model.state, **copies, **seen)
 
 

@@ -238,8 +238,10 @@ class LoneWorld:
     @classmethod
     def of(cls, world: World, state: WorldState) -> LoneWorld | None:
         """The world of a state's only environment; None where only `World.step` can advance it."""
-        still = world.feed is None and not world.passive and isinstance(world.scene, SceneEngine)
+        still = world.feed is None and not world.passive
         if not still or len(state.steps) != 1 or world.device.type != "cpu":
+            return None
+        if not isinstance(world.scene, SceneEngine):
             return None
         arms: dict[str, LoneArm] = {}
         for name, arm in world.arms.items():

@@ -16,8 +16,9 @@ from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import Collision, CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.circle_ablation import PHANTOM, CircleAblation, CircleAblationConfig
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.world.scene import PHANTOM
 
 
 @pytest.fixture(scope="module")

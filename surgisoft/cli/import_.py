@@ -131,13 +131,13 @@ def recording_(
         ),
     ] = None,
     task: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--lerobot-task",
             metavar="TEXT",
-            help="With --lerobot: what the robot does, in words.",
+            help="With --lerobot: what the robot does, in words; default: Drive the soft arm.",
         ),
-    ] = "Drive the soft arm.",
+    ] = None,
     fps: Annotated[
         int | None,
         typer.Option(
@@ -152,12 +152,12 @@ def recording_(
     With --lerobot they are written as a LeRobotDataset, too, which LeRobot trains policies on.
     """
     from surgisoft.measurement.recordings import summary
-    from surgisoft.measurement.recordings.lerobot import save_lerobot
+    from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot
 
     opened = read_recordings(recordings)
     for recording in opened:
         print(*summary(recording), sep="\n")
     if lerobot:
-        for note in save_lerobot(opened, lerobot, task, fps):
+        for note in save_lerobot(opened, lerobot, TASK if task is None else task, fps):
             print(f"note: {note}")
         print(f"wrote {lerobot}: a LeRobotDataset v3.0")

@@ -163,7 +163,7 @@ def decision(
     ] = None,
     robots: Robots = "200,201,202,203,204,205",
     undertrained: Annotated[
-        str, typer.Option(help="Those among them with an undertrained model too.")
+        str, typer.Option(help="Robots among them that also get an undertrained model.")
     ] = "200,201,203",
     count: Annotated[
         int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")

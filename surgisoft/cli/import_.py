@@ -31,7 +31,7 @@ def import_(
         typer.Option(
             "--map",
             metavar="MAP.toml",
-            help="Map file, or the ready map motive. The log of an interrupted recording (.jsonl) "
+            help="Map file, or motive, the map for files of OptiTrack Motive. The log of an interrupted recording (.jsonl) "
             "and a LeRobotDataset with a recording's names need none.",
         ),
     ] = None,
@@ -49,7 +49,7 @@ def import_(
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames.
 
-    Notes tell what cannot be right: lengths, reversed key points, clocks that are apart. With a
+    Notes name what looks wrong: lengths, reversed key points, clocks that differ. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
     from surgisoft.measurement.importing import (

@@ -105,7 +105,7 @@ def train(
     logger: str = TENSORBOARD,
     **fields: Any,
 ) -> TrainedRun:
-    """Train the agents of a task with PPO (Schulman et al. 2017); all of them learn at the same time.
+    """Train the agents of a task at the same time with PPO (Schulman et al. 2017).
 
     Each agent has its own actor, which sees its own observation, and a critic, which sees those of
     all agents (centralised training, decentralised execution). Returns the run's folder, which

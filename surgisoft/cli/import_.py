@@ -31,8 +31,9 @@ def import_(
         typer.Option(
             "--map",
             metavar="MAP.toml",
-            help="Map file, or motive, the map for files of OptiTrack Motive. The log of an interrupted recording (.jsonl) "
-            "and a LeRobotDataset with a recording's names need none.",
+            help="Map file, or motive, the map for files of OptiTrack Motive. The log of an "
+            "interrupted recording (.jsonl), and a LeRobotDataset with a recording's names, need "
+            "none.",
         ),
     ] = None,
     force: Force = False,

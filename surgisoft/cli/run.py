@@ -80,7 +80,7 @@ def run(
         typer.Option(
             "--clean",
             metavar="S",
-            help="Without --before: time at the start of the run, s, in which the arm is unchanged.",
+            help="Without --before: time at the start of the run in which the arm is unchanged.",
         ),
     ] = 120.0,
     false_alarm: Annotated[

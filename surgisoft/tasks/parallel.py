@@ -174,7 +174,8 @@ def parallel_env(
     """The named task as a PettingZoo ParallelEnv.
 
     Observations (D,) are scaled to the order of 1 (docs/environments), actions (m,) are changes of
-    the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or field.
+    the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or
+    field.
 
     config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the

@@ -22,6 +22,9 @@ from surgisoft.scene import frames
 from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
 from surgisoft.scene.distance import (
+    beams_beside_body,
+    beams_beside_chains,
+    beams_inside_faces,
     chains_apart,
     chains_folded,
     chains_to_surface,
@@ -58,6 +61,13 @@ MOST_PARTS = 256
 """No segment is cut into more parts than this."""
 SLOPE_MM = 0.05
 """Shift of an arm by which the slope of its distance from a strained body is measured (mm)."""
+BESIDE_MM = 1e-3
+"""A ray that passes by at this distance misses, by any engine (mm): the width of the triangle by
+which FCL represents a ray, and a million times the rounding of the others."""
+EDGE_MM = 0.01
+"""A ray that meets a face this far inside its edges meets that face, by any engine (mm)."""
+GRAZING = 0.05
+"""Cosine of the angle between ray and normal below which a hit is not beyond doubt (87 degrees)."""
 EXACT_WITHIN_MM = 5.0
 """Clearances below this are exact; larger ones have the field's interpolation error (mm)."""
 
@@ -246,6 +256,51 @@ class BatchedScene:
             normal=normal.reshape(*shape, 3),
             incidence_rad=incidence.reshape(shape),
         )
+
+    def sure_hits(
+        self,
+        origins_mm: np.ndarray,
+        directions: np.ndarray,
+        range_mm: float,
+        arms: Mapping[str, np.ndarray],
+        own: str | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What rays (N, 3) meet first among bodies at rest, where that is beyond doubt.
+
+        Returns a `Struck` (N,) int8, the ends (N, 3) mm in double precision, and sure (N,) bool.
+        Where a ray is sure, no engine that is right to `BESIDE_MM` finds anything else: it meets a
+        face inside its edges by `EDGE_MM` and not at a grazing angle, every other face of every
+        body, and every arm (N, K, 3) mm, stays `BESIDE_MM` away from it up to there.
+        """
+        count = len(origins_mm)
+        origins, aims, normals = (np.empty((count, 3)) for _ in range(3))
+        aim_rays(origins_mm, directions, origins, aims)
+        np.negative(aims, out=normals)
+        struck, t = np.zeros(count, np.int8), np.full(count, float(range_mm))
+        body, face = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+        sure = np.isfinite(origins).all(1) & np.isfinite(aims).all(1)
+        places = []
+        for n, (one, surface, tree) in enumerate(
+            zip(self.bodies, self._surfaces, self._trees, strict=True)
+        ):
+            turn, shift = (part.numpy() for part in self._inward(one, None))
+            mesh = (tree.arrays, tree.order, surface.normals.numpy(), n, int(struck_of(one)))
+            rays_to_body(origins, aims, 1, turn, shift, *mesh, struck, body, face, t, normals)
+            places.append((turn[0], shift[0], tree))
+        cosine = np.abs((normals * aims).sum(1))
+        met = body >= 0
+        sure &= ~met | (cosine >= GRAZING)
+        before = np.where(met, t - 2.0 * BESIDE_MM / np.maximum(cosine, GRAZING), t)
+        ends = origins + t[:, None] * aims
+        for n, (turn, shift, tree) in enumerate(places):
+            beams_beside_body(origins, aims, before, turn, shift, BESIDE_MM, tree.arrays, sure)
+            triangles = tree.mesh.triangles_mm
+            beams_inside_faces(ends, face, body, n, turn, shift, triangles, EDGE_MM, sure)
+        for name, line in arms.items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            beams_beside_chains(origins, aims, t, line, radius, gap, BESIDE_MM, sure)
+        return struck, ends, sure
 
     def alone(self, lines: Mapping[str, np.ndarray]) -> LoneScene:
         """Queries of one environment among bodies at rest, for the compiled engine."""

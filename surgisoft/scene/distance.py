@@ -553,3 +553,40 @@ def beam_near_surface(origin, aim, range_mm, turn, shift, slack, tree, nodes, re
     q = _moved(turn, shift, origin + range_mm * aim)
     limit = slack * slack
     return segment_surface_d2(p, q, limit, tree[0], tree[1], tree[2], tree[3], nodes, reach) < limit
+
+
+@compiled
+def beams_beside_chains(origins, aims, ranges, lines, radius, gap, slack, sure):
+    """Clear the flags (N,) of beams that may meet an arm (N, K, 3) mm, see `beam_near_chain`."""
+    for n in range(len(sure)):
+        if sure[n] and beam_near_chain(
+            origins[n], aims[n], ranges[n], lines[n], radius, gap, slack
+        ):
+            sure[n] = False
+
+
+@compiled
+def beams_beside_body(origins, aims, ranges, turn, shift, slack, tree, sure):
+    """Clear the flags (N,) of beams that come within `slack` mm of a body; see above."""
+    nodes, reach = np.empty(STACK, np.int64), np.empty(STACK)
+    for n in range(len(sure)):
+        if sure[n] and beam_near_surface(
+            origins[n], aims[n], ranges[n], turn, shift, slack, tree, nodes, reach
+        ):
+            sure[n] = False
+
+
+@compiled
+def beams_inside_faces(ends, faces, bodies, which, turn, shift, triangles, margin, sure):
+    """Clear the flags (N,) of beams that end within `margin` mm of an edge of the face they meet.
+
+    ends (N, 3) mm, world frame; faces and bodies (N,); of body number `which`, whose triangles are
+    (F, 3, 3) mm in its own frame.
+    """
+    limit = margin * margin
+    for n in range(len(sure)):
+        if not sure[n] or bodies[n] != which:
+            continue
+        p, (a, b, c) = _moved(turn, shift, ends[n]), triangle(triangles, faces[n])
+        near = min(segments_d2(p, p, a, b), segments_d2(p, p, b, c), segments_d2(p, p, c, a))
+        sure[n] = near >= limit

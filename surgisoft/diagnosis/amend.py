@@ -162,9 +162,9 @@ class Amendment:
     def claimed(self) -> bool:
         """Whether a fall of the error is claimed for the effects, and for the new model.
 
-        A network that is trained anew together with the effects does not see the held-out rows. If
+        A network that is trained on together with the effects does not see the held-out rows. If
         the given model had been fitted to some of them, its error there is no test, and what counts
-        is the network that was trained on as long without the effects.
+        is the network that was trained on from the same weights for as long without the effects.
         """
         return self.alone.claimed and (self.held_out.claimed or self._seen_before)
 
@@ -194,9 +194,10 @@ class Amendment:
         """The outcome of a joint fit in words."""
         if self._seen_before:
             return (
-                f"{self.alone.sentence}, network and effects fitted together, compared with the "
-                f"network alone, trained on as long; the given model, which had been fitted to "
-                f"{self.held_out.in_fit:.0%} of these rows, has {self.held_out.before:.3f} mm there"
+                f"{self.alone.sentence}, fitted together with the network, compared with the "
+                "network alone, trained on as long from the same weights; the given model, which "
+                f"had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
+                f"{self.held_out.before:.3f} mm there"
             )
         network = f"the network alone, trained on as long, reaches {self.alone.before:.3f} mm"
         if self.held_out.claimed and not self.alone.claimed:
@@ -292,7 +293,9 @@ def amend(
         better, retuned, parameters = joint.model, False, joint.parameters
         refitted = tuple(name for name in names if name in model.effects)
         held_out = whole = sealed.opened(plain).final_check()
+        # Both start from the same weights, whatever these were fitted to.
         alone = fall_of(held_out.with_model(joint.alone), held_out.with_model(better))
+        alone = replace(alone, in_fit=0.0)
         far = far_share(problem.pressure, held_out.pressure)
         if far > FAR_ROWS:
             notes = (

@@ -10,6 +10,7 @@ import torch
 
 from surgisoft.diagnosis.residuals import ResidualTable
 from surgisoft.error_scale import error_scale
+from surgisoft.files import new_file
 from surgisoft.palette import MEASURED_ON_LIGHT, RED, model_colour
 from surgisoft.time_axis import with_gaps
 
@@ -47,8 +48,9 @@ def draw_all(table: ResidualTable, unit: str, folder: Path, title: str = "") -> 
 
 
 def save(figure, path: Path) -> Path:
-    """Write a figure and let go of it."""
-    figure.savefig(path, dpi=130)
+    """Write a figure, whole or not at all, and let go of it."""
+    with new_file(path) as fresh:
+        figure.savefig(fresh, dpi=130)
     plt.close(figure)
     return path
 

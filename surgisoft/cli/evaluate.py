@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import counted, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -147,8 +147,7 @@ def evaluate(
             f"{', '.join(found.measured_arms)}: on a real bench, whose true body is not known; "
             "errors are those of the measured key points, camera noise included"
         )
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
 
 
 def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str, object]:

@@ -192,6 +192,7 @@ def train(
     if why := shortfall(run):
         warn(why)
     print(f"next: {with_effect_files(f'surgisoft evaluate {run.folder}')}")
+    print(f"an episode of its last evaluation: surgisoft replay {run.folder}")
 
 
 def _measures(found: dict | None) -> str:

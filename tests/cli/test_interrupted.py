@@ -16,11 +16,11 @@ def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
     recording = folder / "rec.csv"
     assert run(["collect", "walk", "--points", "300", "-o", str(recording)]) == 0
-    table = recording.read_text().splitlines()
-    (folder / "raw.txt").write_text("\n".join(table))
-    names = table[0].split(",")
+    (folder / "raw.txt").write_text(recording.read_text())
+    points = [[f"k{k}_{axis}_mm" for axis in "xyz"] for k in range(5)]
     (folder / "map.toml").write_text(
-        "[columns]\n" + "".join(f'{name} = "{name}"\n' for name in names if name != "run")
+        '[time]\ncolumn = "t_s"\nunit = "s"\n[measured]\nunit = "kPa"\n'
+        f'[key_points]\nunit = "mm"\npositions = {points}\n'
     )
     trimesh.creation.icosphere(3, 40.0).export(folder / "organ.stl")
     return folder

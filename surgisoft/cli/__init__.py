@@ -161,8 +161,7 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
     except TyperException as error:
         return _usage(error, sorted(MANY.intersection(arguments)))
     except (KeyboardInterrupt, typer.Abort):
-        print(f"surgisoft: interrupted; {left_behind(written)}", file=sys.stderr)
-        return INTERRUPTED
+        code = INTERRUPTED
     except ModuleNotFoundError as error:
         advice = missing_library(error, arguments[0] if arguments else "")
         if advice is None:
@@ -178,8 +177,8 @@ def _run(arguments: list[str] | None, written: list[Path]) -> int:
         return 0
     except OSError as error:
         return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
-    if code == INTERRUPTED:
-        print("surgisoft: interrupted", file=sys.stderr)
+    if code == INTERRUPTED:  # typer turns a KeyboardInterrupt into this code
+        print(f"surgisoft: interrupted; {left_behind(written)}", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

@@ -57,9 +57,16 @@ def check_replay(path: Path | None) -> None:
 
 
 def show_written(paths: Iterable[object]) -> None:
-    """Print each file that was written, and how to look at it where that is not plain."""
+    """Print each file that was written, and how to look at it where that is not plain.
+
+    Of several pages only the first one is to be opened; the others belong to it.
+    """
+    shown = False
     for path in paths:
-        print(f"wrote {path}{_how_to_look(Path(str(path)))}")
+        file = Path(getattr(path, "path", str(path)))
+        pages_follow = file.suffix == ".html" and shown
+        shown = shown or file.suffix == ".html"
+        print(f"wrote {path}{'' if pages_follow else _how_to_look(file)}")
 
 
 def _how_to_look(path: Path) -> str:

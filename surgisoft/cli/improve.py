@@ -105,9 +105,8 @@ def improve(
         print(f"{output} was not written")
         raise typer.Exit(NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
-    names = " ".join(map(str, recordings))
-    following = with_effect_files(f"surgisoft compare {model} {output} {names} --report PAGE")
-    print(f"next, both models side by side: {following}")
+    following = with_effect_files(f"surgisoft compare {model} {output} TEST.parquet --report PAGE")
+    print(f"next, both on a recording that took no part: {following}")
 
 
 def _show(result) -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +28,11 @@ class Text:
     """Paragraphs."""
 
     body: str
-    """Plain text; an empty line starts a new paragraph."""
+    """Plain text; an empty line starts a new paragraph, `backquotes` set code."""
 
     def to_html(self) -> str:
         paragraphs = (part.strip() for part in self.body.split("\n\n"))
-        return "".join(f"<p>{html.escape(part)}</p>" for part in paragraphs if part)
+        return "".join(f"<p>{_with_code(part)}</p>" for part in paragraphs if part)
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,11 @@ class Table:
             f'{caption}<div class="wide" tabindex="0"><table><thead><tr>{head}</tr></thead>'
             f"<tbody>{body}</tbody></table></div>"
         )
+
+
+def _with_code(text: str) -> str:
+    """Escaped text with what stands in backquotes as code."""
+    return re.sub("`([^`\n]+)`", r"<code>\1</code>", html.escape(text))
 
 
 def _flush(right: bool) -> str:

@@ -81,7 +81,7 @@ def ladder_loops(tables: dict[str, ResidualTable], unit: str):
         axes[0, column].set_title(f"{label}: tip RMSE {error:.2f} mm")
         axes[1, column].set_xlabel(f"chamber {chamber + 1} [{unit}]")
     axes[0, 0].set_ylabel("tip, main direction [mm]")
-    axes[1, 0].set_ylabel("tip less a cubic [mm]")
+    axes[1, 0].set_ylabel("tip minus a cubic [mm]")
     axes[0, 0].legend(frameon=False)
     return figure
 
@@ -115,7 +115,10 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
         static = _static(table.pressure, measured)
         pressure = table.pressure[rows, chamber]
         for row, (offset, what) in enumerate(
-            ((0 * static, "tip, main direction [mm]"), (static, "less what pressure explains [mm]"))
+            (
+                (0 * static, "tip, main direction [mm]"),
+                (static, "minus what pressure explains [mm]"),
+            )
         ):
             axis = axes[row, chamber]
             shown = (measured - offset)[rows]

@@ -24,6 +24,8 @@ LADDER_ROWS = 400
 """Rows of the ladder's picture, in which one chamber moves alone."""
 POSTURES = 7
 """Bodies that the picture in space shows."""
+MOST_TICKS = 5
+"""Intervals between the marks on the horizontal axes in space, whose labels else overlap."""
 ERROR_COLOURS = "viridis"
 """Matplotlib's colour map of errors; the replay's is after it."""
 
@@ -215,6 +217,8 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
         axis.set_xlabel("x [mm]")
         axis.set_ylabel("y [mm]")
         axis.set_zlabel("z [mm]")
+        axis.locator_params(axis="x", nbins=MOST_TICKS)
+        axis.locator_params(axis="y", nbins=MOST_TICKS)
         known = table.error_mm[~np.isnan(table.error_mm)]
         rms = np.sqrt(np.square(known).mean())
         axis.set_title(f"{name}: error {rms:.3g} mm")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from surgisoft.agents.run_folder import PACKAGED
 from surgisoft.config import (
     Rule,
     Where,
@@ -21,7 +22,7 @@ from surgisoft.config import (
     write_toml,
 )
 from surgisoft.errors import InputError
-from surgisoft.scene.spec import Length, Point
+from surgisoft.scene.spec import SCENES, Length, Point, spec_file
 from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
 
@@ -299,6 +300,12 @@ def _without_none(value: Any) -> Any:
     return [_without_none(part) for part in value] if isinstance(value, list) else value
 
 
+def _packaged(name: str) -> Path:
+    """The scene, or else the run of training, that the package brings along under a name."""
+    scene = SCENES / name
+    return scene if spec_file(scene).is_file() else PACKAGED / name
+
+
 def _absolute(spec: Experiment, where: Where) -> Experiment:
     """The experiment with absolute paths; raises an InputError for one that does not exist."""
     home = where.path.resolve().parent
@@ -306,8 +313,10 @@ def _absolute(spec: Experiment, where: Where) -> Experiment:
     def there(text: str, place: Where, what: str) -> str:
         path = (home / text).resolve()
         if not path.exists():
+            path = _packaged(text)
+        if not path.exists():
             raise place.error(f"there is no '{text}' beside this file", what)
-        return str(path)
+        return str(path.resolve())
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i

@@ -134,9 +134,11 @@ def evaluate(
             written.append(write_replay(found.logs[policies[0]], replay, report=report_progress))
     if report:
         from surgisoft.agents.report import evaluation_page
+        from surgisoft.experiments.pictures import film
         from surgisoft.report import write_page
 
-        page = evaluation_page(found.task, on, list(found.results), found.logs, about)
+        films = {name: film(log) for name, log in found.logs.items() if log.camera is not None}
+        page = evaluation_page(found.task, on, list(found.results), found.logs, about, films)
         written.append(write_page(page, report / "report.html"))
     print(f"{found.task}, {on}: {about}; mean [95 % interval]")
     _show(found.results)

@@ -112,7 +112,12 @@ def train(
         typer.Option(metavar="MIN", help="Duration of the training, minutes, instead of --steps."),
     ] = None,
     envs: Annotated[
-        int | None, typer.Option(min=1, help="Number of episodes that are simulated in parallel.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of episodes that are simulated in parallel; default: by the task, fewer "
+            "in a short training, which so keeps its number of updates.",
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=SEED_MAX, help="Seed of weights, noise and episodes.")

@@ -129,7 +129,7 @@ def _cell(cell: str | Share, right: bool) -> str:
 
 
 def _is_numeric(cells: Sequence[str | Share]) -> bool:
-    known = [cell for cell in cells if not isinstance(cell, str) or cell not in ("", "-")]
+    known = [cell for cell in cells if not isinstance(cell, str) or cell not in ("", "-", "...")]
     return bool(known) and all(
         isinstance(cell, str) and cell.lstrip("+-−").lstrip("<").strip()[:1].isdigit()
         for cell in known

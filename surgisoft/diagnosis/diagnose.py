@@ -260,7 +260,7 @@ def diagnose(
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)
     if both is not None:
-        result = since(result, both, found)
+        result = with_less(since(result, both, found), found)
     elif reason:
         cannot = [*without, *(each.effect for each in not_testable)]
         joint = fit_candidates_together(
@@ -311,6 +311,15 @@ def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
 def within_repeatability(evidence: Evidence) -> bool:
     """Whether a paired difference is about as large as what BEFORE does not repeat."""
     return evidence.error_over_validated <= CLAIM.most_over_validated
+
+
+def with_less(result: Diagnosis, found: Findings) -> Diagnosis:
+    """The diagnosis of a change, which says where a named effect acts less than before."""
+    verdict, text = result.verdict, result.verdict.sentence
+    for score in found.first:
+        if score.effect in verdict.effects and found.selection.taken_away(score.option):
+            text += f"; there is less {score.effect} than before"
+    return replace(result, verdict=replace(verdict, sentence=text))
 
 
 def with_setup(wrong: SetupResult) -> Diagnosis:

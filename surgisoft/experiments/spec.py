@@ -17,12 +17,13 @@ from surgisoft.config import (
     describe,
     from_table,
     merged,
+    path_beside,
     read_toml,
     to_table,
     write_toml,
 )
 from surgisoft.errors import InputError
-from surgisoft.scene.spec import SCENES, Length, Point, spec_file
+from surgisoft.scene.spec import SCENES, Length, Point
 from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
 
@@ -300,23 +301,19 @@ def _without_none(value: Any) -> Any:
     return [_without_none(part) for part in value] if isinstance(value, list) else value
 
 
-def _packaged(name: str) -> Path:
-    """The scene, or else the run of training, that the package brings along under a name."""
-    scene = SCENES / name
-    return scene if spec_file(scene).is_file() else PACKAGED / name
+def _packaged(name: str) -> Path | None:
+    """The scene or the training run that the package brings along under a name."""
+    kinds = ((SCENES / name, "scene.toml"), (PACKAGED / name, "config.json"))
+    return next((folder for folder, file in kinds if (folder / file).is_file()), None)
 
 
 def _absolute(spec: Experiment, where: Where) -> Experiment:
     """The experiment with absolute paths; raises an InputError for one that does not exist."""
-    home = where.path.resolve().parent
 
     def there(text: str, place: Where, what: str) -> str:
-        path = (home / text).resolve()
-        if not path.exists():
-            path = _packaged(text)
-        if not path.exists():
-            raise place.error(f"there is no '{text}' beside this file", what)
-        return str(path.resolve())
+        packaged = _packaged(text)
+        beside = (place.path.resolve().parent / text).exists()
+        return str(packaged if packaged and not beside else path_beside(place, text, what))
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i

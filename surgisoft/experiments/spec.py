@@ -303,17 +303,20 @@ def _without_none(value: Any) -> Any:
 
 def _packaged(name: str) -> Path | None:
     """The scene or the training run that the package brings along under a name."""
-    kinds = ((SCENES / name, "scene.toml"), (PACKAGED / name, "config.json"))
-    return next((folder for folder, file in kinds if (folder / file).is_file()), None)
+    files = [*PACKAGED.glob("*/config.json"), *SCENES.glob("*/scene.toml")]
+    return {file.parent.name: file.parent for file in files}.get(name)
 
 
 def _absolute(spec: Experiment, where: Where) -> Experiment:
     """The experiment with absolute paths; raises an InputError for one that does not exist."""
 
     def there(text: str, place: Where, what: str) -> str:
-        packaged = _packaged(text)
-        beside = (place.path.resolve().parent / text).exists()
-        return str(packaged if packaged and not beside else path_beside(place, text, what))
+        try:
+            return str(path_beside(place, text, what))
+        except InputError:
+            if (packaged := _packaged(text)) is None:
+                raise
+            return str(packaged)
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i

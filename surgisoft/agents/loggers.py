@@ -55,11 +55,11 @@ def open_writer(name: str, folder: Path, plan: Plan, purge_step: int) -> Any:
 def _of_rsl_rl(name: str, folder: Path, plan: Plan) -> _Stopped:
     """One of rsl-rl's writers; it names its run at the service after the last part of a path."""
     if name == "wandb":
-        import wandb
-        from rsl_rl.utils.wandb_log_writer import WandbLogWriter as Writer
+        from rsl_rl.utils import wandb_log_writer as of_wandb
 
-        writer = Writer(str(folder / "tensorboard"), project_name=PROJECT)
-        wandb.run.name = folder.name
+        writer = of_wandb.WandbLogWriter(str(folder / "tensorboard"), project_name=PROJECT)
+        if (run := getattr(of_wandb.wandb, "run", None)) is not None:
+            run.name = folder.name
     else:
         from rsl_rl.utils.neptune_log_writer import NeptuneLogWriter as Writer
 

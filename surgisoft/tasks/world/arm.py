@@ -21,9 +21,14 @@ from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.tasks.world.adaptation import DisturbanceEstimator
 from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
 from surgisoft.tasks.world.random_streams import Stream
+
+STOOD = 40
+"""Measurements at each pressure before an episode from which the observer learns, where it adapts:
+rigs are held there for 4 s."""
 
 
 @dataclass(frozen=True)
@@ -235,8 +240,9 @@ class ModelArm:
         samples: int,
         device: torch.device,
         observer: AlphaBetaFilter | None = None,
+        dt_s: float = 0.1,
     ):
-        """`samples` is the number K of centreline points."""
+        """`samples` is the number K of centreline points; dt_s: time of a step of the world, s."""
         spec = mounted.model.spec
         if spec.unit != "kPa":
             raise InputError(f"arm '{name}': its model has the unit {spec.unit}, expected kPa")
@@ -260,6 +266,9 @@ class ModelArm:
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
         self._compiled = CompiledStep.of(self.model) if device.type == "cpu" else None
+        self._learner = None
+        if self.observer.adapts:
+            self._learner = DisturbanceEstimator(self.model, dt_s, device=device)
 
     def reference(self) -> ModelArm:
         """This arm stepped by differentiable tensor operations alone, which agree to rounding."""
@@ -279,8 +288,10 @@ class ModelArm:
         pressure = (self.first + vary.start_kPa * spread).clamp(self.low, self.high)
         passed = (self.low + (self.high - self.low) * share).unbind(1)
         state = self.model.initial_state(count)
+        stood = []
         for target in (*passed, pressure):
             state, points = self._advanced(state, gain * target, 1.0)
+            stood.append(points)
         mount = self._moved(turn)
         points = frames.apply(mount, points)
         part = ArmPart(
@@ -302,10 +313,23 @@ class ModelArm:
         if self.observer.raw:
             return stream, part
         nominal = self.model.initial_state(count)
-        for target in (*passed, pressure):
+        learned = None if self._learner is None else self._learner.start(count)
+        for target, at in zip((*passed, pressure), stood, strict=True):
             nominal, shape = self._advanced(nominal, target, 1.0)
+            if self._learner is None:
+                continue
+            stream, noise = stream.normal(self.key_points, 3)
+            seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise
+            off = (seen - frames.apply(self.pose, shape)) @ self.pose[:3, :3]
+            learned, _ = self._learner.updated(learned, off, target, STOOD)
         offset = part.seen_mm - frames.apply(self.pose, shape)
-        return stream, replace(part, belief=Belief(nominal, offset, torch.zeros_like(offset)))
+        zero = torch.zeros_like(offset)
+        belief = Belief(nominal, offset, zero, zero[:, :1])
+        if self._learner is not None:
+            belief = replace(belief, adaptation=learned, offset_mm=zero)
+            now, belief = self._learned(belief, offset, part.seen_kPa)
+            part = replace(part, seen_mm=part.seen_mm - offset + now)
+        return stream, replace(part, belief=belief)
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
@@ -485,10 +509,25 @@ class ModelArm:
         if belief is None:
             return part
         arm, points = self._advanced(belief.arm, part.seen_kPa, dt_s)
-        points = frames.apply(self.pose, points)
-        surprise = part.seen_mm - points - belief.offset_mm
-        now, offset, drift = self.observer.adopted(surprise, belief.offset_mm, belief.drift_mm)
-        return replace(part, seen_mm=points + now, belief=Belief(arm, offset, drift))
+        points = frames.apply(self.pose, points) + belief.fed_mm
+        off = part.seen_mm - points
+        belief = replace(belief, arm=arm)
+        if belief.adaptation is None:
+            before = belief.offset_mm, belief.drift_mm
+            now, offset, drift = self.observer.adopted(off - belief.offset_mm, *before)
+            belief = replace(belief, offset_mm=offset, drift_mm=drift)
+        else:
+            now, belief = self._learned(belief, off, part.seen_kPa)
+        return replace(part, seen_mm=points + now, belief=belief)
+
+    def _learned(self, belief: Belief, off: Tensor, pressure: Tensor) -> tuple[Tensor, Belief]:
+        """Disturbance now (B, n, 3) mm, world frame, and the belief after a measurement `off`."""
+        assert self._learner is not None
+        assert belief.adaptation is not None
+        turn = self.pose[:3, :3]
+        memory, now = self._learner.updated(belief.adaptation, off @ turn, pressure)
+        offset = self._learner.expected(memory, pressure) @ turn.mT
+        return now @ turn.mT, replace(belief, adaptation=memory, offset_mm=offset)
 
 
 def _placed(points: Tensor, mount: Tensor) -> Tensor:

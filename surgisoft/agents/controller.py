@@ -96,6 +96,7 @@ class MeasuredArm:
             offset_mm=zero,
             plant=plant,
             belief=None,
+            factors=None,
         )
         points = self.observer.followed(part, pressure, 0.0).points_mm
         return replace(self.simulated.posed(part, points), seen_mm=points)

@@ -24,6 +24,7 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.world.adaptation import DisturbanceEstimator
 from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
+from surgisoft.tasks.world.random_effects import RandomEffects
 from surgisoft.tasks.world.random_streams import Stream
 
 STOOD = 40
@@ -86,6 +87,9 @@ class Randomisation:
     gain: float = 0.0
     """Standard deviation of the factor between a chamber's pressure and the model's input, no
     unit."""
+    effects_mm: float = 0.0
+    """Largest size of the effect out of the library that an episode's arm has and its model lacks:
+    root mean square displacement of the tip, mm. Each episode draws the kind and the size."""
     noise_mm: float = 0.0
     """Standard deviation of the noise on each coordinate of a measured key point, mm."""
     noise_kPa: float = 0.0
@@ -158,6 +162,8 @@ class ArmPart:
     None where the model moves it. Resets and row selections carry it like any tensor."""
     belief: Belief | None = None
     """Memory of the observer of a simulated arm; None where its estimate is the raw measurement."""
+    factors: Tensor | None = None
+    """(B, K): factors of the episode's random effects; None without any."""
 
     @property
     def model_beside(self) -> ArmState:
@@ -266,6 +272,7 @@ class ModelArm:
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
         self._compiled = CompiledStep.of(self.model) if device.type == "cpu" else None
+        self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
         self._learner = None
         if self.observer.adapts:
             self._learner = DisturbanceEstimator(self.model, dt_s, device=device)
@@ -275,6 +282,11 @@ class ModelArm:
         arm = copy.copy(self)
         arm._compiled = None
         return arm
+
+    @property
+    def _plant(self) -> ArmModel:
+        """The model that moves the simulated arm, which may have effects that `model` lacks."""
+        return self.model if self._random_effects is None else self._random_effects.model
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Draw parameters of an episode for each random number stream; returns (streams, arms)."""
@@ -287,10 +299,13 @@ class ModelArm:
         gain = 1.0 + vary.gain * normal
         pressure = (self.first + vary.start_kPa * spread).clamp(self.low, self.high)
         passed = (self.low + (self.high - self.low) * share).unbind(1)
-        state = self.model.initial_state(count)
+        factors = None
+        if self._random_effects is not None:
+            stream, factors = self._random_effects.draw(stream, vary.effects_mm)
+        state = self._plant.initial_state(count)
         stood = []
         for target in (*passed, pressure):
-            state, points = self._advanced(state, gain * target, 1.0)
+            state, points = self._advanced(state, gain * target, 1.0, factors)
             stood.append(points)
         mount = self._moved(turn)
         points = frames.apply(mount, points)
@@ -308,6 +323,7 @@ class ModelArm:
             seen_mm=points,
             seen_kPa=pressure,
             offset_mm=torch.zeros_like(points),
+            factors=factors,
         )
         stream, part = self._measured(stream, part)
         if self.observer.raw:
@@ -337,7 +353,7 @@ class ModelArm:
         """Advance by dt_s seconds with changes (B, m) kPa of the commanded pressures."""
         inputs = (part.command, part.pressure, part.gain, part.mount, part.arm.pressure)
         step = self._compiled_for(*inputs, action)
-        if step is not None:
+        if step is not None and part.factors is None:
             part = self._stepped(step, part, action, dt_s)
         else:
             queue, action = self._due(part, action)
@@ -371,15 +387,25 @@ class ModelArm:
         self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
     ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
-        state, points = self._advanced(part.arm, part.gain * pressure, dt_s)
+        state, points = self._advanced(part.arm, part.gain * pressure, dt_s, part.factors)
         if self._compiled_for(points, part.mount) is None:
             return state, frames.apply(part.mount, points)
         return state, _placed(points, part.mount)
 
     def _advanced(
-        self, state: ArmState, pressure: Tensor, dt_s: Tensor | float
+        self,
+        state: ArmState,
+        pressure: Tensor,
+        dt_s: Tensor | float,
+        factors: Tensor | None = None,
     ) -> tuple[ArmState, Tensor]:
-        """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m)."""
+        """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m).
+
+        factors: (B, K) of random effects, which the state then has the memories of.
+        """
+        if factors is not None:
+            assert self._random_effects is not None
+            return self._random_effects.step(state, pressure, dt_s, factors)
         step, change = self._compiled_for(pressure, state.pressure), pressure - state.pressure
         if step is None:
             return self.model.step(state, change, dt_s)

@@ -13,7 +13,7 @@ from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
 from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo, set_noise
-from surgisoft.agents.presets import PRESETS, Plan, Preset, preset_for
+from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
 from surgisoft.agents.session import EvaluationRequest
@@ -387,3 +387,17 @@ def test_weights_of_a_new_training_follow_from_its_seed():
 
     assert torch.equal(first(3), first(3))
     assert not torch.equal(first(3), first(4))
+
+
+def test_privileged_observations_reach_critics_and_never_actors():
+    """Whatever the simulation knows besides changes the critic's value, and no action."""
+    task = make_task("track_circle", config_for("robust", config_of("track_circle")))
+    env = JointEnv(task, 4, 0, 1.0, privileged=True)
+    (ppo,) = make_ppo(env, replace(TINY, envs=4), Processes()).values()
+    seen = env.get_observations()
+    wide = seen["arm"].shape[1]
+    other = seen.clone()
+    assert other[STATE].shape[1] > wide
+    other[STATE][:, wide:] += 1.0
+    assert torch.equal(ppo.actor(seen), ppo.actor(other))
+    assert not torch.allclose(ppo.critic(seen), ppo.critic(other))

@@ -145,6 +145,13 @@ def decision(
             help="Further sources of cases: folders with recordings before and after a change.",
         ),
     ] = None,
+    judge: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FOLDER...",
+            help="Cases that take no part in any fit: judged by the fit to all others.",
+        ),
+    ] = None,
     robots: Annotated[
         str, typer.Option(help="Seeds of the own rig's robots, with commas.")
     ] = "200,201,202,203,204,205",
@@ -174,11 +181,13 @@ def decision(
     check_folder(work)
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with progress("decision") as report:
-        some, values = run(plan, count, seed, cases or [], work, processes, report)
+        some, aside, values = run(
+            plan, count, seed, cases or [], work, processes, report, judge or []
+        )
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")
         print(f"wrote {asset}")
-    _show("Decision results", values["command"], markdown(some, values), output)
+    _show("Decision results", values["command"], markdown(some, values, aside), output)
 
 
 @app.command("setup-faults")

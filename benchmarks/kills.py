@@ -1,19 +1,24 @@
 """`python -m benchmarks.kills`: end commands by SIGKILL at any moment, and look at what is left.
 
-A command is run in a forked process and killed before one of its own file operations (opening for
-writing, renaming, making or removing a file or folder, as Python's audit events report them) or
-after a random time. Then its output must be the old one, the new one or absent, and readable. An
-interrupted training is resumed and must end with the weights of an uninterrupted one, bit by bit.
+Each command is run in a process that is forked from one which has imported and tried everything, so
+that a kill takes as long as the command's own work. It is killed before a chosen call of the C
+library that changes a file (a write, opening a new file, renaming, making, removing: kill_at_call.c
+counts them, whichever language calls), in the middle of a chosen write, or after a random time.
+Then its output must be the old one, the new one or absent, and readable. An interrupted training is
+resumed and must end with the weights of an uninterrupted one, bit by bit; an interrupted experiment
+is resumed and must end with the rows of an uninterrupted one.
 """
 
 import argparse
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,14 +26,17 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from benchmarks.fuzz.run import in_child
-from benchmarks.fuzz.targets import make_raw, recording
+from benchmarks.fuzz.run import scratch
+from benchmarks.fuzz.targets import make_lerobot, make_raw, recording
 
-EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate")
-"""Audit events before which a process may be killed (Python documentation, audit events table)."""
+COUNTER = Path(__file__).with_name("kill_at_call.c")
+"""Source of the library that counts calls and ends the process."""
+TORN, RANDOM = 0.25, 0.2
+"""Shares of the kills in the middle of a write, and after a random time."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +51,14 @@ class Command:
     """Reads the output; raises where it is damaged."""
     replaces: bool = True
     """Whether the command may replace an older output."""
+    beside: Callable[[Path], object] | None = None
+    """Looks at what else a kill may leave in the working folder; raises where it is damaged."""
+    finish: Callable[[Path, int], object] | None = None
+    """Continues what was killed; the output must then be the new one."""
+    varies: tuple[str, ...] = ()
+    """Files of the output that state times or versions and are only looked at."""
+    share: float = 1.0
+    """Share of the kills, relative to the other commands."""
 
 
 def _options(**fields):
@@ -101,6 +117,94 @@ def _amend(work: Path, number: int) -> None:
     save_model(found.model, work / "amended", found.to_json(), force=True)
 
 
+def _improve(work: Path, number: int) -> None:
+    from surgisoft.diagnosis.improve import improve
+    from surgisoft.measurement.recordings import load_recordings
+    from surgisoft.surrogate.checkpoint import save_model
+
+    files = load_recordings([work / ("other.parquet" if number else "bench.parquet")])
+    found = improve("default", files, most_effects=1, refit="never")
+    save_model(found.model, work / "improved", found.to_json(), force=True)
+
+
+def _run(work: Path, number: int) -> None:
+    from surgisoft.live.session import run
+
+    run(
+        work / "schedule.csv",
+        f"virtual:seed={number}",
+        "default",
+        clock="simulated",
+        any_model=True,
+        reference_s=REFERENCE_S,
+        on_warning=lambda _: None,
+        output=work / "live.csv",
+        force=True,
+    )
+
+
+def _run_log(work: Path) -> None:
+    """The growing log of a run is absent, without a sample, or readable."""
+    from surgisoft.errors import InputError
+    from surgisoft.measurement.recordings.log import read_log
+
+    log = work / "live.log.jsonl"
+    if log.exists():
+        try:
+            read_log(log)
+        except InputError as error:
+            if "no sample yet" not in str(error) and "is empty" not in str(error):
+                raise
+
+
+REFERENCE_S = 30.0
+"""Clean time of a live run, s; no run here is as long."""
+
+
+def _lerobot(work: Path, _: int) -> None:
+    from surgisoft.measurement.recordings import load_recordings
+    from surgisoft.measurement.recordings.lerobot import save_lerobot
+
+    save_lerobot(load_recordings([work / "bench.parquet"]), work / "set", fps=20)
+
+
+def _open_lerobot(path: Path) -> None:
+    from surgisoft.measurement.recordings.lerobot import load_lerobot
+
+    load_lerobot(path)
+
+
+def _import_lerobot(work: Path, number: int) -> None:
+    from surgisoft.cli import run
+
+    code = run(["import", str(work / "dataset" / "set"), "-o", str(work / "b.csv"), "--force",
+                "--name", f"b{number}"])  # fmt: skip
+    if code != 0:
+        raise RuntimeError(f"import ended with code {code}")
+
+
+def _export(work: Path, _: int) -> None:
+    from surgisoft.surrogate.checkpoint import load_model
+    from surgisoft.surrogate.export import export_arm
+
+    export_arm(load_model("default"), work / "exported")
+
+
+def _open_exported(path: Path) -> None:
+    """Both graphs and the description of an exported arm."""
+    import onnx
+    import torch
+
+    about = json.loads((path / "arm.json").read_text())
+    for file in path.iterdir():
+        if file.suffix == ".onnx":
+            onnx.checker.check_model(onnx.load(file))
+        elif file.suffix == ".pt":
+            torch.jit.load(file)
+    if not about:
+        raise ValueError("arm.json is empty")
+
+
 def _experiment(work: Path, number: int) -> None:
     from surgisoft.experiments.session import finish_experiment, start_experiment
 
@@ -108,6 +212,20 @@ def _experiment(work: Path, number: int) -> None:
     file.write_text(TINY.replace("SEED", str(number)))
     there = (work / "results" / "experiment.toml").is_file()
     spec, folder = start_experiment(file, work / "results", (), None, resume=False, force=there)
+    finish_experiment(spec, folder, 1, False, "kills")
+
+
+def _resume_experiment(work: Path, number: int) -> None:
+    """Continue results of the new experiment, begin anew where the old or no results are there."""
+    from surgisoft.experiments.session import finish_experiment, start_experiment
+    from surgisoft.experiments.spec import load_experiment
+
+    file = work / "tiny.toml"
+    file.write_text(TINY.replace("SEED", str(number)))
+    there = work / "results" / "experiment.toml"
+    new = there.is_file() and load_experiment(there).seed == number
+    old = there.is_file() and not new
+    spec, folder = start_experiment(file, work / "results", (), None, resume=new, force=old)
     finish_experiment(spec, folder, 1, False, "kills")
 
 
@@ -159,12 +277,26 @@ def _open_scene(path: Path) -> None:
 COMMANDS: dict[str, Command] = {
     "collect": Command(_collect, "a.parquet", _recording),
     "import": Command(_import, "a.csv", _recording),
-    "fit": Command(_fit, "arm", _model),
-    "amend": Command(_amend, "amended", _model),
-    "experiment": Command(_experiment, "results", _results),
-    "scene new": Command(_scene, "scene", _open_scene, replaces=False),
+    "import a dataset": Command(_import_lerobot, "b.csv", _recording),
+    "recording --lerobot": Command(_lerobot, "set", _open_lerobot, replaces=False),
+    "fit": Command(_fit, "arm", _model, varies=("report.json",)),
+    "amend": Command(_amend, "amended", _model, varies=("report.json",)),
+    "improve": Command(_improve, "improved", _model, varies=("report.json",), share=0.5),
+    "run": Command(_run, "live.csv", _recording, beside=_run_log),
+    "experiment": Command(
+        _experiment,
+        "results",
+        _results,
+        finish=_resume_experiment,
+        varies=("report.html", "versions.json"),
+    ),
+    "scene new": Command(_scene, "scene", _open_scene, replaces=False, share=0.5),
+    "export": Command(_export, "exported", _open_exported, replaces=False),
 }
 """The commands that are killed, beside `train`."""
+
+TRAIN = "train"
+"""The command that is killed up to three times and resumed."""
 
 
 def prepare(work: Path) -> None:
@@ -176,58 +308,62 @@ def prepare(work: Path) -> None:
     from surgisoft.rig import VirtualRig
 
     make_raw(work / "raw")
+    make_lerobot(work / "dataset")
     rows = "".join(f"{0.5 * i},{10 + i},{i % 7},{i % 5}\n" for i in range(8))
     (work / "schedule.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n" + rows)
-    rig = VirtualRig(0, hidden=[("creep", 1.0)])
-    found, _ = rig.record(make_protocol("mixed", rig.limits, points=1200))
-    save_recording(found, work / "bench.parquet")
-    trimesh.creation.icosphere(subdivisions=3, radius=70.0).export(work / "organ.ply")
+    for name, hidden in (("bench", "creep"), ("other", "gain_mismatch")):
+        rig = VirtualRig(0, hidden=[(hidden, 1.0)])
+        found, _ = rig.record(make_protocol("mixed", rig.limits, points=600))
+        save_recording(found, work / f"{name}.parquet")
+    trimesh.creation.icosphere(subdivisions=2, radius=70.0).export(work / "organ.ply")
 
 
-def state_of(path: Path) -> str:
+def state_of(path: Path, varies: tuple[str, ...] = ()) -> str:
     """Hash of a file or of all files of a folder; `absent` where there is none.
 
-    `report.json` of a model states how long the fit took, so that it is only read.
+    varies: files whose content is left out, which have to be there all the same.
     """
     if not path.exists():
         return "absent"
     digest = hashlib.sha256()
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
-        if file.name == "report.json":
-            json.loads(file.read_text())
+        digest.update(str(file.relative_to(path.parent)).encode())
+        if file.name in varies:
+            if file.suffix == ".json":
+                json.loads(file.read_text())
             continue
-        digest.update(str(file.relative_to(path.parent)).encode() + file.read_bytes())
+        digest.update(file.read_bytes())
     return digest.hexdigest()
 
 
-def run_child(call: Callable[[], object], at: int | None, after_s: float | None) -> tuple[int, int]:
-    """Run a call in a forked process; (file operations seen, exit status).
+@dataclass(frozen=True)
+class Moment:
+    """When a process is killed."""
 
-    at: kill before this file operation, counted from 1. after_s: kill after this time.
-    """
+    call: int = 0
+    """Before this call that changes a file, counted from 1; 0: not at a call."""
+    torn: bool = False
+    """Whether a write is done by half first."""
+    after_s: float | None = None
+    """After this time, s."""
+
+
+AT_NO_TIME = Moment()
+
+
+def run_child(call: Callable[[], object], moment: Moment = AT_NO_TIME) -> tuple[int, int]:
+    """Run a call in a forked process; (calls that changed a file, exit status)."""
     reading, writing = os.pipe()
+    counter = ctypes.CDLL(os.environ["LD_PRELOAD"])
     pid = os.fork()
     if pid == 0:
         os.close(reading)
         sink = os.open(os.devnull, os.O_WRONLY)
         os.dup2(sink, 1)
         os.dup2(sink, 2)
-        warnings.simplefilter("ignore")
-        seen = 0
-
-        def hook(event: str, given: tuple) -> None:
-            nonlocal seen
-            if event not in EVENTS:
-                return
-            if event == "open" and (given[1] is None or not set("wax+") & set(str(given[1]))):
-                return
-            seen += 1
-            if seen == at:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-        sys.addaudithook(hook)
         code = 1
+        counter.kill_arm(moment.call, int(moment.torn))
         try:
             call()
             code = 0
@@ -235,96 +371,127 @@ def run_child(call: Callable[[], object], at: int | None, after_s: float | None)
             with contextlib.suppress(OSError):
                 os.write(writing, traceback.format_exc().encode())
         finally:
-            os.write(writing, b"\0%d" % seen)
+            os.write(writing, b"\0%d" % counter.kill_seen())
             os._exit(code)
     os.close(writing)
-    if after_s is not None:
-        time.sleep(after_s)
+    if moment.after_s is not None:
+        time.sleep(moment.after_s)
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    status = os.waitpid(pid, 0)[1]
     with os.fdopen(reading, "rb") as pipe:
         said, _, count = pipe.read().rpartition(b"\0")
+    status = os.waitpid(pid, 0)[1]
     if os.WIFEXITED(status) and os.WEXITSTATUS(status) != 0:
         raise RuntimeError(said.decode())
     return int(count or 0), status
 
 
-def kill_command(name: str, folder: Path, inputs: Path, random: random.Random) -> dict:
-    """Kill a command once; what was left of its output, and whether that is a finding."""
-    command = COMMANDS[name]
-    work = folder / "work"
-    shutil.rmtree(work, ignore_errors=True)
-    shutil.copytree(inputs / name, work)
-    target = work / command.output
-    old = state_of(target)
-    about = json.loads((inputs / f"{name}.json").read_text())
-    at = random.randint(1, about["operations"]) if random.random() < 0.75 else None
-    after_s = None if at else random.uniform(0.0, about["seconds"])
-    _, status = run_child(lambda: command.run(work, 1), at, after_s)
-    killed = os.WIFSIGNALED(status)
-    now, bad = state_of(target), ""
-    kind = {old: "old", about["new"]: "new", "absent": "absent"}.get(now, "other")
-    if now != "absent":
+def moments(count: int, calls: int, seconds: float, random: random.Random) -> list[Moment]:
+    """So many moments: every call once before any of them twice, torn writes, random times."""
+    late = round(RANDOM * count)
+    torn = round(TORN * count)
+    found = [Moment(after_s=random.uniform(0.0, seconds)) for _ in range(late)]
+    found += [Moment(random.randint(1, calls), torn=True) for _ in range(torn)]
+    at: list[int] = []
+    while len(at) < count - len(found):
+        at += random.sample(range(1, calls + 1), calls)
+    found += [Moment(call) for call in at[: count - len(found)]]
+    random.shuffle(found)
+    return found
+
+
+def kill_command(name: str, folder: Path, count: int, seed: int, note: Callable) -> None:
+    """Kill a command so many times; `note` is given what was left of its output each time."""
+    command, inputs, old, work = COMMANDS[name], folder / "in", folder / "old", folder / "work"
+    inputs.mkdir(parents=True)
+    prepare(inputs)
+    shutil.copytree(inputs, old)
+    command.run(old, 0)  # warms up this process: everything is imported, compiled and cached
+    if not command.replaces:
+        shutil.rmtree(old)
+        shutil.copytree(inputs, old)
+
+    def whole() -> str:
+        return state_of(work / command.output, command.varies)
+
+    shutil.copytree(old, work)
+    before = whole()
+    began = time.monotonic()
+    calls, _ = run_child(lambda: command.run(work, 1))
+    seconds, new = time.monotonic() - began, whole()
+    for moment in moments(count, calls, seconds, random.Random(f"{seed} {name}")):
+        shutil.rmtree(work)
+        shutil.copytree(old, work)
+        _, status = run_child(lambda: command.run(work, 1), moment)
+        killed, bad = os.WIFSIGNALED(status), ""
+        now = whole()
+        kind = {before: "old", new: "new", "absent": "absent"}.get(now, "between")
         try:
-            command.read(target)
-        except FileNotFoundError:
-            kind = "absent"
+            if now != "absent":
+                with contextlib.suppress(FileNotFoundError):
+                    command.read(work / command.output)
+            if command.beside:
+                command.beside(work)
+            if command.finish:
+                run_child(lambda: command.finish(work, 1))
+                if whole() != new:
+                    bad = "continued, it is not what an uninterrupted one gives"
+            elif kind == "between":
+                bad = "neither the old nor the new output"
         except Exception as error:
             bad = f"{type(error).__name__}: {error}"
-    if kind == "other" and not bad and name not in ("experiment",):
-        kind = "mixed"
-    return {"command": name, "killed": killed, "left": kind, "bad": bad, "at": at, "s": after_s}
+        note(_row(name, moment, int(killed), kind, bad))
 
 
-def ready(name: str, inputs: Path) -> None:
-    """Inputs of a command with an old output, the new output's hash, operations and seconds."""
-    command, work = COMMANDS[name], inputs / name
-    prepare_once = inputs / "_inputs"
-    if not prepare_once.is_dir():
-        prepare_once.mkdir(parents=True)
-        in_child(lambda: prepare(prepare_once))
-    shutil.copytree(prepare_once, work)
-    run_child(lambda: command.run(work, 1), None, None)
-    new = state_of(work / command.output)
-    shutil.rmtree(work)
-    shutil.copytree(prepare_once, work)
-    if command.replaces:
-        run_child(lambda: command.run(work, 0), None, None)
-    trial = inputs / "_trial"
-    shutil.copytree(work, trial)
-    began = time.monotonic()
-    operations, _ = run_child(lambda: command.run(trial, 1), None, None)
-    seconds = time.monotonic() - began
-    shutil.rmtree(trial)
-    about = {"new": new, "operations": operations, "seconds": seconds}
-    (inputs / f"{name}.json").write_text(json.dumps(about))
+def _row(name: str, moment: Moment, kills: int, left: str, bad: str) -> dict:
+    when = "time" if moment.after_s is not None else "in a write" if moment.torn else "call"
+    about = {"command": name, "killed": kills, "when": when, "left": left, "bad": bad}
+    return about | {"call": moment.call, "s": moment.after_s}
 
 
-def kill_training(folder: Path, random: random.Random, whole: str, operations: int) -> dict:
-    """Kill a training up to three times, resume it to its end, compare with the uninterrupted."""
-    run = folder / "run"
-    shutil.rmtree(run, ignore_errors=True)
-    kills, bad = 0, ""
-    for _ in range(random.choice((1, 1, 2, 3))):
-        at = random.randint(1, operations)
-        _, status = run_child(lambda: _train(run), at, None)
-        kills += os.WIFSIGNALED(status)
-    try:
-        run_child(lambda: _train(run), None, None)
-        bad = "" if _weights(run) == whole else "other weights than the uninterrupted training"
-    except Exception as error:
-        bad = f"{type(error).__name__}: {error}"
-    return {"command": "train", "killed": kills, "left": "resumed", "bad": bad}
+TRAININGS = ("fast", "randomised", "paper", "fast normalised")
+"""Presets that are trained; `normalised`: with running normalisers of the observations."""
 
 
-def _train(run: Path) -> None:
+def kill_training(folder: Path, count: int, seed: int, note: Callable) -> None:
+    """Kill trainings up to three times, resume to the end, compare with uninterrupted ones."""
+    own, done, number = random.Random(f"{seed} train"), 0, 0
+    whole, calls = {}, {}
+    for preset in TRAININGS:
+        first = folder / preset
+        _train(folder / f"{preset} warm", preset)
+        calls[preset], _ = run_child(partial(_train, first, preset))
+        whole[preset] = _weights(first)
+    while done < count:
+        preset, run = TRAININGS[number % len(TRAININGS)], folder / "run"
+        number += 1
+        shutil.rmtree(run, ignore_errors=True)
+        kills, bad = 0, ""
+        moment = Moment()
+        for _ in range(own.choice((1, 1, 2, 3))):
+            moment = Moment(own.randint(1, calls[preset]), torn=own.random() < TORN)
+            try:
+                _, status = run_child(partial(_train, run, preset), moment)
+                kills += os.WIFSIGNALED(status)
+            except Exception as error:
+                bad = f"{type(error).__name__}: {error}"
+        try:
+            run_child(partial(_train, run, preset))
+            if _weights(run) != whole[preset]:
+                bad = "other weights than the uninterrupted training"
+        except Exception as error:
+            bad = f"{type(error).__name__}: {error}"
+        done += max(1, kills)
+        note(_row(TRAIN, moment, kills, f"resumed, {preset}", bad))
+
+
+def _train(run: Path, name: str) -> None:
     """A new training, or the continuation of the one that is there."""
     import torch
 
     from surgisoft.agents import training
     from surgisoft.agents.distributed import Processes
-    from surgisoft.agents.presets import Plan, Preset
+    from surgisoft.agents.presets import PRESETS, Plan, config_for
     from surgisoft.tasks.registry import config_of
 
     training.CHECKPOINT_S = 0.0  # a checkpoint after each iteration
@@ -332,8 +499,12 @@ def _train(run: Path) -> None:
     if (run / "config.json").is_file():
         training.resume(run, Processes(), device)
         return
-    preset = Preset(envs=4, rollout=4, epochs=1, batches=2, hidden=(8,), evaluation_episodes=1)
-    plan = Plan("track_circle", config_of("track_circle"), "fast", preset, steps=64)
+    base, _, normalised = name.partition(" ")
+    small = {"envs": 4, "rollout": 4, "epochs": 1, "batches": 2, "hidden": (8,)}
+    preset = replace(
+        PRESETS[base], **small, evaluation_episodes=1, normalise=bool(normalised), evaluate_every=2
+    )
+    plan = Plan("track_circle", config_for(base, config_of("track_circle")), base, preset, steps=64)
     training.train_new(run, plan, Processes(), device)
 
 
@@ -365,49 +536,101 @@ def _weights(run: Path) -> str:
     return digest.hexdigest()
 
 
+def preloaded() -> None:
+    """Start this program again with the library that counts calls, where it is not loaded."""
+    if "kill_at_call" in os.environ.get("LD_PRELOAD", ""):
+        return
+    library = Path(tempfile.mkdtemp()) / "kill_at_call.so"
+    build = ["cc", "-shared", "-fPIC", "-O1", "-o", str(library), str(COUNTER), "-ldl"]
+    subprocess.run(build, check=True)
+    os.environ.update(LD_PRELOAD=str(library), OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    os.execv(sys.executable, [sys.executable, "-m", "benchmarks.kills", *sys.argv[1:]])
+
+
+def served(name: str, count: int, seed: int, note: Callable[[dict], None]) -> int:
+    """Kill one command in a process of its own; its exit code, 0 where all kills were made."""
+    sys.stdout.flush()
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        warnings.simplefilter("ignore")
+        try:
+            with scratch() as folder:
+                os.chdir(folder)
+                kill = kill_training if name == TRAIN else None
+                if kill is None:
+                    kill_command(name, folder, count, seed, note)
+                else:
+                    kill(folder, count, seed, note)
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def report(rows: list[dict], names: list[str]) -> str:
+    """The table of all kills."""
+    kills, left, bad = Counter(), {name: Counter() for name in names}, Counter()
+    for row in rows:
+        name = row["command"]
+        kills[name] += row["killed"]
+        left.setdefault(name, Counter())[row["left"]] += 1
+        bad[name] += bool(row["bad"])
+    lines = ["| command | kills | what was left | damaged |", "|---|---|---|---|"]
+    for name in left:
+        words = ", ".join(f"{n} {kind}" for kind, n in sorted(left[name].items()))
+        lines.append(f"| {name} | {kills[name]} | {words} | {bad[name]} |")
+    when = Counter()
+    for row in rows:
+        when[row["when"]] += row["killed"]
+    lines.append(f"| all | {sum(kills.values())} | | {sum(bad.values())} |")
+    said = ", ".join(f"{n} {kind}" for kind, n in when.items())
+    return "\n".join([*lines, "", f"moments: {said}"])
+
+
 def main() -> int:
     """Parse, kill, print; exit code 1 where something was left half."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kills", description=__doc__)
-    parser.add_argument("--kills", type=int, default=500, help="number of kills (500)")
-    parser.add_argument("--seconds", type=float, default=1e9, help="end after this time, too")
+    parser.add_argument("--kills", type=int, default=600, help="number of kills (600)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", default=[*COMMANDS, "train"])
-    parser.add_argument("--log", type=Path, help="append each kill to this file")
+    parser.add_argument("--only", nargs="+", default=[*COMMANDS, TRAIN])
+    parser.add_argument("--log", type=Path, help="append each kill; commands that are complete in "
+                        "it are not killed again")  # fmt: skip
     given = parser.parse_args()
-    os.environ["OMP_NUM_THREADS"] = "1"
-    for module in ("surgisoft.agents.training", "surgisoft.experiments.session", "trimesh"):
+    preloaded()
+    for module in ("surgisoft.agents.training", "surgisoft.experiments.session", "trimesh",
+                   "surgisoft.live.session", "surgisoft.surrogate.export"):  # fmt: skip
         __import__(module)
-    chosen, counts, bad = random.Random(given.seed), Counter(), []
-    with tempfile.TemporaryDirectory() as folder:
-        inputs, end = Path(folder) / "inputs", time.monotonic() + given.seconds
-        for name in given.only:
-            if name in COMMANDS:
-                ready(name, inputs)
-        if "train" in given.only:
-            first = Path(folder) / "whole"
-            operations, _ = run_child(lambda: _train(first), None, None)
-            whole = _weights(first)
-        done = 0
-        while done < given.kills and time.monotonic() < end:
-            name = given.only[done % len(given.only)] if done < 10**9 else ""
-            if name == "train":
-                found = kill_training(Path(folder), chosen, whole, operations)
-            else:
-                found = kill_command(name, Path(folder), inputs, chosen)
-            done += max(1, int(found["killed"]))
-            counts[name, found["left"]] += 1
-            counts[name, "kills"] += int(found["killed"])
-            if found["bad"] or found["left"] in ("mixed",):
-                bad.append(found)
-                print(f"{name}: {found}", flush=True)
-            if given.log:
-                with given.log.open("a") as file:
-                    file.write(json.dumps(found) + "\n")
-    print(f"{sum(n for (_, kind), n in counts.items() if kind == 'kills')} kills:")
+    log = (given.log or Path(tempfile.mkdtemp()) / "kills.jsonl").absolute()
+    shares = {name: COMMANDS[name].share if name in COMMANDS else 1.5 for name in given.only}
+
+    def note(row: dict) -> None:
+        with log.open("a") as file:
+            file.write(json.dumps(row | {"seed": given.seed}) + "\n")
+        if row["bad"]:
+            print(f"{row['command']}: {row}", flush=True)
+
+    failed = False
     for name in given.only:
-        kinds = {kind: n for (command, kind), n in sorted(counts.items()) if command == name}
-        print(f"  {name:12} {', '.join(f'{n} {kind}' for kind, n in kinds.items())}")
-    return int(bool(bad))
+        count = -(-given.kills * shares[name] // sum(shares.values()))
+        earlier = [
+            row for row in _rows(log) if row["command"] == name and row["seed"] == given.seed
+        ]
+        count = int(count) - sum(max(1, row["killed"]) for row in earlier)
+        if count > 0:
+            began = time.monotonic()
+            failed |= served(name, count, given.seed + len(earlier), note) != 0
+            print(f"{name}: {count} kills in {time.monotonic() - began:.0f} s", flush=True)
+    rows = _rows(log)
+    print(report(rows, given.only))
+    return int(failed or any(row["bad"] for row in rows))
+
+
+def _rows(log: Path) -> list[dict]:
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
 
 
 if __name__ == "__main__":

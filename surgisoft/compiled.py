@@ -28,7 +28,7 @@ def compiled(function: Callable) -> Callable:
     """
     dispatcher = njit(cache=True, nogil=True, error_model="numpy")(function)
     folder = Path(function.__code__.co_filename).parent
-    index = dispatcher._cache._cache_file  # type: ignore[attr-defined]
+    index = dispatcher._cache._cache_file  # type: ignore[attr-defined]  # private
     index._source_stamp = _source_stamp(folder)
     index._version = f"{numba.__version__} {index._source_stamp}"
     return dispatcher

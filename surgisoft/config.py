@@ -12,6 +12,7 @@ Reading is bounded: a file of any content ends in a value or in one line, never 
 
 import dataclasses
 import difflib
+import functools
 import math
 import re
 import reprlib
@@ -89,6 +90,18 @@ class Where:
         return InputError(f"{place}: {field}{came}; expected {expected}")
 
 
+def path_beside(where: Where, text: str, what: str) -> Path:
+    """The file or folder that a field names, relative to its file; an InputError where none is."""
+    try:
+        found = (where.path.resolve().parent / text).resolve()
+        there = found.exists()
+    except (OSError, ValueError):  # too long a name, a zero byte
+        there = False
+    if not there:
+        raise where.error(f"there is no '{_short(text)}' beside this file", what)
+    return found
+
+
 def line_of(text: str, keys: tuple[str | int, ...]) -> int:
     """1-based line on which the field (or the nearest table above it) is written; 0 if unknown."""
     counts: dict[str, int] = {}
@@ -154,7 +167,7 @@ def from_table(kind: type, table: object, where: Where):
     """Build the frozen dataclass `kind` from a TOML table; the error names the first bad field."""
     if not isinstance(table, dict):
         raise where.error(f"got {describe(table)}", f"a table [{where.field}]")
-    hints = typing.get_type_hints(kind, include_extras=True)
+    hints = _hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name in table:
         if name not in fields:
@@ -173,6 +186,12 @@ def from_table(kind: type, table: object, where: Where):
             )
     built = kind(**values)
     return built.checked(where) if hasattr(built, "checked") else built
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, typing.Any]:
+    """Types of the fields of a dataclass; to find them takes longer than to read a table."""
+    return typing.get_type_hints(kind, include_extras=True)
 
 
 def to_table(config: typing.Any) -> typing.Any:

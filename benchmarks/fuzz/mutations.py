@@ -1,10 +1,12 @@
-"""Mutations of files that know the container: text, JSON, TOML, NPZ, safetensors, Parquet, PyTorch.
+"""Mutations of files that know the container: text, JSON, TOML, arrays, tables, checkpoints.
 
 `mutated(random, name, content)` changes one file. Half of the mutations change bytes or words and
 often break the container; the others take the container apart, change what is inside and put it
 together again, so that they reach the code behind the parser.
 """
 
+import functools
+import gzip
 import io
 import json
 import math
@@ -40,13 +42,52 @@ INTEGERS += (2**40, 2**62, 2**63, 2**64 - 1)
 
 def mutated(random: Random, name: str, content: bytes) -> bytes:
     """The content of the file `name` after one to three mutations."""
-    kinds = [change_bytes, *KINDS.get(name.rpartition(".")[2], (change_text,))]
-    for _ in range(random.choice((1, 1, 1, 2, 3))):
+    suffix = name.rpartition(".")[2]
+    kinds = [change_bytes, *KINDS.get(suffix, (change_text,))]
+    for number in range(random.choice((1, 1, 1, 2, 3))):
+        if number and suffix in FRAGILE:
+            kinds = [change_bytes, change_head]
         try:
             content = random.choice(kinds)(random, content)
         except Exception:  # what an earlier mutation broke cannot be taken apart again
             content = change_bytes(random, content)
     return content
+
+
+@functools.lru_cache(maxsize=64)
+def _json_tree(content: bytes) -> Any:
+    """The parsed JSON; a change copies what it changes, so that one parse serves many inputs."""
+    return json.loads(content)
+
+
+@functools.lru_cache(maxsize=64)
+def _toml_tree(content: bytes) -> dict:
+    return tomllib.loads(content.decode())
+
+
+@functools.lru_cache(maxsize=16)
+def _arrays(content: bytes) -> dict[str, np.ndarray]:
+    with np.load(io.BytesIO(content)) as file:
+        return dict(file)
+
+
+@functools.lru_cache(maxsize=16)
+def _parquet(content: bytes) -> Any:
+    import pyarrow.parquet as pq
+
+    return pq.read_table(io.BytesIO(content))
+
+
+@functools.lru_cache(maxsize=16)
+def _checkpoint(content: bytes) -> Any:
+    import torch
+
+    return torch.load(io.BytesIO(content), weights_only=True)
+
+
+@functools.lru_cache(maxsize=16)
+def _unpacked(content: bytes) -> bytes:
+    return gzip.decompress(content)
 
 
 def change_bytes(random: Random, content: bytes) -> bytes:
@@ -153,7 +194,7 @@ def change_tree(random: Random, value: Any, values: tuple[Any, ...] = VALUES) ->
 
 def change_json(random: Random, content: bytes) -> bytes:
     """A change of one node of a JSON file."""
-    return json.dumps(change_tree(random, json.loads(content))).encode()
+    return json.dumps(change_tree(random, _json_tree(content))).encode()
 
 
 def change_json_lines(random: Random, content: bytes) -> bytes:
@@ -169,7 +210,7 @@ def change_toml(random: Random, content: bytes) -> bytes:
     import tomli_w
 
     values = tuple(v for v in VALUES if v is not None)
-    return tomli_w.dumps(change_tree(random, tomllib.loads(content.decode()), values)).encode()
+    return tomli_w.dumps(change_tree(random, _toml_tree(content), values)).encode()
 
 
 DTYPES = ("f4", "f8", "i4", "i8", "u1", "?", "c16", "f2", "U4", "S3", "M8[s]", ">f8")
@@ -209,8 +250,7 @@ def change_array(random: Random, array: np.ndarray) -> np.ndarray:
 
 def change_npz(random: Random, content: bytes) -> bytes:
     """An .npz file with an array changed, lost, exchanged, or with a false header."""
-    with np.load(io.BytesIO(content)) as file:
-        arrays = dict(file)
+    arrays = dict(_arrays(content))
     names = list(arrays)
     name = random.choice(names)
     claims: dict[str, bytes] = {}
@@ -261,7 +301,7 @@ def change_parquet(random: Random, content: bytes) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pq.read_table(io.BytesIO(content))
+    table = _parquet(content)
     at = random.randrange(table.num_columns)
     name, column = table.column_names[at], table.column(at)
     match random.randrange(7):
@@ -296,8 +336,8 @@ def change_checkpoint(random: Random, content: bytes) -> bytes:
 
     if random.random() < 0.6:
         tensors = (torch.zeros(()), torch.zeros(2, 3), torch.full((4,), math.nan))
-        tree = torch.load(io.BytesIO(content), weights_only=True)
         out = io.BytesIO()
+        tree = _checkpoint(content)
         torch.save(_change_tensors(random, tree, (*VALUES, *tensors)), out)
         return out.getvalue()
     out = io.BytesIO()
@@ -341,14 +381,130 @@ def _put(tree: Any, path: list, new: Any) -> Any:
 
 
 def change_gzip(random: Random, content: bytes) -> bytes:
-    """A gzip file with another text in it, or one that unpacks to a gigabyte."""
-    import gzip
+    """A gzip file with other content in it, or one that unpacks to a gigabyte."""
+    if random.random() < 0.0005:
+        return _bomb()
+    inside = _unpacked(content)
+    change = change_text if inside[:64].isascii() and b"\0" not in inside[:64] else change_head
+    return gzip.compress(change(random, inside), 1)
 
-    if random.random() < 0.02:
-        return gzip.compress(bytes(1 << 30), 1)
-    return gzip.compress(change_text(random, gzip.decompress(content)), 1)
+
+@functools.cache
+def _bomb() -> bytes:
+    return gzip.compress(bytes(1 << 30), 1)
 
 
+def change_head(random: Random, content: bytes) -> bytes:
+    """An integer, a real number or a flipped bit in the first 2,048 bytes, where headers are."""
+    data = bytearray(content)
+    at = random.randrange(min(len(data), random.choice((64, 512, 2048))) or 1)
+    form = random.choice(("B", "B", "<H", "<H", "<I", "<Q", "<f", "<d", ">I"))
+    value: Any = random.choice(INTEGERS) % (1 << min(8 * struct.calcsize(form), 64))
+    if form in ("<f", "<d"):
+        value = random.choice((0.0, -1.0, 1e30, math.nan, math.inf))
+    if random.random() < 0.3 and data:
+        data[at] ^= 1 << random.randrange(8)
+    else:
+        data[at : at + struct.calcsize(form)] = struct.pack(form, value)
+    return bytes(data)
+
+
+def change_matlab(random: Random, content: bytes) -> bytes:
+    """A MATLAB file with a variable changed, lost, exchanged or of another kind."""
+    from scipy.io import savemat
+
+    fields = dict(_matlab(content))
+    name = random.choice(list(fields))
+    match random.randrange(6):
+        case 0:
+            del fields[name]
+        case 1:
+            fields[name] = fields[random.choice(list(fields))]
+        case 2:
+            fields[name] = random.choice(("x", {"a": [1.0]}, np.array([], float), [[1], "x"]))
+        case 3 if isinstance(fields[name], dict):
+            inner = dict(fields[name])
+            key = random.choice(list(inner))
+            fields[name] = inner | {key: change_array(random, inner[key])}
+        case _:
+            fields[name] = change_array(random, fields[name])
+    out = io.BytesIO()
+    savemat(out, fields, do_compression=random.random() < 0.5)
+    return out.getvalue()
+
+
+@functools.lru_cache(maxsize=16)
+def _matlab(content: bytes) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    found = loadmat(io.BytesIO(content), simplify_cells=True)
+    return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+def change_hdf5(random: Random, content: bytes) -> bytes:
+    """An HDF5 file with a dataset changed, lost, or one that claims more than the file holds."""
+    import h5py
+
+    out = io.BytesIO(content)
+    with h5py.File(out, "r+") as file:
+        names: list[str] = []
+        file.visititems(lambda name, item: names.append(name) if item.name else None)
+        sets = [name for name in names if isinstance(file[name], h5py.Dataset)]
+        name = random.choice(sets)
+        values = file[name][()]
+        del file[name]
+        match random.randrange(8):
+            case 0:
+                pass
+            case 1:
+                shape = random.choice(((10**9,), (10**6, 10**6), (2**40,), (0,)))
+                file.create_dataset(name, shape, "f8", chunks=True, maxshape=(None,) * len(shape))
+            case 2:
+                file[name] = random.choice((np.array(["a"], object), 1.0, h5py.Empty("f8")))
+            case 3:
+                file[name] = h5py.SoftLink(random.choice(("/", "/none", f"/{name}", "/t")))
+            case 4:
+                file[name] = h5py.ExternalLink("raw.h5", random.choice(("/", name)))
+            case 5:
+                file.create_group(f"{name}/{random.choice(('a', 'b.c', '0'))}")
+            case _:
+                plain = values if not values.dtype.names else values[values.dtype.names[0]]
+                file[name] = change_array(random, plain)
+    return out.getvalue()
+
+
+def change_mcap(random: Random, content: bytes) -> bytes:
+    """An MCAP file with a record changed, lost, twice or with another length."""
+    at, records = 8, []
+    while at + 9 <= len(content) - 8:
+        (size,) = struct.unpack_from("<Q", content, at + 1)
+        records.append(content[at : at + 9 + size])
+        at += 9 + size
+    number = random.randrange(len(records))
+    record = records[number]
+    match random.randrange(6):
+        case 0:
+            del records[number]
+        case 1:
+            records.insert(number, records[random.randrange(len(records))])
+        case 2:
+            records[number] = record[:1] + struct.pack("<Q", random.choice(INTEGERS)) + record[9:]
+        case 3:
+            records[number] = bytes([random.randrange(16)]) + record[1:]
+        case _:
+            inside = random.choice((change_bytes, change_head))(random, record[9:])
+            records[number] = record[:1] + struct.pack("<Q", len(inside)) + inside
+    return content[:8] + b"".join(records) + content[-8:]
+
+
+def change_nrrd(random: Random, content: bytes) -> bytes:
+    """An NRRD file with a change in the text of its header."""
+    head, gap, body = content.partition(b"\n\n")
+    return change_text(random, head) + gap + body
+
+
+FRAGILE = ("mat", "h5")
+"""Files whose libraries may end the process: what one mutation made is not taken apart again."""
 Mutation = Callable[[Random, bytes], bytes]
 
 KINDS: dict[str, tuple[Mutation, ...]] = {
@@ -359,7 +515,12 @@ KINDS: dict[str, tuple[Mutation, ...]] = {
     "safetensors": (change_safetensors, change_safetensors),
     "parquet": (change_parquet, change_parquet),
     "pt": (change_checkpoint, change_checkpoint, change_checkpoint),
-    "gz": (change_gzip,),
+    "gz": (change_gzip, change_gzip),
+    "mat": (change_head, change_matlab, change_matlab),
+    "h5": (change_head, change_hdf5, change_hdf5),
+    "mcap": (change_mcap, change_mcap),
+    "nrrd": (change_nrrd, change_nrrd, change_nrrd),
+    **dict.fromkeys(("c3d", "nii", "bin"), (change_head, change_head)),
     **dict.fromkeys(("stl", "rrd", "glb", "field"), ()),
     **dict.fromkeys(("csv", "txt", "obj", "off", "ply"), (change_text, change_text)),
 }

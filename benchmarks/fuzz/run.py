@@ -1,7 +1,7 @@
 """Runs of the fuzzer: worker processes with limits, the record of what they find.
 
-The parent imports the readers and forks a worker for each batch of inputs, so that a crash, a hang
-or an allocation ends a worker and not the run. Input number i of a target is the same for the same
+The parent forks a worker for each batch of inputs, so that a crash, a hang or an allocation ends a
+worker and not the run. Input number i of a target is the same for the same
 seed and the same corpus.
 """
 
@@ -19,12 +19,14 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.fuzz.mutations import mutated
 from benchmarks.fuzz.targets import TARGETS, Target
+from surgisoft import apart
 from surgisoft.errors import InputError
 
 
@@ -38,31 +40,10 @@ class Limits:
     """Wall time of one input, s: for a reader that waits; a loaded machine has to stay below."""
     memory_bytes: int = 1 << 30
     """Address space beyond that of a worker which has read the valid files."""
-    batch_s: float = 30.0
-    """Time of one worker, s."""
+    batch_s: float = 60.0
+    """Time of one worker, s, of which it imports what it needs for a few."""
     message: int = 1000
     """Longest message, characters."""
-
-
-READ_ONLY_IMPORTS = (
-    "numba",
-    "pyarrow.csv",
-    "pyarrow.parquet",
-    "rerun",
-    "torch",
-    "trimesh",
-    "surgisoft.agents.learned",
-    "surgisoft.agents.report",
-    "surgisoft.agents.training",
-    "surgisoft.diagnosis.decision",
-    "surgisoft.experiments.plan",
-    "surgisoft.measurement.importing",
-    "surgisoft.measurement.protocols",
-    "surgisoft.replay.episode_view",
-    "surgisoft.replay.show",
-    "surgisoft.scene.folder",
-)
-"""Modules that the parent imports once for all workers."""
 
 
 def fuzz(
@@ -72,34 +53,56 @@ def fuzz(
     seed: int,
     limits: Limits,
     note: Callable[[dict], None],
+    planned: Mapping[str, int] | None = None,
+    done: Mapping[str, int] | None = None,
+    kept: Path | None = None,
 ) -> None:
-    """Fuzz the named targets for some time; `note` is given the record of each batch."""
+    """Fuzz the named targets for some time; `note` is given the record of each batch.
+
+    planned: inputs of each target after which it is done, so that the run may end early. done:
+    inputs of each target that an earlier run has read; this one goes on behind them. kept: folder
+    for the valid files, which are made where it lacks them; None: in memory, made anew.
+    """
     os.environ.update(OMP_NUM_THREADS="1", MALLOC_ARENA_MAX="1")
-    for name in READ_ONLY_IMPORTS:
-        __import__(name)
     with scratch() as folder:
-        corpus = folder / "corpus"
+        corpus = kept or folder / "corpus"
+        makers: dict[Callable, str] = {}
         for name in names:
-            in_child(lambda name=name: make_corpus(corpus, name))
+            same = makers.setdefault(TARGETS[name].make, name)
+            if same != name and not (corpus / name).is_dir():
+                shutil.copytree(corpus / same, corpus / name)
+            elif not (corpus / name).is_dir():
+                in_child(lambda name=name: make_corpus(corpus, name))
+        apart.started = forked
         end = time.monotonic() + seconds
-        queue, position = turns_of(names), dict.fromkeys(names, 0)
+        position = {name: (done or {}).get(name, 0) for name in names}
+        turns, spent = turns_of(names), Counter(dict.fromkeys(names, 0.0))
         running: dict[int, Batch] = {}
-        while time.monotonic() < end or running:
+        while True:
+            left = [n for n in names if planned is None or position[n] < planned[n]]
+            if not running and (not left or time.monotonic() >= end):
+                return
             busy = {batch.target for batch in running.values()}
-            if len(running) < workers and time.monotonic() < end:
-                name = next(name for name in queue if name not in busy or len(names) <= len(busy))
-                batch = Batch(name, seed, position[name], corpus / name, folder, limits, end)
+            free = [n for n in left if n not in busy or (planned is None and len(left) < workers)]
+            if len(running) < workers and time.monotonic() < end and free:
+                if planned is None:
+                    name, last = next(n for n in turns if n in free), None
+                else:  # quick readers are done first, slow ones share the rest of the time
+                    name = min(free, key=lambda n: spent[n])
+                    last = planned[name]
+                batch = Batch(name, seed, position[name], corpus / name, folder, limits, end, last)
                 running[batch.start()] = batch
                 # Numbers of another worker of the same target must not overlap.
-                position[name] += 1_000_000 if len(names) < workers else 0
+                position[name] += 1_000_000 if planned is None and len(names) < workers else 0
                 continue
             for pid in list(running):
                 record = running[pid].finished()
                 if record is not None:
-                    done = running.pop(pid)
-                    position[done.target] = max(position[done.target], record.pop("next"))
+                    batch = running.pop(pid)
+                    position[batch.target] = max(position[batch.target], record.pop("next"))
+                    spent[batch.target] += record["seconds"]
                     note(record)
-            time.sleep(0.1)
+            time.sleep(0.02)
 
 
 def turns_of(names: Sequence[str]) -> Iterator[str]:
@@ -187,12 +190,14 @@ class Batch:
     folder: Path
     limits: Limits
     end: float
+    last: int | None = None
+    """Number behind that of the last input; None: until the time of a worker is over."""
 
     def start(self) -> int:
         """Fork the worker; returns its process id."""
         self.now = mmap.mmap(-1, 16)
         self.now[:16] = struct.pack("<qd", self.first, time.monotonic())
-        self.out = Path(tempfile.mkdtemp(dir=self.folder))
+        self.out, self.began = Path(tempfile.mkdtemp(dir=self.folder)), time.monotonic()
         sys.stdout.flush()
         self.pid = os.fork()
         if self.pid == 0:
@@ -225,6 +230,7 @@ class Batch:
             "target": self.target,
             "first": self.first,
             "inputs": number - self.first,
+            "seconds": round(time.monotonic() - self.began, 2),
             "next": number,
             "findings": findings,
         }
@@ -235,6 +241,8 @@ class Batch:
 
     def _work(self) -> None:
         target = TARGETS[self.target]
+        for name in target.imports:
+            __import__(name)
         warnings.simplefilter("ignore")
         sink = os.open(os.devnull, os.O_WRONLY)
         os.dup2(sink, 1)
@@ -245,7 +253,7 @@ class Batch:
         with (self.out / "findings.jsonl").open("w") as file:
             _limit(self.limits)
             number, end = self.first, min(self.end, time.monotonic() + self.limits.batch_s)
-            while time.monotonic() < end:
+            while time.monotonic() < end and number != self.last:
                 self.now[:16] = struct.pack("<qd", number, time.monotonic())
                 with inputs.put(number) as sample:
                     signal.setitimer(signal.ITIMER_PROF, self.limits.hang_s)
@@ -265,6 +273,34 @@ def _limit(limits: Limits) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
+
+
+def forked(module: str, path: Path) -> apart.Ended:
+    """`surgisoft.apart.started` where the process that reads is forked from this one.
+
+    It has imported the library already, so that an input takes the time of reading it.
+    """
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
+        pid = os.fork()
+        if pid == 0:
+            code = 1
+            try:
+                signal.setitimer(signal.ITIMER_PROF, 0.0)
+                os.dup2(out.fileno(), 1)
+                os.dup2(errors.fileno(), 2)
+                sys.stdout, sys.stderr = (os.fdopen(n, "w", closefd=False) for n in (1, 2))
+                code = apart.answer(module, path)
+                sys.stderr.flush()
+            except BaseException as error:
+                os.write(2, f"{type(error).__name__}: {error}".encode("utf-8", "replace"))
+            finally:
+                os._exit(code)
+        _, status, used = os.wait4(pid, 0)
+        if used.ru_utime + used.ru_stime > Limits.hang_s:
+            raise RuntimeError(f"the reading process computed for {used.ru_utime:.0f} s")
+        out.seek(0)
+        errors.seek(0)
+        return apart.Ended(os.waitstatus_to_exitcode(status), out.read(), errors.read())
 
 
 def examine(name: str, number: int, sample: Path, limits: Limits) -> dict | None:

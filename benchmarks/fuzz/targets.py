@@ -14,6 +14,8 @@ import numpy as np
 
 from surgisoft.scene.spec import PHANTOM
 
+CONTOUR_STEP_MM = 2.0
+"""Distance of the points of a contour that is laid on the organ, mm."""
 SCENE_MESHES = ("liver.ply", "gallbladder.ply", "tray.ply")
 """Meshes of the packaged scene."""
 
@@ -30,6 +32,10 @@ class Target:
     """Patterns of the files of a sample that are mutated."""
     weight: float = 1.0
     """Share of the time, relative to the other targets."""
+    inputs: int = 5_000
+    """Inputs of a million: more where a reader is quick."""
+    imports: tuple[str, ...] = ()
+    """Modules that a worker imports at once, for the processes that it forks."""
 
 
 def recording(rows: int = 60):
@@ -55,7 +61,7 @@ def make_recordings(folder: Path) -> None:
     from surgisoft.measurement.recordings.file import save_recording
 
     for suffix in ("csv", "parquet"):
-        save_recording(recording(), folder / suffix / f"a.{suffix}")
+        save_recording(recording(24), folder / suffix / f"a.{suffix}")
         side = folder / suffix / "a.toml"
         side.write_text(side.read_text() + "[arm]\nlength_mm = 70.0\n")
 
@@ -71,7 +77,7 @@ def make_lerobot(folder: Path) -> None:
     """A LeRobotDataset of two episodes."""
     from surgisoft.measurement.recordings.lerobot import save_lerobot
 
-    save_lerobot([recording()], folder / "set")
+    save_lerobot([recording(24)], folder / "set")
 
 
 def read_lerobot(sample: Path) -> None:
@@ -177,6 +183,11 @@ def make_raw(folder: Path) -> None:
     (folder / "motive" / "take.csv").write_text(_motive())
     log = "t_s,p1_kPa,p2_kPa\n" + "".join(f"{i / 20},{i % 9},{i % 4}\n" for i in range(60))
     (folder / "motive" / "log.csv").write_text(log)
+    make_lerobot(folder / "lerobot")
+    state = "observation.state."
+    names = ["t", *(f"{state}p{i}_kPa" for i in (1, 2)), *(f"{state}k2_{a}_mm" for a in "xyz")]
+    more = "[runs]\ntime_restarts = true\n"
+    _write_map(folder / "lerobot", "format = 'lerobot'", ["timestamp", *names[1:]], more)
 
 
 def _motive(planes: int = 3, markers: int = 3, rows: int = 40) -> str:
@@ -359,25 +370,53 @@ def make_replays(folder: Path) -> None:
 
 def read_rrd(sample: Path) -> None:
     """The recording's duration and views, as `replay --screenshot` needs them."""
-    from surgisoft.replay.contents import contents
+    from surgisoft.apart import read_apart
+    from surgisoft.replay import contents
     from surgisoft.replay.show import find_replay
 
-    contents(find_replay(sample / "replay.rrd"))
+    read_apart(contents.__name__, find_replay(sample / "replay.rrd"), "a Rerun recording")
 
 
 def make_scenes(folder: Path) -> None:
-    """The liver phantom."""
-    sample = folder / "phantom"
-    sample.mkdir(parents=True)
-    for name in ("scene.toml", *SCENE_MESHES):
-        shutil.copy2(PHANTOM / name, sample / name)
+    """The liver phantom with coarse meshes, as it is and with a contour of a CSV file."""
+    import trimesh
+
+    from surgisoft.config import read_toml, write_toml
+    from surgisoft.scene.folder import open_scene
+
+    table = read_toml(PHANTOM / "scene.toml")[0]
+    for name in ("phantom", "contour"):
+        sample = folder / name
+        sample.mkdir(parents=True)
+        for mesh in SCENE_MESHES:
+            whole = trimesh.load_mesh(PHANTOM / mesh)
+            few = whole.vertices[:: max(1, len(whole.vertices) // 300)]
+            hull = trimesh.convex.convex_hull(few)
+            hull.export(sample / mesh)
+            if mesh == table["bodies"][0]["mesh"]:
+                for part in (table["lesion"], *table["contours"]):
+                    for key in ("centre_mm", "points_mm"):
+                        if part.get(key):
+                            near = trimesh.proximity.closest_point(hull, np.atleast_2d(part[key]))
+                            part[key] = np.reshape(near[0].round(3), np.shape(part[key])).tolist()
+        write_toml(sample / "scene.toml", table)
+    ring = open_scene(folder / "contour").ring
+    path = ring.points_mm[:: max(1, len(ring.points_mm) // 12)]
+    rows = "".join(f"{x:.2f},{y:.2f},{z:.2f}\n" for x, y, z in path)
+    (folder / "contour" / "line.csv").write_text("x,y,z\n" + rows)
+    with (folder / "contour" / "scene.toml").open("a") as file:
+        file.write("\n[[contours]]\nname = 'line'\nfile = 'line.csv'\n")
 
 
 def read_scene(sample: Path) -> None:
-    """The scene and its ring."""
+    """The scene, its ring, and its contours on the organ."""
+    from surgisoft.scene.contours import contour_path
     from surgisoft.scene.folder import open_scene
 
-    open_scene(sample).ring  # noqa: B018
+    scene = open_scene(sample)
+    scene.ring  # noqa: B018
+    for contour in scene.spec.contours:
+        contour_path(scene.organ.world_mesh, contour, CONTOUR_STEP_MM)
 
 
 def make_experiments(folder: Path) -> None:
@@ -390,6 +429,8 @@ def make_experiments(folder: Path) -> None:
         text = file.read_text() + "\n[[drivers]]\nname = 'mine'\nschedule = 'schedule.csv'\n"
         (sample / "experiment.toml").write_text(text)
         shutil.copy2(folder / "_schedule" / "one" / "schedule.csv", sample / "schedule.csv")
+        for scene in PHANTOM.glob("*.toml"):
+            shutil.copy2(scene, sample.parent / scene.name)
     shutil.rmtree(folder / "_schedule")
 
 
@@ -471,25 +512,413 @@ def read_decision(sample: Path) -> None:
     load_decision(path)
 
 
+LAB_COLUMNS = ["t", "u1", "u2", "x", "y", "z"]
+"""Columns of the made-up files of a laboratory: time, two actuations, one key point."""
+
+
+def _lab_values(rows: int = 12) -> np.ndarray:
+    """(rows, 6) time in s, actuation in kPa and a key point in m."""
+    t = 0.05 * np.arange(rows)
+    wave = np.sin(t[:, None] * [3.0, 4.0, 1.0, 2.0, 5.0])
+    return np.column_stack([t, 10 + 5 * wave[:, :2], 0.02 * wave[:, 2:]])
+
+
+def _write_map(sample: Path, role: str, names: list[str], more: str = "") -> None:
+    """The map of a sample: one file, columns in the order of LAB_COLUMNS."""
+    sample.mkdir(parents=True, exist_ok=True)
+    t, u1, u2, *xyz = names
+    (sample / "map.toml").write_text(
+        f"[file.log]\n{role}\n[time]\ncolumn = '{t}'\n[measured]\ncolumns = ['{u1}', '{u2}']\n"
+        f"unit = 'kPa'\n[key_points]\npositions = [{xyz}]\nunit = 'm'\n{more}"
+    )
+
+
+def make_c3d(folder: Path) -> None:
+    """A C3D file of two markers, one of them lost once, and two analog channels."""
+    import ezc3d
+
+    values, made = _lab_values(), ezc3d.c3d()
+    sample = folder / "one"
+    names = ["t_s", "valve1", "valve2", "tip.x", "tip.y", "tip.z"]
+    _write_map(sample, "format = 'c3d'", names)
+    made["parameters"]["POINT"]["RATE"]["value"] = [20]
+    made["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    made["parameters"]["POINT"]["LABELS"]["value"] = ("base", "tip")
+    made["parameters"]["ANALOG"]["RATE"]["value"] = [20]
+    made["parameters"]["ANALOG"]["LABELS"]["value"] = ("valve1", "valve2")
+    points = np.ones((4, 2, len(values)))
+    points[:3, 1] = 1000.0 * values[:, 3:].T
+    residuals = np.zeros((1, 2, len(values)))
+    residuals[0, 0, 4] = -1.0
+    made["data"]["meta_points"]["residuals"] = residuals
+    made["data"]["points"], made["data"]["analogs"] = points, values[:, 1:3].T[None]
+    made.write(str(sample / "raw.c3d"))
+
+
+def make_matlab(folder: Path) -> None:
+    """MATLAB files of version 5: plain, compressed, and with structs."""
+    from scipy.io import savemat
+
+    values = _lab_values()
+    columns = dict(zip(LAB_COLUMNS, values.T, strict=True))
+    for name, packed in (("plain", False), ("packed", True)):
+        _write_map(folder / name, "format = 'matlab'", LAB_COLUMNS)
+        savemat(folder / name / "raw.mat", columns | {"who": "me"}, do_compression=packed)
+    struct = {"trial": {"t": values[:, 0], "p": values[:, 1:3], "k": values[:, None, 3:]}}
+    names = ["t", "p.0", "p.1", "k.0", "k.1", "k.2"]
+    _write_map(folder / "struct", "format = 'matlab'\ntopic = 'trial'", names)
+    savemat(folder / "struct" / "raw.mat", struct | {"gain": np.eye(3)})
+
+
+def make_hdf5(folder: Path) -> None:
+    """HDF5 files: vectors, packed chunks, a compound type, and MATLAB's version 7.3."""
+    import h5py
+
+    values = _lab_values()
+    for name, how in {
+        "plain": {},
+        "packed": {"compression": "gzip", "chunks": True, "shuffle": True},
+    }.items():
+        _write_map(folder / name, "format = 'hdf5'", LAB_COLUMNS)
+        with h5py.File(folder / name / "raw.h5", "w") as file:
+            for column, content in zip(LAB_COLUMNS, values.T, strict=True):
+                file.create_dataset(column, data=content, **how)
+    _write_map(folder / "compound", "format = 'hdf5'\ntopic = 'log'", LAB_COLUMNS)
+    with h5py.File(folder / "compound" / "raw.h5", "w") as file:
+        file["log"] = np.rec.fromarrays(values.T, names=",".join(LAB_COLUMNS))
+    names = ["t", "p.0", "p.1", "k.0", "k.1", "k.2"]
+    _write_map(folder / "matlab", "format = 'matlab'\ntopic = 'trial'", names)
+    with h5py.File(folder / "matlab" / "raw.mat", "w", userblock_size=512) as file:
+        group = file.create_group("trial")
+        group["t"], group["p"], group["k"] = values[:, :1].T, values[:, 1:3].T, values[:, 3:].T
+
+
+def make_mcap(folder: Path) -> None:
+    """MCAP files: JSON in one topic, ROS 2 messages in two, with and without chunks."""
+    from mcap.writer import CompressionType, Writer
+    from mcap_ros2.writer import Writer as RosWriter
+
+    values = _lab_values()
+    fields = [f"data.{i}" for i in range(5)]
+    _write_map(folder / "json", "format = 'mcap'\ntopic = '/log'", ["t_s", *fields])
+    with (folder / "json" / "raw.mcap").open("wb") as file:
+        bag = Writer(file, use_chunking=False)
+        bag.start()
+        schema = bag.register_schema("log", "jsonschema", b"{}")
+        channel = bag.register_channel("/log", "json", schema)
+        for t, *row in values:
+            stamp = round(1e9 * (1000.0 + t))
+            text = ('{"data": [' + ", ".join(map(str, row)) + "]}").encode()
+            bag.add_message(channel, stamp, text, stamp)
+        bag.finish()
+    for packed in ("none", "lz4", "zstd"):
+        names = ["t_s", *(f"{topic}.data.{i}" for topic, n in (("/p", 2), ("/k", 3))
+                          for i in range(n))]  # fmt: skip
+        _write_map(folder / packed, "format = 'mcap'\ntopics = ['/p', '/k']", names)
+        with (folder / packed / "raw.mcap").open("wb") as file:
+            bag = RosWriter(file, compression=getattr(CompressionType, packed.upper()))
+            kind = bag.register_msgdef("std_msgs/Float64MultiArray", "float64[] data\n")
+            for t, *row in values:
+                stamp = round(1e9 * (1000.0 + t))
+                for topic, part in (("/p", row[:2]), ("/k", row[2:])):
+                    bag.write_message(topic, kind, {"data": part}, stamp, stamp)
+            bag.finish()
+
+
+CONTEXT = """
+question = "Is the arm's tip accurate enough to cut a ring?"
+use = "The model replaces the arm in training."
+title = "made up"
+model = "default"
+recordings = ["a.csv"]
+[risk]
+influence = "medium"
+consequence = "low"
+reason = "a phantom"
+[limits]
+error_mm = 2.0
+tip_error_mm = 3.0
+area_mm = 1.0
+applicable = 0.9
+[uncertainty]
+noise_mm = 0.1
+input = [0.2, 0.2, 0.3]
+parameters_mm = 0.05
+[[sources]]
+name = "a"
+robot = "first"
+date = "2026-01-01"
+[scenario]
+states = ["a.csv"]
+payload_g = [0.0, 5.0]
+"""
+
+
+def make_contexts(folder: Path) -> None:
+    """A CONTEXT.toml with everything that one may state."""
+    (folder / "one").mkdir(parents=True)
+    (folder / "one" / "context.toml").write_text(CONTEXT)
+    (folder / "one" / "a.csv").write_text("")
+
+
+def read_context(sample: Path) -> None:
+    """The context of use, as `compare --credibility` opens it."""
+    from surgisoft.credibility.context import load_context
+
+    load_context(sample / "context.toml")
+
+
+def make_segmentations(folder: Path) -> None:
+    """Segmented images: NIfTI, plain and packed, and NRRD with named segments."""
+    import nibabel
+    import nrrd
+
+    voxels = np.zeros((8, 8, 8), np.uint8)
+    voxels[1:7, 1:7, 1:7] = 1
+    voxels[3:5, 3:5, 3:5] = 2
+    for name in ("image.nii", "image.nii.gz"):
+        (folder / name.replace(".", "_")).mkdir(parents=True)
+        image = nibabel.Nifti1Image(voxels, np.diag([2.0, 2.0, 2.0, 1.0]))
+        nibabel.save(image, folder / name.replace(".", "_") / name)
+    header = {
+        "space": "left-posterior-superior",
+        "space directions": 2.0 * np.eye(3),
+        "space origin": [0.0, 0.0, 0.0],
+        "Segment0_Name": "organ",
+        "Segment0_LabelValue": "1",
+        "Segment0_Layer": "0",
+    }
+    for encoding in ("raw", "gzip"):
+        (folder / encoding).mkdir()
+        kept = header | {"encoding": encoding}
+        nrrd.write(str(folder / encoding / "image.nrrd"), voxels, kept)
+
+
+def read_segmented(sample: Path) -> None:
+    """The surfaces of both labels, as `scene new` makes them."""
+    from surgisoft.scene.segmentation import parse_label, read_segmentation
+
+    (path,) = sample.iterdir()
+    read_segmentation(path, (parse_label("1:organ"), parse_label("2:lesion")))
+
+
+BENCH = """
+points = ["base", "m1+m2+m3", "tip"]
+channels = [2, 1, 3]
+gravity = [0.0, 0.0, -1.0]
+payload_g = 4.0
+[frame]
+body = "plate"
+origin_mm = [1.0, 2.0, 3.0]
+rotation_deg = [0.0, 90.0, 0.0]
+[arm]
+length_mm = 70.0
+"""
+
+
+def make_benches(folder: Path) -> None:
+    """The map of a bench with motion capture."""
+    (folder / "one").mkdir(parents=True)
+    (folder / "one" / "bench.toml").write_text(BENCH)
+
+
+def read_bench(sample: Path) -> None:
+    """The map, and the key points of a frame by it."""
+    from surgisoft.errors import InputError
+    from surgisoft.rig.drivers.bench_map import KeyPoints, load_bench_map
+    from surgisoft.rig.drivers.motion_capture import Body, Frame
+
+    points = KeyPoints(load_bench_map(sample / "bench.toml"))
+    plate = Body(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    seen = {name: np.arange(3.0) + i for i, name in enumerate(("base", "m1", "m2", "m3", "tip"))}
+    frame = Frame(1, 0.0, seen, {"plate": plate})
+    try:
+        points.require(frame)
+    except InputError:
+        return
+    points(frame)
+
+
+def make_frames(folder: Path) -> None:
+    """Datagrams of motion capture: JSON, and NatNet's frames, descriptions and server."""
+    import json
+    import struct
+
+    def sample(name: str, content: bytes) -> None:
+        (folder / name).mkdir(parents=True)
+        suffix = "json" if name == "json" else "bin"
+        (folder / name / f"packet.{suffix}").write_bytes(content)
+
+    seen = {"k0": [0.0, 0.0, 0.0], "k1": None, "k2": [1.0, 2.0, 70.0]}
+    body = {"position": [0.0, 1.0, 2.0], "rotation": [0.0, 0.0, 0.0, 1.0], "valid": True}
+    content = {"frame": 7, "t": 0.5, "unit": "mm", "points": seen, "bodies": {"base": body}}
+    sample("json", json.dumps(content).encode())
+    for name, size in (("frame3", b""), ("frame4", struct.pack("<i", 0))):
+        pose = struct.pack("<i7ffh", 1, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0, 0.001, 1)
+        marker = struct.pack("<i4fhf", 1 << 16 | 1, 0.1, 0.2, 0.3, 0.01, 2, 0.001)
+        parts = [struct.pack("<i", 42), struct.pack("<i", 1) + size]
+        parts += [b"base\0" + struct.pack("<i3f", 1, 0.1, 0.2, 0.3)]
+        parts += [struct.pack("<i", 1) + size + struct.pack("<3f", 0.1, 0.2, 0.3)]
+        parts += [struct.pack("<i", 1) + size + pose]
+        parts += [struct.pack("<i", 1) + size + struct.pack("<ii", 1, 1) + pose]
+        parts += [struct.pack("<i", 0) + size] if size else []
+        parts += [struct.pack("<i", 1) + size + marker]
+        parts += [struct.pack("<i", 1) + size + struct.pack("<iiif", 1, 1, 1, 0.5)]
+        parts += [struct.pack("<i", 0) + size, bytes(8)]
+        parts += [struct.pack("<d3Q", 0.5, 10**6, 0, 0), bytes(8)]
+        sample(name, b"".join(parts))
+    rigid = b"base\0" + struct.pack("<ii3f", 1, -1, 0, 0, 0) + struct.pack("<i", 0)
+    markers = b"all\0" + struct.pack("<i", 1) + b"m1\0"
+    sized = struct.pack("<iii", 2, 0, len(markers)) + markers
+    sample("bodies4", sized + struct.pack("<ii", 1, len(rigid)) + rigid)
+    sample("bodies3", struct.pack("<ii", 2, 0) + markers + struct.pack("<i", 1) + rigid)
+    server = b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0, 4, 1, 0, 0])
+    sample("server", server + struct.pack("<QH?4B", 10**7, 1511, True, 239, 255, 42, 99))
+
+
+def read_packet(sample: Path) -> None:
+    """The frame, description or server in a datagram; receivers pass over what is none."""
+    from surgisoft.rig.drivers import natnet
+    from surgisoft.rig.drivers.motion_capture import DAMAGED, decode_json
+
+    (path,) = sample.iterdir()
+    packet, version = path.read_bytes()[:65536], (4, 1) if "4" in sample.name else (3, 0)
+    try:
+        match sample.name.rstrip("34"):
+            case "json":
+                decode_json(packet)
+            case "frame":
+                natnet.read_frame(packet, version, {1: "base"}, 1e7)
+            case "bodies":
+                natnet.read_bodies(packet, version)
+            case _:
+                natnet.read_server(packet)
+    except DAMAGED:
+        pass
+
+
+def make_lines(folder: Path) -> None:
+    """Lines of a pressure controller without their checksums."""
+    (folder / "one").mkdir(parents=True)
+    lines = "INFO 1 3 0.000 40.000 500 1000 emulator\n"
+    lines += "".join(f"DATA {20 * i} {i} R 1.5 2.5 nan 1.0 2.0 3.0\n" for i in range(5))
+    (folder / "one" / "lines.txt").write_text(lines + "NAK 7 beyond the limits\n")
+
+
+def read_lines(sample: Path) -> None:
+    """What the controller's lines say; each gets the checksum that belongs to it."""
+    from surgisoft.rig.drivers.line_protocol import LONGEST, Data, Info, line, words_of
+
+    found = None
+    for raw in (sample / "lines.txt").read_bytes().split(b"\n"):
+        raw = raw[-LONGEST:]
+        try:
+            words = words_of(line(raw.decode("ascii", "ignore"), "<"), "<")
+            if words is None:
+                continue
+            if words[0] == "INFO":
+                found = Info.read(words)
+            elif words[0] != "NAK" and found is not None:
+                Data.read(words, found.chambers)
+        except ValueError:  # the driver counts it as a damaged line
+            continue
+
+
+def make_assignments(folder: Path) -> None:
+    """Assignments of fields as they follow a command."""
+    for name, lines in {
+        "circle_ablation": ["fire_mm=0.8", "weights.laser.fine=2", "world.observer.gain=0.3"],
+        "track_circle": ["follow.size_mm=12.5", "world.randomisation.noise_mm=0.1"],
+    }.items():
+        (folder / name).mkdir(parents=True)
+        (folder / name / "words.txt").write_text("\n".join(lines))
+
+
+def read_assignments(sample: Path) -> None:
+    """The configuration of a task with the assignments, as `train` and `evaluate` make it."""
+    from surgisoft.config import COMMAND_LINE, assignments
+    from surgisoft.tasks.registry import changed_config, config_of
+
+    text = (sample / "words.txt").read_text("utf-8", "replace")
+    changed_config(config_of(sample.name), assignments(text.split("\n")), COMMAND_LINE)
+
+
+TINY_EXPERIMENT = f"""
+name = "tiny"
+scene = "{PHANTOM}"
+repeats = 2
+together = 2
+[limits]
+time_s = 0.3
+[[phases]]
+name = "look"
+endoscope = "policy"
+timeout_s = 0.3
+on_timeout = "go on"
+"""
+
+
+def make_results(folder: Path) -> None:
+    """The results of a tiny experiment."""
+    from surgisoft.experiments.run import run_experiment
+    from surgisoft.experiments.session import start_experiment
+
+    folder.mkdir(parents=True)
+    file = folder / "tiny.toml"
+    file.write_text(TINY_EXPERIMENT)
+    spec, place = start_experiment(file, folder / "one")
+    run_experiment(spec, place)
+    file.unlink()
+    shutil.rmtree(place / "logs", ignore_errors=True)
+
+
+def read_results(sample: Path) -> None:
+    """The experiment and its rows, as `experiment run --resume` and reports open them."""
+    from surgisoft.experiments.results import sum_up
+    from surgisoft.experiments.run import jobs, read_rows
+    from surgisoft.experiments.spec import load_experiment
+
+    spec = load_experiment(sample / "experiment.toml")
+    sum_up(spec, sample, read_rows(sample, jobs(spec)))
+
+
 TARGETS: dict[str, Target] = {
-    "recording": Target(make_recordings, read_recordings, weight=3),
+    "recording": Target(make_recordings, read_recordings, weight=3, inputs=30_000),
     "lerobot": Target(
-        make_lerobot, read_lerobot, ("meta/info.json", "meta/*.toml", "data/*/*.parquet")
+        make_lerobot,
+        read_lerobot,
+        ("meta/info.json", "meta/*.toml", "data/*/*.parquet"),
+        inputs=10_000,
     ),
-    "log": Target(make_logs, read_logged, weight=2),
-    "schedule": Target(make_schedule, read_schedule, weight=2),
-    "import": Target(make_raw, read_raw, weight=3),
-    "model": Target(make_models, read_model, ("config.json", "*.safetensors"), weight=2),
-    "run": Target(make_runs, read_run, ("config.json", "*.pt"), weight=2),
+    "log": Target(make_logs, read_logged, weight=2, inputs=120_000),
+    "schedule": Target(make_schedule, read_schedule, weight=2, inputs=100_000),
+    "import": Target(make_raw, read_raw, weight=3, inputs=10_000),
+    "c3d": Target(make_c3d, read_raw, ("*.c3d",), imports=("ezc3d",)),
+    "matlab": Target(make_matlab, read_raw, ("*.mat",), imports=("scipy.io",)),
+    "hdf5": Target(make_hdf5, read_raw, ("*.h5", "*.mat"), inputs=10_000),
+    "mcap": Target(make_mcap, read_raw, ("*.mcap",), inputs=10_000),
+    "model": Target(
+        make_models, read_model, ("config.json", "*.safetensors"), weight=2, inputs=30_000
+    ),
+    "run": Target(make_runs, read_run, ("config.json", "*.pt"), weight=2, inputs=5_000),
     "resume": Target(make_runs, read_resumed, ("config.json", "last.pt"), weight=2),
-    "episode": Target(make_episodes, read_episode, weight=3),
+    "episode": Target(make_episodes, read_episode, weight=3, inputs=6_000),
     "charts": Target(make_episodes, read_charts),
     "replay": Target(make_episodes, read_replay),
-    "rrd": Target(make_replays, read_rrd, weight=0.5),
-    "scene": Target(make_scenes, read_scene, ("scene.toml",)),
-    "experiment": Target(make_experiments, read_experiment, ("*.toml",), weight=2),
-    "task": Target(make_tasks, read_task, weight=2),
-    "mesh": Target(make_meshes, read_meshes, weight=2),
-    "decision": Target(make_decision, read_decision),
+    "rrd": Target(make_replays, read_rrd, weight=0.5, imports=("rerun.chunk", "pyarrow.compute")),
+    "scene": Target(make_scenes, read_scene, ("scene.toml", "*.csv"), inputs=5_000),
+    "segmentation": Target(make_segmentations, read_segmented, inputs=20_000),
+    "experiment": Target(
+        make_experiments, read_experiment, ("experiment.toml",), weight=2, inputs=6_000
+    ),
+    "results": Target(make_results, read_results, ("experiment.toml", "*.json"), inputs=6_000),
+    "context": Target(make_contexts, read_context, ("context.toml",), inputs=80_000),
+    "task": Target(make_tasks, read_task, weight=2, inputs=60_000),
+    "assignments": Target(make_assignments, read_assignments, inputs=80_000),
+    "mesh": Target(make_meshes, read_meshes, weight=2, inputs=100_000),
+    "decision": Target(make_decision, read_decision, inputs=130_000),
+    "bench": Target(make_benches, read_bench, inputs=90_000),
+    "packet": Target(make_frames, read_packet, inputs=130_000),
+    "lines": Target(make_lines, read_lines, inputs=30_000),
 }
 """Every reader by name."""

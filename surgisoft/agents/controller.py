@@ -18,14 +18,14 @@ from torch import Tensor, nn
 
 from surgisoft.agents.observer import Observer, ObserverGains, Order
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Episodes, MeasuredTask, Signal, Task, TaskState
+from surgisoft.tasks.base import FEED_SIGNAL, Episodes, MeasuredTask, Signal, Task, TaskState
 from surgisoft.tasks.describe import field_docs
 from surgisoft.tasks.world.adaptation import Adaptation
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import SceneEngine, SceneState
-from surgisoft.tasks.world.world import WorldState
+from surgisoft.tasks.world.world import WorldState, fed
 
 EARLY = 1e-3
 """Share of the control period by which the last sample of a period may come early."""
@@ -136,6 +136,8 @@ class Memory:
     """The task's goal."""
     lesion: Tensor
     """(1,) int64: number of the lesion, of tasks with several."""
+    out_mm: Tensor | None = None
+    """(1,) mm: by how much the arms' bases were behind their mounts; None without a feed."""
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,7 @@ class ControllerGraph(nn.Module):
         world.arms = dict(self.arms)
         if world.scene is not None:
             world.scene = cast(SceneEngine, _MeasuredScene())
+        self.feeds, world.feed = world.feed is not None, None  # the carriages are measured
         moved.world = world
         self.simulated = task
         self.task, self.episodes = moved, Episodes(moved)
@@ -262,6 +265,7 @@ class ControllerGraph(nn.Module):
         signals = dict(
             zip((s.name for s in self.signals), measured[3 * len(self.arms) :], strict=True)
         )
+        memory = self._fed(memory, signals)
         begins = begin > 0.5
         elapsed = memory.elapsed_s + dt_s
         over = elapsed >= (1.0 - EARLY) * self.control_s
@@ -311,6 +315,14 @@ class ControllerGraph(nn.Module):
             results += [part.plant.target_kPa, part.seen_mm, model, views[name]]
         return tuple(results)
 
+    def _fed(self, memory: Memory, signals: dict[str, Tensor]) -> Memory:
+        """The memory with the arms' bases where their carriages are measured."""
+        if not self.feeds:
+            return memory
+        out_mm, before_mm = signals[FEED_SIGNAL], cast(Tensor, memory.out_mm)
+        arms = {name: fed(part, before_mm - out_mm) for name, part in memory.arms.items()}
+        return replace(memory, arms=arms, out_mm=out_mm)
+
     def _posed(self, arm: MeasuredArm, part: ArmPart) -> ArmPart:
         """The part with its body where it is estimated."""
         return arm.simulated.posed(part, part.seen_mm)
@@ -335,7 +347,7 @@ class ControllerGraph(nn.Module):
         if self.signals:
             scene = cast(MeasuredTask, self.task).measured_scene(signals, memory.lesion)
         failed = torch.zeros(1, dtype=torch.bool)
-        world = WorldState(self._stream, memory.steps, memory.arms, scene, failed)
+        world = WorldState(self._stream, memory.steps, memory.arms, scene, failed, memory.out_mm)
         return TaskState(world, memory.goal)
 
     def _at_rest(self) -> Memory:
@@ -343,7 +355,8 @@ class ControllerGraph(nn.Module):
         _, goal = self.task.goal(self._stream)
         zero = torch.zeros(1)
         arms = {name: arm.at_rest(self._stream) for name, arm in self.arms.items()}
-        return Memory(zero > 0, zero, zero.long(), arms, goal, zero.long())
+        out_mm = zero if self.feeds else None
+        return Memory(zero > 0, zero, zero.long(), arms, goal, zero.long(), out_mm)
 
 
 def goal_docs(goal: Any, prefix: str = "goal") -> dict[str, str]:

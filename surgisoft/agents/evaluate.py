@@ -83,6 +83,9 @@ class Evaluation:
                 "beam_differs": sum(v.beam_differs for v in self.checks),
                 "beam_off_mm": max(v.beam_off_mm for v in self.checks),
                 "clearance_off_mm": json_safe(max(v.clearance_off_mm for v in self.checks)),
+                "contact_asked": sum(v.asked for v in self.checks),
+                "contact_audited": sum(v.audited for v in self.checks),
+                "beams_asked": sum(v.beams_asked for v in self.checks),
                 "contacts": [_contact(v) for v in self.checks],
             }
         return document

@@ -1,16 +1,18 @@
 """Exact collision checks (FCL) of evaluated episodes, to verify the batched geometry.
 
-The end of the beam is computed exactly (`scene.collision`) at every step, and contact at every step
-at which there may be one. An exact clearance proves that there is none for a while: where no point
-of an arm's centreline has moved by as much since, the arm has not come to touch anything. Every
-point of a segment moves at most as far as the farther of its ends, so the bound holds for whole
-arms, and it needs nothing from the batched geometry.
+FCL (`scene.collision`) decides about contact and about what the beam meets wherever its answer may
+differ from that of the batched geometry. Where the batched clearance is farther from contact than
+its error bound, FCL cannot find a contact; where the beam meets a face well inside its edges and
+passes everything else at a distance, FCL cannot find another end (`BatchedScene.sure_hits`). Random
+poses test both in `tests/agents/test_exact_checks.py`, and every evaluation audits a share of such
+instants by FCL.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,12 +21,13 @@ import torch
 from surgisoft.agents.rollout import Instant
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
-from surgisoft.scene.capsules import ArmShape, folding_pairs
+from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.capsules import ArmShape
 from surgisoft.scene.collision import CollisionChecker
 from surgisoft.scene.rays import RayHit
 from surgisoft.tasks.base import Task
 from surgisoft.tasks.world.arm import ArmPart
-from surgisoft.tasks.world.scene import SceneEngine, SceneState
+from surgisoft.tasks.world.scene import SceneEngine
 
 CLOSEST = 3
 """Steps of each episode at which exact clearances are computed."""
@@ -59,33 +62,22 @@ class EpisodeCheck:
     beam_off_mm: float
     """Largest distance between both ends of the beam where the engines agree in what it hits, mm.
     """
+    asked: int = 0
+    """Instants at which FCL looked for contact; at the others it cannot find one."""
+    beams_asked: int = 0
+    """Beams that FCL followed; what the others meet is beyond doubt."""
+    audited: int = 0
+    """Instants at which FCL looked for contact although it could not find one."""
 
 
-PROVEN_FROM_MM = 0.5
-"""Clearance by the batched geometry from which an exact one is worth its cost (mm): it serves for
-as long as the arms move less. It does not decide what is found."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Proof:
-    """Exact clearances of one pose of the arms."""
-
-    lines_mm: dict[str, np.ndarray]
-    """Centreline (K, 3) mm of each arm."""
-    free_mm: dict[tuple[str, ...], float]
-    """Clearance of each arm from the bodies, (arm,), and of each pair of arms, mm."""
-
-    def holds(self, lines_mm: dict[str, np.ndarray]) -> bool:
-        """Whether no arm has moved far enough since to touch a body or another arm."""
-        if any(line.shape != self.lines_mm[name].shape for name, line in lines_mm.items()):
-            return False
-        moved = {
-            name: float(np.sqrt(((line - self.lines_mm[name]) ** 2).sum(axis=1).max()))
-            for name, line in lines_mm.items()
-        }
-        return all(
-            sum(moved[name] for name in names) < free for names, free in self.free_mm.items()
-        )
+SURE_FROM_MM = 0.1
+"""Clearance by the batched geometry from which FCL cannot find a contact (mm): the largest
+difference between both engines near contact that `tests/scene/test_distance.py` allows. What the
+batched geometry calls 5 mm or more is a lower bound, see `batched.EXACT_WITHIN_MM`."""
+BEAMS_TOGETHER = 256
+"""So many beams that wait for FCL are followed together (a count): closed forms cost less so."""
+AUDIT_EVERY = 64
+"""Of the instants that need no FCL every so many is given to it all the same (a count)."""
 
 
 @dataclass
@@ -93,24 +85,44 @@ class _Notes:
     """Intermediate results of one episode while it runs."""
 
     contact: Contact | None = None
-    """See `EpisodeCheck`, as for the next four fields."""
+    """See `EpisodeCheck`, as for the next seven fields."""
     steps: int = 0
     contact_differs: int = 0
     beam_differs: int = 0
     beam_off_mm: float = 0.0
-    closest: list[tuple[float, int, dict[str, ArmShape], CollisionChecker]] = field(
+    asked: int = 0
+    beams_asked: int = 0
+    audited: int = 0
+    closest: list[tuple[float, int, dict[str, np.ndarray], CollisionChecker]] = field(
         default_factory=list
     )
-    """(clearance in mm, step, arms, checker with the bodies of the step) at the steps of least
-    clearance by the batched geometry."""
-    proof: _Proof | None = None
-    """The last exact clearance, where there was any."""
-    collision_checks: int = 0
-    """Instants at which FCL looked for contact or for the clearance."""
+    """(clearance in mm, step, centrelines, checker with the bodies of the step) at the steps of
+    least clearance by the batched geometry."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Beam:
+    """A beam that waits for FCL."""
+
+    notes: _Notes
+    """Of its episode."""
+    origin_mm: np.ndarray
+    """(3,) mm, and aim (3,)."""
+    aim: np.ndarray
+    lines_mm: dict[str, np.ndarray]
+    """Centreline (K, 3) mm of each arm."""
+    struck: int
+    """What it meets by the batched geometry, a `Struck`, and its end (3,) mm."""
+    end_mm: np.ndarray
 
 
 class ExactChecks:
-    """Checks every instant of a rollout of a task in a scene; given as `rollout(watch=...)`."""
+    """Checks every instant of a rollout of a task in a scene; given as `rollout(watch=...)`.
+
+    The batched geometry is computed anew from the centrelines, because a state may hold something
+    else. It only chooses the instants that FCL is asked about: those at which it cannot rule out
+    that FCL would answer otherwise, and an audit of the others.
+    """
 
     def __init__(self, task: Task):
         """task: a task whose world has obstacles, see `has_obstacles`."""
@@ -122,7 +134,10 @@ class ExactChecks:
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.around, self.checker = around, CollisionChecker(around.geometry.bodies)
         self.beam_mm = around.beam_mm if isinstance(around, SceneEngine) else math.nan
+        same = around.geometry.compiled
+        self._bounds = around.geometry if same else BatchedScene(around.geometry.bodies, self.radii)
         self._notes: dict[int, _Notes] = defaultdict(_Notes)
+        self._beams: dict[str, list[_Beam]] = defaultdict(list)
 
     def __call__(self, now: Instant) -> None:
         """Check every live episode of an instant."""
@@ -132,145 +147,132 @@ class ExactChecks:
             self._notes[number]  # an episode that fails at once has its entry, too
         if not len(rows):
             return
-        lines = {
-            name: part.line_mm[rows].double().cpu().numpy() for name, part in world.arms.items()
-        }
-        numbers, steps = now.episodes[rows].tolist(), world.steps[rows].tolist()
+        lines = {name: part.line_mm[rows].float().cpu() for name, part in world.arms.items()}
+        numbers, steps = now.episodes[rows].cpu().numpy(), world.steps[rows].cpu().numpy()
         clearance = world.scene.clearance
         assert clearance is not None, "a world with bodies has a clearance"
         least, collides = clearance.least_mm[rows].tolist(), clearance.collides[rows].tolist()
-        folds, checkers = self._may_fold(lines), self._checkers(world.scene, rows)
-        for n, number in enumerate(numbers):
-            own = {name: line[n] for name, line in lines.items()}
-            notes = self._notes[number]
-            self._look(notes, own, steps[n], least[n], collides[n], bool(folds[n]), checkers[n])
-        for laser, hit in world.scene.hits.items():
-            self._look_along(numbers, world.arms[laser], hit, rows, lines, laser, checkers)
-
-    def _checkers(self, scene: SceneState, rows: torch.Tensor) -> list[CollisionChecker]:
-        """For each of the rows (R,) of the batch the checker with the bodies where they are."""
         placement = None
         if isinstance(self.around, SceneEngine):
-            placement = self.around.placement(scene.breaths)
+            placement = self.around.placement(world.scene.breaths)
+        audit = (numbers + steps) % AUDIT_EVERY == 0
+        checkers = [self.checker] * len(rows)
+        clear = np.zeros(len(rows), bool)
         if placement is None:
-            return [self.checker] * len(rows)
-        return [self.checker.moved(placement, row) for row in rows.tolist()]
-
-    def _may_fold(self, lines: dict[str, np.ndarray]) -> np.ndarray:
-        """(B,) bool: parts of an arm (B, K, 3) mm may touch one another."""
-        found = []
-        for name, line in lines.items():
-            steps = line[:, 1:] - line[:, :-1]
-            middles, halves = 0.5 * (line[:, 1:] + line[:, :-1]), 0.5 * frames.norm(steps)
-            apart = frames.norm(middles[:, :, None] - middles[:, None])
-            apart = apart - halves[:, :, None] - halves[:, None]
-            touching = apart <= 2.0 * self.radii[name]
-            found.append((touching & folding_pairs(line, self.radii[name])).any(axis=(1, 2)))
-        return np.any(found, axis=0)
+            clear = out_of_contact(self._bounds, lines)
+        else:
+            checkers = [self.checker.moved(placement, row) for row in rows.tolist()]
+        notes = [self._notes[number] for number in numbers.tolist()]
+        arrays = {name: line.numpy() for name, line in lines.items()}
+        for n, kept in enumerate(notes):
+            kept.steps += 1
+            place = (least[n], int(steps[n]))
+            if len(kept.closest) < CLOSEST or place < kept.closest[-1][:2]:
+                own = {name: line[n].copy() for name, line in arrays.items()}
+                closest = [*kept.closest, (*place, own, checkers[n])]
+                kept.closest = sorted(closest, key=lambda seen: seen[:2])[:CLOSEST]
+            if collides[n] and clear[n] and not audit[n]:
+                kept.contact_differs += 1
+        for n in np.flatnonzero(audit | ~clear).tolist():
+            own = {name: line[n] for name, line in arrays.items()}
+            found = self._touches(notes[n], own, int(steps[n]), checkers[n])
+            notes[n].contact_differs += found != collides[n]
+            notes[n].asked += 1
+            notes[n].audited += bool(audit[n] and clear[n])
+        for laser, hit in world.scene.hits.items():
+            self._look_along(notes, world.arms[laser], hit, rows, arrays, laser, checkers, audit)
 
     def checks(self) -> list[EpisodeCheck]:
         """Result of each episode, in order; computes the exact clearances."""
+        for laser in self._beams:
+            self._follow(laser, self.checker)
         return [self._check(notes) for _, notes in sorted(self._notes.items())]
 
-    def _look(
-        self,
-        notes: _Notes,
-        lines: dict[str, np.ndarray],
-        step: int,
-        least_mm: float,
-        collides: bool,
-        folds: bool,
-        checker: CollisionChecker,
-    ) -> None:
-        """Check one pose of the arms (K, 3) mm; least_mm and collides: by the batched geometry."""
-        notes.steps += 1
-        place = (least_mm, step)
-        close = len(notes.closest) < CLOSEST or place < notes.closest[-1][:2]
-        shown = not folds and notes.proof is not None and notes.proof.holds(lines)
-        if shown and not close:
-            notes.contact_differs += collides
-            return
-        arms = {name: ArmShape(line, self.radii[name]) for name, line in lines.items()}
-        if close:
-            notes.closest = sorted(
-                [*notes.closest, (*place, arms, checker)], key=lambda seen: seen[:2]
-            )
-            notes.closest = notes.closest[:CLOSEST]
-        found = False if shown else self._touches(notes, arms, step, least_mm, folds, checker)
-        notes.contact_differs += found != collides
-
     def _touches(
-        self,
-        notes: _Notes,
-        arms: dict[str, ArmShape],
-        step: int,
-        least_mm: float,
-        folds: bool,
-        checker: CollisionChecker,
+        self, notes: _Notes, lines: dict[str, np.ndarray], step: int, checker: CollisionChecker
     ) -> bool:
-        """Whether FCL finds a contact; keeps a proof for the next steps, or the first contact.
-
-        Among bodies that move no clearance proves anything about the next step.
-        """
-        notes.collision_checks += 1
-        if least_mm >= PROVEN_FROM_MM and not folds and checker is self.checker:
-            notes.proof = self._proof(arms)
-            if min(notes.proof.free_mm.values(), default=math.inf) > 0.0:
-                return False
-            notes.proof = None
+        """Whether FCL finds a contact; keeps the first one."""
+        arms = {name: ArmShape(line, self.radii[name]) for name, line in lines.items()}
         found = checker.collisions(arms)
         if found and notes.contact is None:
             notes.contact = Contact(self.dt_s * step, (found[0].arm, found[0].other))
         return bool(found)
 
-    def _proof(self, arms: dict[str, ArmShape]) -> _Proof:
-        """Exact clearances of the arms."""
-        exact = self.checker.clearance(arms)
-        free: dict[tuple[str, ...], float] = {
-            (one, other): clearance for (one, other), clearance in exact.arms_mm.items()
-        }
-        for (arm, _), clearance in exact.bodies_mm.items():
-            free[arm,] = min(free.get((arm,), math.inf), clearance)
-        return _Proof({name: shape.centreline_mm for name, shape in arms.items()}, free)
-
     def _look_along(
         self,
-        numbers: list[int],
+        notes: list[_Notes],
         beam: ArmPart,
         hit: RayHit,
         rows: torch.Tensor,
         lines: dict[str, np.ndarray],
         laser: str,
         checkers: list[CollisionChecker],
+        audit: np.ndarray,
     ) -> None:
-        """Compare the exact ends of a laser's beam with those of the batched geometry."""
-        origin, aim = (v[rows].double().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
-        if all(checker is self.checker for checker in checkers):
-            cast = self.checker.cast_each(origin, aim, self.beam_mm, lines, self.radii, laser)
-        else:
-            each = [
-                checker.cast_each(
-                    origin[n : n + 1],
-                    aim[n : n + 1],
-                    self.beam_mm,
-                    {name: line[n : n + 1] for name, line in lines.items()},
-                    self.radii,
-                    laser,
-                )
-                for n, checker in enumerate(checkers)
-            ]
-            cast = (np.concatenate([one[0] for one in each]), np.concatenate([o[1] for o in each]))
+        """Compare the ends of a laser's beam with those of the batched geometry."""
+        origin, aim = (v[rows].float().cpu().numpy() for v in (beam.tip_mm, beam.tip_direction))
         struck, ends = hit.struck[rows].cpu().numpy(), hit.point_mm[rows].cpu().numpy()
-        off = frames.norm(cast[1] - ends)
-        for n, number in enumerate(numbers):
-            notes = self._notes[number]
-            if cast[0][n] != struck[n]:
-                notes.beam_differs += 1
-            else:
-                notes.beam_off_mm = max(notes.beam_off_mm, float(off[n]))
+        at_rest = all(checker is self.checker for checker in checkers)
+        asked = np.ones(len(rows), bool)
+        if at_rest:
+            kind, end, sure = self._bounds.sure_hits(origin, aim, self.beam_mm, lines, laser)
+            asked = audit | ~sure
+            self._compare(notes, np.flatnonzero(~asked), kind, end, struck, ends)
+        for n in np.flatnonzero(asked).tolist():
+            notes[n].beams_asked += 1
+            own = {name: line[n] for name, line in lines.items()}
+            ray = _Beam(notes[n], origin[n], aim[n], own, struck[n], ends[n])
+            self._beams[laser].append(ray)
+            if not at_rest:
+                self._follow(laser, checkers[n])
+        if len(self._beams[laser]) >= BEAMS_TOGETHER:
+            self._follow(laser, self.checker)
+
+    def _follow(self, laser: str, checker: CollisionChecker) -> None:
+        """Follow the beams of a laser that wait for FCL, all among the bodies of one checker."""
+        beams, self._beams[laser] = self._beams[laser], []
+        if not beams:
+            return
+        kind, end = checker.cast_each(
+            np.array([beam.origin_mm for beam in beams], dtype=float),
+            np.array([beam.aim for beam in beams], dtype=float),
+            self.beam_mm,
+            {
+                name: np.array([beam.lines_mm[name] for beam in beams], dtype=float)
+                for name in beams[0].lines_mm
+            },
+            self.radii,
+            laser,
+        )
+        struck = np.array([beam.struck for beam in beams])
+        ends = np.array([beam.end_mm for beam in beams])
+        notes = [beam.notes for beam in beams]
+        self._compare(notes, range(len(beams)), kind, end, struck, ends)
+
+    @staticmethod
+    def _compare(
+        notes: Sequence[_Notes],
+        which: Iterable[int],
+        kind: np.ndarray,
+        end: np.ndarray,
+        struck: np.ndarray,
+        ends: np.ndarray,
+    ) -> None:
+        """Note by how much beams differ: what they meet (N,), and where they end (N, 3) mm."""
+        differs, off = (kind != struck).tolist(), frames.norm(end - ends).tolist()
+        for n in which:
+            if differs[n]:
+                notes[n].beam_differs += 1
+            elif off[n] > notes[n].beam_off_mm:
+                notes[n].beam_off_mm = off[n]
 
     def _check(self, notes: _Notes) -> EpisodeCheck:
-        exact = [checker.clearance(arms).least_mm for _, _, arms, checker in notes.closest]
+        exact = [
+            checker.clearance(
+                {name: ArmShape(line, self.radii[name]) for name, line in lines.items()}
+            ).least_mm
+            for _, _, lines, checker in notes.closest
+        ]
         offs = [abs(mm - seen[0]) for mm, seen in zip(exact, notes.closest, strict=True)]
         return EpisodeCheck(
             contact=notes.contact,
@@ -280,7 +282,17 @@ class ExactChecks:
             clearance_off_mm=max(offs, default=0.0),
             beam_differs=notes.beam_differs,
             beam_off_mm=notes.beam_off_mm,
+            asked=notes.asked,
+            beams_asked=notes.beams_asked,
+            audited=notes.audited,
         )
+
+
+def out_of_contact(scene: BatchedScene, lines: Mapping[str, torch.Tensor]) -> np.ndarray:
+    """(R,) bool: arms (R, K, 3) mm that FCL cannot find in contact, among bodies at rest."""
+    found = scene.clearance(lines)
+    near = torch.cat((found.bodies_mm.flatten(1), found.arms_mm, found.self_mm), 1)
+    return (near.amin(1) >= SURE_FROM_MM).numpy()
 
 
 def has_obstacles(task: Task) -> bool:

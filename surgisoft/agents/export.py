@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -152,7 +151,16 @@ def describe_controller(graph: ControllerGraph) -> dict[str, Any]:
     ]
     described = describe_agents(cast(DocumentedTask, graph.simulated))
     signals = [
-        asdict(signal) | {"optional": signal.default is not None} for signal in graph.signals
+        {
+            "name": signal.name,
+            "meaning": signal.meaning,
+            "unit": signal.unit,
+            "low": signal.low,
+            "high": signal.high,
+            "default": signal.default,
+            "optional": signal.default is not None,
+        }
+        for signal in graph.signals
     ]
     return {
         "episode_steps": task.steps,

@@ -20,7 +20,7 @@ from surgisoft.agents.rollout import Instant, rollout
 from surgisoft.errors import InputError
 from surgisoft.rig import SimulatedRig
 from surgisoft.rig.interface import is_simulated
-from surgisoft.tasks.base import MeasuredTask, Task, TaskState
+from surgisoft.tasks.base import Signal, Task, TaskState
 
 
 @dataclass(frozen=True)
@@ -85,18 +85,18 @@ def check_on_rig(
     settled = len(next(iter(logged.values())).commands) - samples * decisions
     for rig in rigs.values():
         rig.reset()
+    signals = _signals(task, None, first)
     for number in range(settled):
         asked = {name: rig.commands[number] for name, rig in logged.items()}
         measured = _measured(rigs, asked)
         if number < settled - 1:
-            controller.observe(measured[0], measured[1], asked, period_s, **_anything(controller))
+            controller.observe(measured[0], measured[1], asked, period_s, **signals)
     goal = {
         name.removeprefix("goal."): value[0].numpy()
         for name, value in named_tensors(first.goal, "goal")
     }
     if first.world.scene.lesion is not None:
         goal["lesion"] = first.world.scene.lesion[0].numpy()
-    signals = _signals(task, None, first)
     command = controller.begin(measured[0], measured[1], asked, period_s, goal=goal, **signals)
     points, commands = 0.0, 0.0
     for decision in range(decisions):
@@ -121,21 +121,16 @@ def _as_started(controller: Controller, first: TaskState, rigs: dict[str, Simula
     """Set limits and mounts of the episode in the controller's state."""
     low, high = ({name: rig.limits[:, end] for name, rig in rigs.items()} for end in (0, 1))
     controller.limit(low, high)
+    if first.world.out_mm is not None:
+        controller.set(out_mm=first.world.out_mm[0].numpy())
     for name, part in first.world.arms.items():
         controller.set(**{f"arms__{name}__mount": part.mount[0].numpy()})
 
 
 def _signals(task: Task, before: TaskState | None, after: TaskState) -> dict[str, float]:
     """The task's signals as they are in simulation."""
-    if not getattr(task, "signals", ()):
-        return {}
-    found = cast(MeasuredTask, task).true_signals(before, after)
-    return {name: float(value[0]) for name, value in found.items()}
-
-
-def _anything(controller: Controller) -> dict[str, float]:
-    """Signals before the episode begins, which decide nothing."""
-    return {signal["name"]: signal["low"] for signal in controller.about["controller"]["signals"]}
+    signals: tuple[Signal, ...] = getattr(task, "signals", ())
+    return {each.name: float(each.true(task, before, after)[0]) for each in signals}
 
 
 def _by_arm(command, rigs: dict) -> dict[str, np.ndarray]:

@@ -222,7 +222,9 @@ def _show(results) -> None:
                 f"exact collision checker on {Path(result.policy).name}: of "
                 f"{counted(facts['instants'], 'instant')} the batched geometry differs on contact "
                 f"in {facts['contact_differs']} and on what the beam hits in "
-                f"{facts['beam_differs']}; the hit differs by at most {facts['beam_off_mm']:.1g} mm"
+                f"{facts['beam_differs']}; the hit differs by at most {facts['beam_off_mm']:.1g} "
+                f"mm; FCL was asked about contact in {facts['contact_asked']} and about the beam "
+                f"in {facts['beams_asked']}, in the others it cannot differ"
             )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from surgisoft.config import Rule, Where, from_table, one_of, read_toml
+from surgisoft.config import Rule, Where, from_table, one_of, path_beside, read_toml
 
 LEVELS = ("low", "medium", "high")
 """Levels of model influence and of decision consequence."""
@@ -137,13 +137,9 @@ def load_context(path: str | Path) -> Context:
     path = Path(path)
     table, where = read_toml(path)
     context = from_table(Context, table, where)
-    home = path.resolve().parent
 
     def there(text: str, place: Where) -> str:
-        found = (home / text).resolve()
-        if not found.exists():
-            raise place.error(f"there is no '{text}' beside this file", "a file or folder")
-        return str(found)
+        return str(path_beside(place, text, "a file or folder"))
 
     states = tuple(
         there(text, where / "scenario" / "states" / i)

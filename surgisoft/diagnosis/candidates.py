@@ -1,6 +1,30 @@
-"""Candidates: first-order sensitivities of a model's prediction to effects that it may lack."""
+"""Candidates: first-order sensitivities of a model's prediction to effects that it may lack.
+
+Where the same motion was recorded before and after a change, the body that a load was hung on is
+known: it is what BEFORE measured. What a load or a smaller gain does to it needs no model, and also
+holds for motion that no model predicts from the actuation, such as swings. So a paired difference
+has further candidates of the effects, on the measured body in place of the predicted one.
+
+A load in motion pulls with its apparent weight m (g - a), a the acceleration of its place
+(d'Alembert 1743). In a linear arm with the mass, damping and stiffness M, D, K and the actuation's
+force f, before and after obey
+
+    M y0'' + D y0' + K y0 = f,        (M + m) y1'' + D y1' + (K + k) y1 = f,
+    y1 - y0 = - A1^-1 (m y0'' + k y0),        A1 = (M + m) d^2/dt^2 + D d/dt + K + k,
+
+whatever the size of m: the load acts on the motion of BEFORE, and the arm gives way with the poles
+of AFTER. In the first bending mode (Meirovitch 2001, ch. 8)
+
+    (K + k) A1^-1 = w^2 / (d^2/dt^2 + 2 damping w d/dt + w^2),        w = 2 pi frequency,
+
+times the sag at rest of `effects/payload.py`. A hanging arm is pulled back by a load at rest, as by
+a smaller gain. But the faster it swings, the less: a load pulls outward where the arm swings faster
+than a pendulum of its length. A smaller gain acts alike at every frequency, so motion tells the two
+apart.
+"""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -19,8 +43,22 @@ from surgisoft.surrogate.effects import (
     hypothesis_of,
     known_effects,
 )
+from surgisoft.surrogate.effects.beam import Beam, cross, displaced
+from surgisoft.surrogate.effects.gain_mismatch import GainMismatch
+from surgisoft.surrogate.effects.inertia import Inertia
+from surgisoft.surrogate.effects.payload import Payload
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
+
+STANDARD_GRAVITY_MM_S2 = 9806.65
+"""Standard acceleration of gravity, mm/s^2 (CGPM 1901)."""
+FREQUENCIES_HZ = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+"""Undamped frequencies of the loaded arm's first mode that identification tries, Hz: those of soft
+arms of centimetres to a metre, in steps of half an octave."""
+DAMPING_RATIOS = (0.1, 0.2, 0.4, 0.8)
+"""Damping ratios of that mode that are tried: up to nearly no swing."""
+SAMPLES_A_PERIOD = 4.0
+"""Fewest samples in a period of a mode that is tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +75,12 @@ class Candidate:
     """Whether the sensitivities make an effect that the model has already stronger."""
     fitted: bool = False
     """Whether its nonlinear parameters were fitted and not taken from a grid."""
+    removable: bool = False
+    """Whether the effect may also have been taken away, with amplitudes of the other sign: a load
+    that hung on the arm before."""
+    spread: np.ndarray | None = None
+    """(P, K) the effect's P amplitudes for each of the K that are fitted; None: they are the same.
+    """
 
     @property
     def amplitudes(self) -> int:
@@ -49,6 +93,7 @@ class Candidate:
         if self.more:
             return None
         effect, first = copy.deepcopy(self.effect), 0
+        amplitudes = amplitudes if self.spread is None else self.spread @ amplitudes
         for parameter in effect.amplitudes().values():
             part = amplitudes[first : first + parameter.numel()]
             parameter.copy_(torch.as_tensor(part, dtype=parameter.dtype).view_as(parameter))
@@ -153,7 +198,15 @@ def facts_of(problem: Problem) -> ArmFacts:
 
 
 def candidates(problem: Problem, names: list[str] | None = None) -> list[Candidate]:
-    """The sensitivities of every known effect (or the named ones) over its grid."""
+    """The sensitivities of every known effect (or the named ones) over its grid.
+
+    In a paired difference also those of effects on the measured body of BEFORE.
+    """
+    return [*model_candidates(problem, names), *measured_candidates(problem, names)]
+
+
+def model_candidates(problem: Problem, names: list[str] | None = None) -> list[Candidate]:
+    """The sensitivities of a model's own prediction to effects over their grids."""
     model, signal = problem.model, signals(problem)
     points = problem.rows(signal.body)
     answer, known, facts = [], known_effects(), facts_of(problem)
@@ -173,3 +226,100 @@ def candidates(problem: Problem, names: list[str] | None = None) -> list[Candida
         for c in answer
         if np.isfinite(c.sensitivities).all() and np.abs(c.sensitivities).max() > 1e-6
     ]
+
+
+# On the measured body --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """The first bending mode of the arm with its load."""
+
+    frequency_Hz: float
+    """Undamped frequency, Hz."""
+    damping: float
+    """Damping ratio."""
+
+    def follow(self, facts: ArmFacts, signal: Tensor, dt_s: Tensor) -> tuple[Tensor, Tensor]:
+        """(R, T, c) response y to signals u (R, T, c), and its acceleration y'', in u / s^2.
+
+        The signal is taken for linear between its rows, by its mean over each step.
+        """
+        mode = Inertia(facts, self.frequency_Hz, self.damping)
+        before = torch.cat([signal[:, :1], signal[:, :-1]], dim=1)
+        state = mode.scan(mode.rest(signal[:, 0]), (signal + before) / 2, Context(dt_s))
+        y, speed = state.unbind(-1)
+        w = 2 * np.pi * self.frequency_Hz
+        return y, w**2 * (signal - y - 2 * self.damping * speed)
+
+
+@torch.no_grad()
+def measured_candidates(problem: Problem, names: Sequence[str] | None = None) -> list[Candidate]:
+    """Candidates of the named effects on the body of BEFORE; none for a problem without pairs."""
+    body = problem.table.body_before_mm
+    if body is None:
+        return []
+    facts, answer = facts_of(problem), []
+    fresh = [name for name in names or known_effects() if name not in problem.model.effects]
+    if "gain_mismatch" in fresh:
+        answer.append(_gain(problem, facts, body))
+    if "payload" in fresh:
+        answer += _loads(problem, facts, body)
+    return answer
+
+
+def _gain(problem: Problem, facts: ArmFacts, body: np.ndarray) -> Candidate:
+    """One gain of all chambers: a linear arm's whole motion grows by it, whatever moves it."""
+    motion = body[problem.index.numpy()] - problem.table.rest_mm
+    effect = GainMismatch(facts)
+    spread = np.ones((problem.model.spec.chambers, 1))
+    return Candidate("gain_mismatch", effect, motion[..., None], spread=spread)
+
+
+def _loads(problem: Problem, facts: ArmFacts, body: np.ndarray) -> list[Candidate]:
+    """A load at rest on the measured body, and in motion for each mode."""
+    history = problem.history
+    shape = (*history.valid.shape, *body.shape[1:])
+    points = torch.zeros(shape, dtype=torch.float32)
+    points[history.valid] = torch.from_numpy(body).float()
+    # Rows of padding repeat the last one.
+    effect = Payload(facts)
+    still = effect.sensitivities(points, points.new_zeros(*shape[:2], 0))
+    answer = [Candidate("payload", effect, _rows(problem, still), removable=True)]
+    if facts.gravity is None or not problem.table.timed.any():
+        return answer
+    beam = Beam.through(facts.rest_mm)
+    steps = history.dt_s[history.dt_s > 0]
+    fastest = 1.0 / (SAMPLES_A_PERIOD * float(steps.median())) if len(steps) else 0.0
+    for frequency in FREQUENCIES_HZ:
+        for damping in DAMPING_RATIOS if frequency <= fastest else ():
+            mode = Mode(frequency, damping)
+            moved = torch.stack([mode.follow(facts, s.flatten(2), history.dt_s)[0] for s in still])
+            moved = moved.view(len(still), *shape)
+            _, acceleration = mode.follow(facts, points.flatten(2), history.dt_s)
+            force = -acceleration.view(shape) / STANDARD_GRAVITY_MM_S2
+            sensitivities = _rows(problem, moved + _pulled(beam, points, force))
+            answer.append(Candidate("payload", Payload(facts), sensitivities, removable=True))
+    return answer
+
+
+def _pulled(beam: Beam, points: Tensor, force: Tensor) -> Tensor:
+    """(2, R, T, n, 3) displacement, mm, by forces at the key points, for 1 mm of each sag.
+
+    force: (R, T, n, 3) force of a mass at each key point over its weight. The first load is at the
+    tip; the second one lies along the body, the share of each key point that of the body nearest to
+    it (`Payload` states the units).
+    """
+    p = points.mT.contiguous()
+    chords, length = p @ beam.chords, beam.length_mm
+    tip = cross(p @ beam.levers[-1], force[..., -1, :, None]) * (3 / length**3)
+    body = torch.zeros_like(tip)
+    for place, share in enumerate(beam.shares):
+        lever = p @ beam.levers[place]
+        body += cross(lever, force[..., place, :, None]) * (8 / length**3 * share)
+    return torch.stack([displaced(turned, chords, beam.collect) for turned in (tip, body)])
+
+
+def _rows(problem: Problem, fields: Tensor) -> np.ndarray:
+    """(S, n, 3, K) the looked-at rows of K fields (K, R, T, n, 3)."""
+    return torch.stack([problem.rows(field) for field in fields], dim=-1).double().numpy()

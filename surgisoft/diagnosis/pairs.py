@@ -20,7 +20,7 @@ before it. Delay estimation by matching: Knapp & Carter 1976, here with a square
 place of a correlation, because the level of an actuation counts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -94,6 +94,11 @@ SPECTRUM_S = 20.0
 """Longest stretch of a power spectrum, s: four blocks of time."""
 FREE_POWER = 4.0
 """Power of the measured motion over that of the predicted one from which motion is free."""
+COHERENCE_S = 5.0
+"""Longest stretch of a spectrum from which coherence is estimated, s: one block of time, which
+resolves the resonance of a damped arm and leaves many stretches to average."""
+LEAST_STRETCHES = 4
+"""Fewest stretches of such spectra; of fewer, fast motion does not count as repeated."""
 LEAST_BINS = 8
 """Lowest frequency at which motion can be free, in steps of the spectrum: below it the few bins say
 little, and creep and drift act there."""
@@ -136,6 +141,9 @@ class Pairs:
     before_mm: np.ndarray
     """(N, n, 3) measured key points of the partner, corrected for the difference of the actuation,
     base frame, mm; NaN where there is none."""
+    body_mm: np.ndarray
+    """(N, n, 3) motion of BEFORE in every row of AFTER, as far as it comes again, mm, see
+    `body_before`."""
     correction_mm: np.ndarray
     """(N, n, 3) what the model says the difference of the actuation does, mm."""
     repeatability_mm: np.ndarray
@@ -596,8 +604,91 @@ def paired_table(after: ResidualTable, before: ResidualTable) -> tuple[ResidualT
         floor=Floor(float(np.sqrt(np.mean(noise**2))), "pairs"),
         paired_discrepancy_mm=pairs.discrepancy_mm,
         paired_tolerance_mm=pairs.tolerance_mm,
+        body_before_mm=pairs.body_mm,
     )
     return paired, pairs
+
+
+def body_before(
+    after: ResidualTable, before_mm: np.ndarray, repeated: "RepeatedShare"
+) -> np.ndarray:
+    """(N, n, 3) key points of BEFORE along every row of AFTER, as far as they come again, mm.
+
+    before_mm: (N, n, 3) key points of the partners, mm, NaN where there is none. In gaps the model
+    stands in, with what it got wrong at their ends. Of fast motion the share is taken that AFTER
+    repeats: a vibration that is another one in each recording says nothing of a load, but half of
+    the difference of two of them is one of them with the other sign (regression to the mean).
+    """
+    wrong = before_mm - after.predicted_mm
+    answer = after.predicted_mm.copy()
+    for signal in run_signals(after, False):
+        rows = signal.rows
+        for point in range(wrong.shape[1]):
+            seen = rows[np.isfinite(wrong[rows, point]).all(1)]
+            if len(seen):
+                answer[rows, point] += np.stack(
+                    [np.interp(rows, seen, axis[seen]) for axis in wrong[:, point].T], axis=1
+                )
+        if signal.timed:
+            answer[rows] = repeated.of(answer[rows], signal.step_s)
+    return answer
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedShare:
+    """How much of the motion of BEFORE comes again in AFTER, by frequency."""
+
+    frequency_Hz: np.ndarray
+    """(F,) frequencies, Hz."""
+    share: np.ndarray
+    """(F, n) share of the power of each key point's motion that both recordings have in common, 0
+    to 1: the root of their squared coherence, which is the product of both shares."""
+
+    def at(self, frequency_Hz: np.ndarray) -> np.ndarray:
+        """(G, n) the share at other frequencies (G,)."""
+        return np.stack(
+            [np.interp(frequency_Hz, self.frequency_Hz, column) for column in self.share.T], axis=1
+        )
+
+    def of(self, motion_mm: np.ndarray, step_s: float) -> np.ndarray:
+        """(T, n, 3) motion of one run (T, n, 3) with each frequency as far as it is repeated, mm.
+
+        The run is continued by its mirror image, so that it ends where it begins.
+        """
+        both = np.concatenate([motion_mm, motion_mm[::-1]])
+        weights = self.at(np.fft.rfftfreq(len(both), step_s))
+        spectrum = np.fft.rfft(both, axis=0) * weights[..., None]
+        return np.fft.irfft(spectrum, len(both), axis=0)[: len(motion_mm)]
+
+
+def repeated_share(after: ResidualTable, before_mm: np.ndarray) -> RepeatedShare:
+    """The share of the motion that BEFORE and AFTER have in common, from the training rows.
+
+    A load, gain or lag filters a motion linearly, which leaves the coherence at 1 (Bendat & Piersol
+    2010, ch. 6). The estimate of the squared coherence from K stretches is 1 / K too large where
+    there is none, which is taken off. Slower than LEAST_BINS / SPECTRUM_S, and where there
+    are too few stretches at hand for an estimate, all slow and no fast motion counts as repeated.
+    """
+    points = before_mm.shape[1]
+    slow = LEAST_BINS / SPECTRUM_S
+    fields = np.concatenate([before_mm, after.measured_mm], axis=1)
+    count, cross, power = 0, None, None
+    step, length = _stretch(after, COHERENCE_S)
+    for values in _stretches(after, fields, step, length):
+        spectrum = _spectrum(values).reshape(-1, 2, points, 3)
+        both = np.conj(spectrum[:, 0]) * spectrum[:, 1]
+        own = np.square(np.abs(spectrum))
+        cross, power = (both, own) if cross is None else (cross + both, power + own)
+        count += 1
+    if cross is None or power is None or count < LEAST_STRETCHES:
+        edges = np.array([0.0, slow, np.nextafter(slow, np.inf)])
+        return RepeatedShare(edges, np.repeat([[1.0], [1.0], [0.0]], points, axis=1))
+    found = np.square(np.abs(cross)) / np.maximum(power[:, 0], 1e-30)
+    share = found.sum(2) / np.maximum(power[:, 1].sum(2), 1e-30)
+    share = np.clip((share - 1.0 / count) / (1.0 - 1.0 / count), 0.0, 1.0)
+    frequency = np.fft.rfftfreq(length, step)
+    share[frequency <= slow] = 1.0
+    return RepeatedShare(frequency, np.sqrt(share))
 
 
 def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
@@ -611,7 +702,8 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         np.square(after.noise_mm)
         + np.square(before.noise_mm) * (np.nanmean(found.averaging) if paired.any() else 1.0)
     )
-    free = free_motion(after, measured_before, found.predicted_mm, change)
+    repeated = repeated_share(after, measured_before)
+    free = free_motion(after, measured_before, found.predicted_mm, change, repeated)
     repeatability, source = _repeatability(before)
     slope = slope_error(after)
     discrepancy = paired_discrepancy(repeatability, correction[training], noise, slope)
@@ -625,6 +717,7 @@ def _pairs(after: ResidualTable, before: ResidualTable, found: _Found) -> Pairs:
         partner_t_s=found.partner_t_s,
         after_mm=after.measured_mm,
         before_mm=after.measured_mm - change,
+        body_mm=body_before(after, measured_before + correction, repeated),
         correction_mm=correction,
         repeatability_mm=repeatability,
         source=source,
@@ -678,15 +771,16 @@ def free_motion(
     measured_before_mm: np.ndarray,
     predicted_before_mm: np.ndarray,
     change_mm: np.ndarray,
+    repeated: RepeatedShare,
 ) -> np.ndarray:
-    """(n,) RMS of the change of each key point at the frequencies of free motion, mm.
+    """(n,) RMS of the change of each key point that free motion makes, mm.
 
     An arm that swings, vibrates or is measured with noise moves at frequencies that the actuation
     hardly contains: there BEFORE or AFTER shows FREE_POWER times the power that the model predicts,
-    or more.
-    No change of gain below 1 and no delay of a predicted motion has so much (|1 - exp(i phi)|^2 is
-    at most 4), so no effect of the catalogue explains what changes there, and it counts as noise of
-    the pair. Power by the method of Welch (1967), in bands of a third of an octave.
+    or more. No change of gain below 1 and no delay of a predicted motion has so much
+    (|1 - exp(i phi)|^2 is at most 4). What BEFORE and AFTER do not have in common there counts as
+    noise of the pair: swings that every recording has otherwise. Power by the method of Welch
+    (1967), in bands of a third of an octave.
     """
     points = change_mm.shape[1]
     fields = np.concatenate(
@@ -694,44 +788,55 @@ def free_motion(
         axis=1,
     )
     count, power = 0, None
-    signals = [signal for signal in run_signals(after, False) if signal.timed]
-    if not signals:
-        return np.zeros(points)
-    step = float(np.median(np.concatenate([np.diff(signal.t_s) for signal in signals])))
-    length = int(2 ** np.floor(np.log2(max(2.0, SPECTRUM_S / step))))
-    for signal in signals:
-        rows = signal.rows[~after.held_out[signal.rows]]
-        seen = np.isfinite(fields[rows]).all((1, 2))
-        if seen.sum() < length:
-            continue
-        time = after.t_s[rows][seen]
-        even = np.arange(time[0], time[-1], step)
-        flat = fields[rows][seen].reshape(seen.sum(), -1)
-        values = np.stack([np.interp(even, time, column) for column in flat.T], axis=1)
-        for begin in range(0, len(even) - length + 1, length // 2):
-            found = _power(values[begin : begin + length]).reshape(-1, 5, points, 3).sum(3)
-            power, count = found if power is None else power + found, count + 1
+    step, length = _stretch(after, SPECTRUM_S)
+    for values in _stretches(after, fields, step, length):
+        found = np.square(np.abs(_spectrum(values))).reshape(-1, 5, points, 3).sum(3)
+        power, count = found if power is None else power + found, count + 1
     if power is None:
         return np.zeros(points)
     total = power / count
     frequency = np.fft.rfftfreq(length, step)
     band = np.floor(3.0 * np.log2(np.maximum(frequency, frequency[1]) / frequency[1])).astype(int)
+    apart = (1.0 - repeated.at(frequency)) * total[:, :2].sum(1)
     free = np.zeros(points)
     for number in range(band[LEAST_BINS] + 1, band.max() + 1):
-        level = total[band == number].sum(0)
-        before, later, predicted_before, predicted_later = level[:4].sum(1)
+        before, later, predicted_before, predicted_later = total[band == number, :4].sum((0, 2))
         if before >= FREE_POWER * predicted_before or later >= FREE_POWER * predicted_later:
-            free += level[4]
+            free += np.minimum(apart, total[:, 4])[band == number].sum(0)
     return np.sqrt(free)
 
 
-def _power(values: np.ndarray) -> np.ndarray:
-    """(F, C) power of signals (T, C) at each frequency; their sum is the variance."""
+def _stretch(table: ResidualTable, longest_s: float) -> tuple[float, int]:
+    """(time between two samples, s; samples of a stretch, a power of two)."""
+    steps = [np.diff(signal.t_s) for signal in run_signals(table, False) if signal.timed]
+    step = float(np.median(np.concatenate(steps))) if steps else 1.0
+    return step, int(2 ** np.floor(np.log2(max(2.0, longest_s / step))))
+
+
+def _stretches(
+    table: ResidualTable, fields: np.ndarray, step: float, length: int
+) -> Iterator[np.ndarray]:
+    """(length, C) stretches of the training rows of fields (N, ...), evenly sampled, half over."""
+    for signal in run_signals(table, False):
+        rows = signal.rows[~table.held_out[signal.rows]]
+        seen = np.isfinite(fields[rows]).all((1, 2))
+        if not signal.timed or seen.sum() < length:
+            continue
+        time = table.t_s[rows][seen]
+        even = np.arange(time[0], time[-1], step)
+        flat = fields[rows][seen].reshape(seen.sum(), -1)
+        values = np.stack([np.interp(even, time, column) for column in flat.T], axis=1)
+        for begin in range(0, len(even) - length + 1, length // 2):
+            yield values[begin : begin + length]
+
+
+def _spectrum(values: np.ndarray) -> np.ndarray:
+    """(F, C) amplitudes of signals (T, C) at each frequency; their squares sum to the variance."""
     window = np.hanning(len(values))
     spectrum = np.fft.rfft((values - values.mean(0)) * window[:, None], axis=0)
-    power = np.square(np.abs(spectrum)) / np.square(window).sum() / len(values)
-    power[1:-1] *= 2.0
-    return power
+    spectrum /= np.sqrt(np.square(window).sum() * len(values))
+    spectrum[1:-1] *= np.sqrt(2.0)
+    return spectrum
 
 
 def _enough(after: ResidualTable, pairs: Pairs) -> bool:

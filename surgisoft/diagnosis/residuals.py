@@ -175,6 +175,9 @@ class ResidualTable:
     discrepancy, mm; None: the residuals are those of the model."""
     paired_tolerance_mm: np.ndarray | None = None
     """(n,) where they are paired differences: `Problem.tolerance_mm`."""
+    body_before_mm: np.ndarray | None = None
+    """(N, n, 3) where they are paired differences: key points of BEFORE along the same motion, base
+    frame, mm, without gaps."""
 
     @property
     def spec(self) -> ArmSpec:

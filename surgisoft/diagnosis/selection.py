@@ -84,6 +84,11 @@ def _near(quantity: Quantity) -> bool:
     return bool(np.all((np.ravel(quantity.value) >= low) & (np.ravel(quantity.value) <= high)))
 
 
+def _all_near(effect: Effect) -> bool:
+    """Whether all parameters of an effect may turn out plausible."""
+    return all(_near(quantity) for quantity in effect.quantities())
+
+
 def _options_of(
     candidates: Sequence[Candidate], number: int = 0, first: int = 0
 ) -> Iterator[Option]:
@@ -234,7 +239,7 @@ class ModelSelection:
         begin at rest, loops can be summed to any such function.
         """
         effect = self.in_place(self.single(option, base), base)
-        if effect is not None and not all(_near(quantity) for quantity in effect.quantities()):
+        if effect is not None and not _all_near(effect) and not self.taken_away(option, base):
             return False
         some = self.candidates[self.options[option.effect][0].alone].effect
         return (
@@ -242,9 +247,18 @@ class ModelSelection:
             or self._static_share(option, base) <= SEARCH.most_static
         )
 
+    def taken_away(self, option: Option, base: tuple[int, ...] = ()) -> bool:
+        """Whether an effect is plausible as one that acted before and acts no more, or less."""
+        one = self.single(option, base)
+        effect, candidate = self.in_place(one, base), self.candidates[one.alone]
+        if effect is None or _all_near(effect) or not candidate.removable:
+            return False
+        mirrored = candidate.with_amplitudes(-self._amplitudes(one, base))
+        return mirrored is not None and _all_near(mirrored)
+
     def _static_share(self, option: Option, base: tuple[int, ...]) -> float:
         """Share of what an effect explains that is a cubic of the actuation."""
-        amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+        amplitudes = self._amplitudes(option, base)
         part = (self.sensitivities[..., list(option.chosen)] @ amplitudes).reshape(
             len(self.sensitivities), -1
         )
@@ -279,9 +293,13 @@ class ModelSelection:
         """A single candidate's effect at the amplitudes that it is given beside a base."""
         key = (option.candidate, base)
         if key not in self.fitted:
-            amplitudes = self.validation.amplitudes(base + option.chosen)[len(base) :]
+            amplitudes = self._amplitudes(option, base)
             self.fitted[key] = self.candidates[option.alone].with_amplitudes(amplitudes)
         return self.fitted[key]
+
+    def _amplitudes(self, option: Option, base: tuple[int, ...]) -> np.ndarray:
+        """(k,) amplitudes of an option beside a base."""
+        return self.validation.amplitudes(base + option.chosen)[len(base) :]
 
     def starts(self, scores: Sequence[Score]) -> list[tuple[str, Effect]]:
         """Effects, by name, in their best single candidate at their amplitudes: starts of a fit."""

@@ -14,7 +14,7 @@ from surgisoft.errors import InputError
 from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.spec import NOMINAL, ControllerSpec, Experiment
 from surgisoft.measurement.protocols.schedule_file import load_schedule
-from surgisoft.tasks.base import TaskState
+from surgisoft.tasks.base import Task, TaskState
 
 Controller = Callable[[PhasedTask, str, TaskState], Tensor]
 """(task, agent, state) -> (B, m) kPa: the actions of one arm."""
@@ -97,9 +97,10 @@ class PhaseControllers:
 
     @torch.inference_mode()
     def act(
-        self, task: PhasedTask, state: TaskState, observations: dict[str, Tensor]
+        self, task: Task, state: TaskState, observations: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Actions of the controllers of the present phases, see `Policy.act`."""
+        """Actions of the controllers of the present phases, see `Policy.act`; a `PhasedTask`."""
+        assert isinstance(task, PhasedTask)
         known: dict[str, dict[str, Tensor]] = {}
         actions = {}
         for agent in task.agents:

@@ -23,6 +23,7 @@ from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacl
 from surgisoft.agents.on_rig import at_benches, real_benches
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
 from surgisoft.agents.run_folder import versions
+from surgisoft.config import LARGEST_INTEGER
 from surgisoft.errors import InputError
 from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.phases import REASONS, PhasedTask, with_phase_events
@@ -188,7 +189,14 @@ def read_rows(folder: Path, every: list[Job]) -> list[Row]:
 def _kinds(row: Row) -> dict[str, type]:
     """Text or number, by the name of each value; what is neither is no row's."""
     kinds = {str: str, int: float, float: float, type(None): float}
-    return {name: kinds.get(type(value), object) for name, value in row.items()}
+    return {
+        name: object if _is_too_large(value) else kinds.get(type(value), object)
+        for name, value in row.items()
+    }
+
+
+def _is_too_large(value: object) -> bool:
+    return isinstance(value, int) and abs(value) >= LARGEST_INTEGER
 
 
 def _is_done(folder: Path, job: Job) -> bool:

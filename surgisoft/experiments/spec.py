@@ -16,6 +16,7 @@ from surgisoft.config import (
     describe,
     from_table,
     merged,
+    path_beside,
     read_toml,
     to_table,
     write_toml,
@@ -301,13 +302,9 @@ def _without_none(value: Any) -> Any:
 
 def _absolute(spec: Experiment, where: Where) -> Experiment:
     """The experiment with absolute paths; raises an InputError for one that does not exist."""
-    home = where.path.resolve().parent
 
     def there(text: str, place: Where, what: str) -> str:
-        path = (home / text).resolve()
-        if not path.exists():
-            raise place.error(f"there is no '{text}' beside this file", what)
-        return str(path)
+        return str(path_beside(place, text, what))
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i

@@ -16,6 +16,8 @@ SPIN_S = 5e-4
 """Last part of a wait that is spent looking at the clock instead of sleeping [s]."""
 MISSED = 1.5
 """An interval of more periods than this counts as an overrun where the rig keeps the time."""
+NAMED = 5
+"""Number of overruns whose time is printed."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,11 @@ class Timing:
     overruns: int
     """Periods whose work was not done in time; where the rig keeps the time, samples that came
     more than half a period late."""
+    overruns_waiting: int = 0
+    """Overruns in which the loop computed for less than a period: it waited for the processor, for
+    memory or for the rig."""
+    overruns_s: tuple[float, ...] = ()
+    """When the overruns were, from the first period on [s]."""
 
     @property
     def sentence(self) -> str:
@@ -56,7 +63,20 @@ class Timing:
         return (
             f"{self.ticks:,} periods of {1e3 * self.period_s:g} ms; jitter "
             f"{1e3 * self.jitter_s:.3f} ms (99 %: {1e3 * self.interval_99_s:.3f} ms, worst "
-            f"{1e3 * self.interval_worst_s:.3f} ms); {work}; {self.overruns} overruns"
+            f"{1e3 * self.interval_worst_s:.3f} ms); {work}; {self.overruns} overruns{self._causes}"
+        )
+
+    @property
+    def _causes(self) -> str:
+        """When and why the period was not kept, in words."""
+        if not self.overruns:
+            return ""
+        when = ", ".join(f"{at:.1f}" for at in self.overruns_s[:NAMED])
+        more = ", ..." if self.overruns > NAMED else ""
+        own = self.overruns - self.overruns_waiting
+        return (
+            f" (at {when}{more} s; in {own} the loop's own work took longer than the period, in "
+            f"{self.overruns_waiting} the loop waited: for the processor, memory or the rig)"
         )
 
 
@@ -72,10 +92,16 @@ class Clock:
     """Reads the time [s]."""
     sleep: Callable[[float], None] = time.sleep
     """Waits for a time [s]."""
+    computed: Callable[[], float] = time.thread_time
+    """Reads the processor time of the thread that calls `tick` [s]."""
     overruns: int = 0
     """Periods that were not kept so far."""
+    _waiting: int = 0
+    _overruns_s: list[float] = field(default_factory=list)
+    _began: float | None = None
     _due: float | None = None
     _last: float | None = None
+    _computed: float = 0.0
     _intervals: list[float] = field(default_factory=list)
     _busy: list[float] = field(default_factory=list)
 
@@ -88,21 +114,32 @@ class Clock:
         came = self.now()
         if self._due is None or self._last is None:
             self._due = self._last = came
+            self._began = came if self._began is None else self._began
+            self._computed = self.computed()
             return
+        computed = self.computed() - self._computed
         self._busy.append(came - self._last)
         self._due += self.period_s
         if self.pace == "real":
             if came > self._due:
-                self.overruns += 1
+                self._overrun(computed)
                 # Later periods keep their grid where this one can be made up for.
                 self._due = max(self._due, came - self.period_s)
             self._wait(self._due)
         there = self.now()
         interval = there - self._last
         if self.pace == "rig" and interval > MISSED * self.period_s:
-            self.overruns += 1
+            self._overrun(computed)
         self._intervals.append(interval)
-        self._last = there
+        self._last, self._computed = there, self.computed()
+
+    def _overrun(self, computed_s: float) -> None:
+        """Count a period that was not kept, and note when it began."""
+        assert self._last is not None
+        assert self._began is not None
+        self.overruns += 1
+        self._waiting += computed_s < self.period_s
+        self._overruns_s.append(self._last - self._began)
 
     def _wait(self, due: float) -> None:
         left = due - self.now()
@@ -127,4 +164,6 @@ class Clock:
             float(np.quantile(busy, 0.99)),
             float(busy.max()),
             self.overruns,
+            self._waiting,
+            tuple(self._overruns_s),
         )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gc
 import math
+import os
 import signal
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -77,6 +78,13 @@ SUSPICIOUS = 2.0
 LEAD_IN_S = 60.0
 """Time before the change that `*-after` keeps without key points, so that a model's memory is
 that of the run [s]."""
+REHEARSED = 3
+"""Number of steps of a policy in simulation before the run."""
+PRIORITY = 20
+"""Real-time priority of the loop, of 1 to 99; threads of the kernel have 50."""
+OLD_OBJECTS_KEPT = 1_000_000
+"""Threshold of the oldest generation of the garbage collector during a run: it is not looked at, as
+the samples that a run keeps are in it (after 140 s that took 60 ms, longer than a period)."""
 SWITCH_S = 5e-4
 """Longest time for which another thread may hold the interpreter during a run [s]."""
 
@@ -354,9 +362,10 @@ class _Session:
             opened.pop_all()
             with (
                 self._shown(rig),
-                _real_time(),
+                _begun(ThreadPoolExecutor(1)) as self._worker,
                 self._guarded(bench),
-                ThreadPoolExecutor(1) as self._worker,
+                _undisturbed(),
+                nullcontext() if clock.pace == "simulated" else _real_time_priority(),
             ):
                 try:
                     drive()
@@ -561,6 +570,7 @@ class _Session:
             config = replace(config, observer_gain=request.observer_gain, adapts=False)
         task = on_rig(place, config, lambda config, trial: bench)
         policy = open_policy(request.policy, task)
+        _rehearse(place, policy)
         return lambda: self._follow_policy(task, policy)
 
     def _follow_schedule(self, bench: Rig, protocol: Protocol) -> None:
@@ -854,12 +864,30 @@ def _next_goal(task: Task, state: TaskState) -> TaskState:
     return TaskState(replace(state.world, stream=stream, steps=steps), goal)
 
 
+def _begun(pool: ThreadPoolExecutor) -> ThreadPoolExecutor:
+    """A pool of one thread, which has started."""
+    pool.submit(int).result()
+    return pool
+
+
+@torch.inference_mode()
+def _rehearse(place: Task, policy: Policy) -> None:
+    """A few steps in simulation: what loads or compiles when first used does so before the run."""
+    episodes = Episodes(place)
+    state = episodes.seeded(0, 1)
+    for _ in range(REHEARSED):
+        actions = policy.act(place, state, episodes.observe(state))
+        state, _ = episodes.step(state, actions)
+
+
 @contextmanager
-def _real_time() -> Iterator[None]:
+def _undisturbed() -> Iterator[None]:
     """Keep the interpreter's garbage collector and other threads from delaying the loop."""
     threads, interval = torch.get_num_threads(), sys.getswitchinterval()
     gc.collect()
     gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*thresholds[:2], OLD_OBJECTS_KEPT)
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -867,5 +895,29 @@ def _real_time() -> Iterator[None]:
     finally:
         sys.setswitchinterval(interval)
         torch.set_num_threads(threads)
+        gc.set_threshold(*thresholds)
         with suppress(AttributeError):
             gc.unfreeze()
+
+
+@contextmanager
+def _real_time_priority() -> Iterator[None]:
+    """Real-time priority of this process's threads, where the system has it and permits it.
+
+    All threads that are there get it: one of lower priority that is held up while it has the
+    interpreter would hold up the loop. What they start later has none (`SCHED_RESET_ON_FORK`).
+    """
+    before: dict[int, tuple[int, Any]] = {}
+    with suppress(AttributeError, OSError):  # no such call on this system, or not permitted
+        policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
+        for name in os.listdir("/proc/self/task"):
+            thread = int(name)
+            kept = os.sched_getscheduler(thread), os.sched_getparam(thread)
+            os.sched_setscheduler(thread, policy, os.sched_param(PRIORITY))
+            before[thread] = kept
+    try:
+        yield
+    finally:
+        for thread, kept in before.items():
+            with suppress(OSError):  # it has ended
+                os.sched_setscheduler(thread, *kept)

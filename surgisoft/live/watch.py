@@ -28,6 +28,8 @@ class Companion:
     def __init__(self, model: ArmModel):
         self.model = model
         self.reset()
+        with torch.inference_mode():  # what loads or compiles when first used does so now
+            model.step(self._state, torch.zeros_like(self._state.pressure), 0.0, None)
 
     def reset(self) -> None:
         """The arm was vented and is at rest: the model forgets."""

@@ -240,7 +240,7 @@ class SafeRig:
         if not self.dry and callable(getattr(self.rig, "vent", None)):
             ours = self._lock.acquire(timeout=LOCK_S)  # a command that hangs must not hold it up
             with contextlib.suppress(Exception):  # the end of the run tries again, and reports
-                self.rig.vent()  # type: ignore[attr-defined]
+                self.rig.vent()  # type: ignore[attr-defined]  # asked above
             if ours:
                 self._lock.release()
         if self._handlers and threading.current_thread() is not threading.main_thread():
@@ -272,7 +272,7 @@ class SafeRig:
                 failed = " ".join(str(unreached).split())
         self._unlisten()
         for number, handler in self._handlers.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+            signal.signal(number, handler)  # type: ignore[arg-type]  # as Python gave it
         self._handlers = {}
         for thread in self._threads:
             thread.join(timeout=1.0)

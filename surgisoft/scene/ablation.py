@@ -355,6 +355,10 @@ class AblationMap:
             delivered_j=delivered,
         )
 
+    def alone(self, state: AblationState) -> LoneDose:
+        """The dose of the only environment of a state with one beam, on the CPU, in kept arrays."""
+        return LoneDose(self, state)
+
     def paint(self, state: AblationState, environment: int = 0) -> Paint:
         """For `render`: colours one environment's patch by dose, from blanched to charred."""
         dose = state.dose[environment].detach().cpu().numpy()
@@ -369,6 +373,103 @@ class AblationMap:
             return np.where(heat >= 1.0, charred, pale)
 
         return recolour
+
+
+class LoneDose:
+    """The dose of one environment under one beam, in kept arrays with a batch of one in front.
+
+    It calls the compiled loop of `AblationMap.advance`, which sets what happens.
+    """
+
+    def __init__(self, dose_map: AblationMap, state: AblationState):
+        self._map, self._ring = dose_map, state.ring
+        patch, grid = dose_map.patch, dose_map.patch.buckets
+        names = (*_SUMS, "last_point_mm", "last_direction", "last_on")
+        self._arrays = {name: getattr(state, name).numpy().copy() for name in names}
+        dose, self._peak, band, self._zone_mm2, joule, self._delivered = (
+            self._arrays[name] for name in _SUMS
+        )
+        began, ended, middle = (np.zeros((1, 3), np.float32) for _ in range(3))
+        self._energy = np.zeros(1, np.float32)
+        last = (self._arrays[name] for name in ("last_point_mm", "last_direction", "last_on"))
+        self._sweep = (*last, began, ended, middle, self._energy)
+        self._deposit = (
+            *(began, ended, middle, self._energy, state.ring.numpy().copy(), dose_map.waist_mm),
+            dose_map._counted,
+            (patch.points_mm, patch.normals, patch.areas_mm2, dose_map._zones, dose_map._stations),
+            (grid.origin_mm, grid.cell_mm, grid.shape, grid.starts),
+            *(dose, self._peak, band, self._zone_mm2, joule),
+        )
+        self._station_mm = float(dose_map._ring_mm[state.ring[0]] / patch.stations)
+        self._cut_dose = np.float32(dose_map.cut_dose)
+
+    def advance(
+        self, point_mm: np.ndarray, direction: np.ndarray, on: bool, power_w: float, dt_s: float
+    ) -> None:
+        """The beam has swept to (1, 3) mm along (1, 3), on the organ or not, see `AblationMap`."""
+        _sweep_to(point_mm, direction, on, np.float32(power_w), np.float32(dt_s), *self._sweep)
+        if self._energy[0] > 0.0:
+            _deposit(*self._deposit)
+            self._delivered += self._energy
+
+    def progress(self) -> tuple[float, float, float]:
+        """Completion, largest gap (mm) and healthy tissue ablated (mm^2), see `RingReport`."""
+        completion, gap = _ring_progress(self._peak, self._cut_dose)
+        return completion, gap * self._station_mm, float(self._zone_mm2[0, HEALTHY])
+
+    @property
+    def state(self) -> AblationState:
+        """A copy of the present state."""
+        copies = {name: torch.from_numpy(array.copy()) for name, array in self._arrays.items()}
+        return AblationState(**copies, ring=self._ring)
+
+
+@compiled
+def _sweep_to(
+    point, aim, on, power, dt, last_point, last_aim, last_on, began, ended, middle, energy
+):
+    """One environment's sweep since the last place of its beam, as in `AblationMap.advance`.
+
+    point, aim (1, 3); writes began, ended, middle (1, 3) and energy (1,), and renews what is last.
+    """
+    total = np.float32(0.0)
+    for i in range(3):
+        total += abs(point[0, i]) + abs(aim[0, i])
+    finite = math.isfinite(total)
+    on = on and finite
+    was, share = last_on[0], np.float32(0.0)
+    if on and was:
+        share = np.float32(1.0)
+    elif on != was:
+        share = np.float32(0.5)
+    energy[0] = max(share * power * dt, np.float32(0.0))
+    size = np.float32(0.0)
+    for i in range(3):
+        now = point[0, i] if finite else np.float32(0.0)
+        along = aim[0, i] if finite else np.float32(0.0)
+        began[0, i] = last_point[0, i] if was else now
+        ended[0, i] = now if on else last_point[0, i]
+        before = last_aim[0, i] if was else along
+        middle[0, i] = before + (along if on else last_aim[0, i])
+        size += middle[0, i] * middle[0, i]
+        last_point[0, i], last_aim[0, i] = now, along
+    length = max(math.sqrt(size), 1e-12)
+    for i in range(3):
+        middle[0, i] /= length
+    last_on[0] = on
+
+
+@compiled
+def _ring_progress(peak, cut_dose):
+    """Share of a ring's stations (1, N) that is cut, and stations of its longest uncut stretch."""
+    count = peak.shape[1]
+    cut, longest, run = 0, 0, 0
+    for k in range(2 * count):
+        is_cut = peak[0, k if k < count else k - count] >= cut_dose
+        cut += is_cut and k < count
+        run = 0 if is_cut else run + 1
+        longest = max(longest, run)
+    return cut / count, min(longest, count)
 
 
 def _each_beam(*fields: torch.Tensor) -> Iterator[tuple[torch.Tensor, ...]]:

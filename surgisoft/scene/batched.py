@@ -8,7 +8,8 @@ tolerances that `tests/scene/test_distance.py` and `test_rays.py` state.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -21,11 +22,15 @@ from surgisoft.scene import frames
 from surgisoft.scene.bvh import TriangleTree, build_tree
 from surgisoft.scene.capsules import HORIZON_MM, BatchClearance, chain_normal, self_contact_gap_mm
 from surgisoft.scene.distance import (
+    beams_beside_body,
+    beams_beside_chains,
+    beams_inside_faces,
     chains_apart,
     chains_folded,
     chains_to_surface,
     divide_steps,
     longest_steps,
+    parts_of_steps,
 )
 from surgisoft.scene.field import MOST_NODES, DistanceField, load_field
 from surgisoft.scene.mesh import Body
@@ -40,7 +45,7 @@ from surgisoft.scene.rays import (
     rays_to_chains,
     struck_of,
 )
-from surgisoft.scene.sight import hide_behind_body, hide_behind_chain
+from surgisoft.scene.sight import hide_behind_body, hide_behind_chain, points_in_picture
 from surgisoft.scene.torch_queries import (
     TorchSurface,
     chains_apart_torch,
@@ -56,6 +61,13 @@ MOST_PARTS = 256
 """No segment is cut into more parts than this."""
 SLOPE_MM = 0.05
 """Shift of an arm by which the slope of its distance from a strained body is measured (mm)."""
+BESIDE_MM = 1e-3
+"""A ray that passes by at this distance misses, by any engine (mm): the width of the triangle by
+which FCL represents a ray, and a million times the rounding of the others."""
+EDGE_MM = 0.01
+"""A ray that meets a face this far inside its edges meets that face, by any engine (mm)."""
+GRAZING = 0.05
+"""Cosine of the angle between ray and normal below which a hit is not beyond doubt (87 degrees)."""
 EXACT_WITHIN_MM = 5.0
 """Clearances below this are exact; larger ones have the field's interpolation error (mm)."""
 
@@ -245,6 +257,55 @@ class BatchedScene:
             incidence_rad=incidence.reshape(shape),
         )
 
+    def sure_hits(
+        self,
+        origins_mm: np.ndarray,
+        directions: np.ndarray,
+        range_mm: float,
+        arms: Mapping[str, np.ndarray],
+        own: str | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What rays (N, 3) meet first among bodies at rest, where that is beyond doubt.
+
+        Returns a `Struck` (N,) int8, the ends (N, 3) mm in double precision, and sure (N,) bool.
+        Where a ray is sure, no engine that is right to `BESIDE_MM` finds anything else: it meets a
+        face inside its edges by `EDGE_MM` and not at a grazing angle, every other face of every
+        body, and every arm (N, K, 3) mm, stays `BESIDE_MM` away from it up to there.
+        """
+        count = len(origins_mm)
+        origins, aims, normals = (np.empty((count, 3)) for _ in range(3))
+        aim_rays(origins_mm, directions, origins, aims)
+        np.negative(aims, out=normals)
+        struck, t = np.zeros(count, np.int8), np.full(count, float(range_mm))
+        body, face = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+        sure = np.isfinite(origins).all(1) & np.isfinite(aims).all(1)
+        places = []
+        for n, (one, surface, tree) in enumerate(
+            zip(self.bodies, self._surfaces, self._trees, strict=True)
+        ):
+            turn, shift = (part.numpy() for part in self._inward(one, None))
+            mesh = (tree.arrays, tree.order, surface.normals.numpy(), n, int(struck_of(one)))
+            rays_to_body(origins, aims, 1, turn, shift, *mesh, struck, body, face, t, normals)
+            places.append((turn[0], shift[0], tree))
+        cosine = np.abs((normals * aims).sum(1))
+        met = body >= 0
+        sure &= ~met | (cosine >= GRAZING)
+        before = np.where(met, t - 2.0 * BESIDE_MM / np.maximum(cosine, GRAZING), t)
+        ends = origins + t[:, None] * aims
+        for n, (turn, shift, tree) in enumerate(places):
+            beams_beside_body(origins, aims, before, turn, shift, BESIDE_MM, tree.arrays, sure)
+            triangles = tree.mesh.triangles_mm
+            beams_inside_faces(ends, face, body, n, turn, shift, triangles, EDGE_MM, sure)
+        for name, line in arms.items():
+            radius = self.radius_mm(name)
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            beams_beside_chains(origins, aims, t, line, radius, gap, BESIDE_MM, sure)
+        return struck, ends, sure
+
+    def alone(self, lines: Mapping[str, np.ndarray]) -> LoneScene:
+        """Queries of one environment among bodies at rest, for the compiled engine."""
+        return LoneScene(self, lines)
+
     def clear_lines(
         self,
         eyes_mm: torch.Tensor,
@@ -299,6 +360,213 @@ class BatchedScene:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class LoneView:
+    """What one camera sees of M points, in kept arrays with a batch of one in front."""
+
+    wanted: np.ndarray
+    """(1, M) bool: inside the cone and in range."""
+    visible: np.ndarray
+    """(1, M) bool: and nothing in between."""
+    middle: np.ndarray
+    """(1, 2) float32: angle of the points' middle to the axis, rad, and its distance, mm."""
+
+
+class LoneScene:
+    """Clearance, beams and views of one environment among bodies at rest, in kept arrays.
+
+    It calls the compiled loops of a `BatchedScene`, which give what they give for a batch; what a
+    batch of one saves is everything around them. `lines` name -> (1, K, 3) float32 mm are the arms'
+    centrelines, which the caller overwrites between two queries. Each query overwrites its results.
+    """
+
+    def __init__(self, scene: BatchedScene, lines: Mapping[str, np.ndarray]):
+        self.scene, self.lines = scene, dict(lines)
+        self.radii = {name: scene.radius_mm(name) for name in lines}
+        self._bodies = [
+            (tuple(part.numpy() for part in scene._inward(body, None)), surface, tree)
+            for body, surface, tree in zip(scene.bodies, scene._surfaces, scene._trees, strict=True)
+        ]
+        arms, bodies = len(lines), len(scene.bodies)
+        self.bodies_mm = np.empty((1, arms, bodies), np.float32)
+        """(1, A, N) mm: clearance of each arm from each body, see `BatchClearance`."""
+        self.arms_mm = np.empty((1, arms * (arms - 1) // 2), np.float32)
+        """(1, A (A - 1) / 2) mm: of each pair of arms."""
+        self.self_mm = np.empty((1, arms), np.float32)
+        """(1, A) mm: of each arm from itself."""
+        self._fine: dict[tuple[str, bytes], tuple[np.ndarray, np.ndarray, list[tuple]]] = {}
+        self._parts = {name: np.empty(line.shape[1] - 1, np.int64) for name, line in lines.items()}
+        radius, places = self.radii, list(enumerate(lines))
+        self._apart = [
+            (
+                lines[one],
+                lines[two],
+                radius[one] + radius[two],
+                scene.horizon_mm,
+                self.arms_mm[0, n : n + 1],
+            )
+            for n, ((_, one), (_, two)) in enumerate(combinations(places, 2))
+        ]
+        self._folded = [
+            (
+                lines[one],
+                radius[one],
+                self_contact_gap_mm(radius[one]),
+                scene.horizon_mm,
+                self.self_mm[0, a : a + 1],
+            )
+            for a, one in places
+        ]
+        self._looks: dict[tuple, tuple] = {}
+
+    def clearance(self) -> None:
+        """Fill `bodies_mm`, `arms_mm` and `self_mm`."""
+        for arm, (name, line) in enumerate(self.lines.items()):
+            parts = self._parts[name]
+            total = parts_of_steps(line[0], LONGEST_SEGMENT_MM, MOST_PARTS, parts)
+            key = (name, parts.tobytes())
+            if key not in self._fine:
+                self._fine[key] = self._divided(arm, name, total)
+            fine, divided, calls = self._fine[key]
+            if fine is not line:
+                divide_steps(line, divided, fine)
+            for call in calls:
+                chains_to_surface(*call)
+        for call in self._apart:
+            chains_apart(*call)
+        for call in self._folded:
+            chains_folded(*call)
+
+    def _divided(self, arm: int, name: str, total: int) -> tuple:
+        """Array of an arm's divided centreline, its parts, and the queries of the bodies."""
+        line, parts = self.lines[name], self._parts[name].copy()
+        given = np.zeros(total + 1, bool)
+        given[np.concatenate(([0], parts)).cumsum()] = True
+        fine = line if total == len(parts) else np.empty((1, total + 1, 3), np.float32)
+        scene, calls = self.scene, []
+        for n, ((turn, shift), surface, tree) in enumerate(self._bodies):
+            out = self.bodies_mm[0, arm, n : n + 1]
+            assert isinstance(surface, CompiledSurface), "tensors have a batch of their own"
+            limits = (self.radii[name], scene.exact_within_mm, scene.horizon_mm)
+            calls.append((fine, given, turn, shift, *limits, *surface.constants, tree.arrays, out))
+        return fine, parts, calls
+
+    def beam(self, tip_mm: np.ndarray, aim: np.ndarray, range_mm: float, own: str) -> LoneBeam:
+        """The beam of the arm `own` from its tip (1, 3) mm along aim (1, 3), kept arrays."""
+        return LoneBeam(self, tip_mm, aim, range_mm, own)
+
+    def look(
+        self,
+        eye_mm: np.ndarray,
+        axis: np.ndarray,
+        points_mm: np.ndarray,
+        normals: np.ndarray,
+        picture: tuple[float, float, float, float],
+        short_mm: float,
+        own: str,
+    ) -> Callable[[], LoneView]:
+        """A function that looks from the kept arrays eye_mm and axis (1, 3) at points (1, M, 3).
+
+        picture: lift of the points, half of the field of view, nearest and farthest distance, as
+        for `sight.points_in_picture`; short_mm and own as for `BatchedScene.clear_lines`.
+        """
+        count = points_mm.shape[1]
+        ends, distance = np.empty((1, count, 3)), np.empty((1, count))
+        wanted, clear = np.empty((1, count), bool), np.empty((1, count), bool)
+        middle = np.empty((1, 2), np.float32)
+        first: tuple = (eye_mm, axis, points_mm, normals, *picture, ends, wanted, distance, middle)
+        place: tuple = (eye_mm, ends, distance, short_mm)
+        chains = [
+            (
+                *place,
+                line,
+                self.radii[name],
+                self_contact_gap_mm(self.radii[name]) if name == own else -1.0,
+                wanted,
+                clear,
+            )
+            for name, line in self.lines.items()
+        ]
+        bodies = [(*place, *inward, tree.arrays, clear) for inward, _, tree in self._bodies]
+        found = LoneView(wanted, clear, middle)
+
+        def look() -> LoneView:
+            points_in_picture(*first)
+            if wanted.any():
+                clear[:] = wanted
+                for call in chains:
+                    hide_behind_chain(*call)
+                for call in bodies:
+                    hide_behind_body(*call)
+            else:
+                clear[:] = False
+            return found
+
+        return look
+
+
+class LoneBeam:
+    """The end of one arm's beam in kept arrays, see `RayHit`; `cast` computes it."""
+
+    def __init__(self, scene: LoneScene, tip_mm, aim, range_mm: float, own: str):
+        self._range_mm = float(range_mm)
+        self.struck = np.zeros(1, np.int8)
+        """(1,) what is met first, a `Struck`."""
+        self.body, self.face = np.empty(1, np.int32), np.empty(1, np.int32)
+        """(1,) body and face that are met, -1 for none."""
+        self.point_mm, self.normal = np.empty((1, 3), np.float32), np.empty((1, 3), np.float32)
+        """(1, 3) mm where the beam ends, and the outward unit normal there."""
+        self.distance_mm, self.incidence_rad = np.empty(1, np.float32), np.empty(1, np.float32)
+        """(1,) mm along the beam, and rad between it and the normal."""
+        origins, aims, normals = (np.empty((1, 3)) for _ in range(3))
+        self._aims, self._normals, self._t = aims, normals, np.empty(1)
+        self._segment, self._before = np.zeros(1, np.int64), np.empty(1)
+        found = (self.struck, self.body, self.face, self._t, normals)
+        self._aim = (tip_mm, aim, origins, aims)
+        self._bodies = [
+            (
+                origins,
+                aims,
+                1,
+                *inward,
+                tree.arrays,
+                tree.order,
+                surface.normals.numpy(),
+                n,
+                int(struck_of(body)),
+                *found,
+            )
+            for n, (body, (inward, surface, tree)) in enumerate(
+                zip(scene.scene.bodies, scene._bodies, strict=True)
+            )
+        ]
+        rays = (origins.reshape(1, 1, 3), aims.reshape(1, 1, 3))
+        ends = (self._t.reshape(1, 1), self._segment.reshape(1, 1))
+        self._chains = []
+        for name, line in scene.lines.items():
+            radius = scene.radii[name]
+            gap = self_contact_gap_mm(radius) if name == own else -1.0
+            kind = int(Struck.OWN_ARM if name == own else Struck.OTHER_ARM)
+            hit = (origins, aims, 1, line, kind, self._before, self._segment, *found)
+            self._chains.append(((*rays, line, radius, gap, *ends), hit))
+        numbers = (self.distance_mm, self.incidence_rad)
+        self._end = (origins, aims, self._t, normals, self.point_mm, self.normal, *numbers)
+
+    def cast(self) -> None:
+        """Find what the beam meets now."""
+        aim_rays(*self._aim)
+        np.negative(self._aims, out=self._normals)
+        self.struck[0], self.body[0], self.face[0] = 0, -1, -1
+        self._t[0] = self._range_mm
+        for call in self._bodies:
+            rays_to_body(*call)
+        for chain, hit in self._chains:
+            self._before[0], self._segment[0] = self._t[0], 0
+            rays_to_chains(*chain)
+            chain_hits(*hit)
+        ray_ends(*self._end)
+
+
 def strained_clearance(
     surface: CompiledSurface | TorchSurface,
     lines: torch.Tensor,
@@ -336,8 +604,10 @@ class CompiledSurface:
     """One body's surface on the CPU, for clearance queries."""
 
     def __init__(self, tree: TriangleTree, field: DistanceField, device: str | torch.device):
-        self._tree, self._field = tree, field
-        self._closed = tree.mesh.is_watertight
+        self._tree = tree
+        grid = (field.values_mm, field.origin_mm, field.cell_mm, field.band_mm, field.slack_mm)
+        self.constants = (tree.mesh.is_watertight, *grid)
+        """What `chains_to_surface` takes of the body beside its tree."""
         self.normals = torch.tensor(np.array(tree.mesh.face_normals), device=device)
 
     def clearance(
@@ -355,24 +625,9 @@ class CompiledSurface:
         given (K,) bool: the centreline's own points, where depth inside the body counts.
         """
         out = torch.empty(len(lines), dtype=lines.dtype)
-        field = self._field
-        chains_to_surface(
-            lines.numpy(),
-            given.numpy(),
-            turn.numpy(),
-            shift.numpy(),
-            radius,
-            within,
-            horizon,
-            self._closed,
-            field.values_mm,
-            field.origin_mm,
-            field.cell_mm,
-            field.band_mm,
-            field.slack_mm,
-            self._tree.arrays,
-            out.numpy(),
-        )
+        place = (lines.numpy(), given.numpy(), turn.numpy(), shift.numpy())
+        limits = (radius, within, horizon)
+        chains_to_surface(*place, *limits, *self.constants, self._tree.arrays, out.numpy())
         return out
 
 

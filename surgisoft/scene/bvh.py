@@ -6,7 +6,8 @@ CPU; `torch_queries` walks the same arrays on an accelerator.
 
 The first part holds the primitives: exact distances between points, segments, triangles and boxes
 as compiled scalar arithmetic in float64, in one frame and one unit. Functions whose name ends in
-`d2` return squared distances. The exact collision checker in `collision` uses none of them.
+`d2` return squared distances. The exact collision checker in `collision` uses none of them; its
+queries of a lone environment let them choose what FCL is asked about.
 """
 
 from __future__ import annotations

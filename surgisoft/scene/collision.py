@@ -19,6 +19,7 @@ import torch
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene import frames
+from surgisoft.scene.bvh import STACK, TriangleTree, build_tree
 from surgisoft.scene.capsules import (
     HORIZON_MM,
     ArmShape,
@@ -28,6 +29,14 @@ from surgisoft.scene.capsules import (
     ray_chain,
     ray_free_segments,
     segment_distance,
+    self_contact_gap_mm,
+)
+from surgisoft.scene.distance import (
+    beam_near_chain,
+    beam_near_surface,
+    nearest_fold,
+    nearest_of_chains,
+    nearest_to_surface,
 )
 from surgisoft.scene.inside import points_inside
 from surgisoft.scene.mesh import Body, Mesh
@@ -169,6 +178,14 @@ class _Chain:
         index = np.arange(len(points) - 1)[start:stop]
         faces = np.stack((index, index + 1, index + 1), axis=1)
         return fcl.CollisionObject(surface_model(points, faces))
+
+    def part(self, start: int, stop: int) -> fcl.CollisionObject:
+        """Segments start..stop alone, which is cheaper to build than `line` with all points."""
+        points = self.shape.centreline_mm[start : stop + 1]
+        index = np.arange(stop - start)
+        return fcl.CollisionObject(
+            surface_model(points, np.stack((index, index + 1, index + 1), 1))
+        )
 
     def touches(self, other: fcl.CollisionObject) -> list[int]:
         """Segments that overlap the surface of another object."""
@@ -412,10 +429,13 @@ class CollisionChecker:
                 column[index] = value
         return RayHit(*columns)
 
-    def _cast_one(self, origin, direction, range_mm, arms, own) -> tuple:
+    def _cast_one(self, origin, direction, range_mm, arms, own, among=None) -> tuple:
+        """Fields of the `RayHit` of one ray; among: numbers of the bodies to ask FCL about."""
         best = (Struck.NOTHING, -1, -1, range_mm, origin + range_mm * direction, -direction)
         probe = _probe(origin, direction, range_mm)
         for index, body in enumerate(self.bodies):
+            if among is not None and index not in among:
+                continue
             inward = self._inward[index]
             o, d = frames.apply(inward, origin[None]), frames.rotate(inward, direction[None])
             if not _enter_box(o, d, best[3], body.mesh.bounds_mm)[0]:
@@ -519,6 +539,8 @@ class ExactScene:
         self.bodies, self.radii_mm = tuple(bodies), dict(radii_mm)
         self.device = torch.device(device)
         self.checker = CollisionChecker(self.bodies)
+        self._trees: dict[int, tuple[Mesh, TriangleTree]] = {}
+        self._guided = GuidedChecker(self.checker, self._trees)
 
     def radius_mm(self, arm: str) -> float:
         """Radius of an arm by name (mm)."""
@@ -535,12 +557,8 @@ class ExactScene:
         found = np.full((len(first), len(names) * (len(self.bodies) + 1) + len(pairs)), np.nan)
         for i, (row, shapes) in enumerate(zip(found, self._shapes(arms), strict=True)):
             if shapes is not None:
-                exact = self._checker(poses, i).clearance(shapes)
-                row[:] = [
-                    *(exact.bodies_mm[name, body.name] for name in names for body in self.bodies),
-                    *(exact.arms_mm[pair] for pair in pairs),
-                    *exact.self_mm.values(),
-                ]
+                to_bodies, apart, own = self.guided(poses, i).clearances(shapes)
+                row[:] = [*to_bodies, *apart, *own]
         values = torch.as_tensor(found, dtype=first.dtype, device=self.device)
         sizes = (len(names) * len(self.bodies), len(pairs), len(names))
         bodies, apart, own = values.split(sizes, 1)
@@ -561,7 +579,7 @@ class ExactScene:
         hits = [
             _missed(o, d, range_mm)
             if near is None or not (np.isfinite(o).all() and np.isfinite(d).all())
-            else self._checker(poses, i).cast(o, d, range_mm, near, own)
+            else self.guided(poses, i).cast_all(o, d, range_mm, near, own)
             for i, (o, d, near) in enumerate(zip(origins, aims, shapes, strict=True))
         ]
         parts = {name: np.stack([getattr(hit, name) for hit in hits]) for name in vars(hits[0])}
@@ -574,9 +592,15 @@ class ExactScene:
             }
         )
 
-    def _checker(self, poses: Placement | None, environment: int) -> CollisionChecker:
-        """The checker with the bodies of one environment."""
-        return self.checker if poses is None else self.checker.moved(poses, environment)
+    def alone(self, lines: Mapping[str, np.ndarray]) -> LoneExact:
+        """Queries of one environment among bodies at rest."""
+        return LoneExact(self, lines)
+
+    def guided(self, poses: Placement | None = None, environment: int = 0) -> GuidedChecker:
+        """FCL with the bodies of one environment."""
+        if poses is None:
+            return self._guided
+        return GuidedChecker(self.checker.moved(poses, environment), self._trees)
 
     def _shapes(self, arms: Mapping[str, torch.Tensor]) -> list[dict[str, ArmShape] | None]:
         """Each environment's arms; None where one of them is not finite."""
@@ -588,6 +612,217 @@ class ExactScene:
             else None
             for i in range(count)
         ]
+
+
+GUIDE_SLACK_MM = 1e-6
+"""Rounding that the compiled search for the nearest segments may have (mm); of the segments within
+it of the nearest all are given to FCL."""
+BEAM_SLACK_MM = 0.01
+"""FCL and the closed forms are asked about everything that comes within this of a beam (mm): ten
+times the width of the triangle that represents the beam."""
+_REQUEST = fcl.DistanceRequest()
+_WITHOUT_POINTS = fcl.DistanceResult(min_distance_=-np.inf)
+"""A result that FCL leaves alone; it saves the conversion of the nearest points."""
+
+
+class GuidedChecker:
+    """FCL's clearances and beams of one pose of the arms, cheaper than by `CollisionChecker`.
+
+    FCL decides: each distance is FCL's, and each face that a beam meets is one that FCL found. A
+    compiled search first finds the segments that come nearest, so that FCL is asked about these and
+    not about whole arms; it is not asked about what lies beyond the horizon, nor about bodies that
+    a beam does not come near. Where FCL's distance differs from that of the search by more than
+    `GUIDE_SLACK_MM` FCL measures whole arms. The referee of evaluations is not guided.
+    """
+
+    def __init__(
+        self, checker: CollisionChecker, trees: dict[int, tuple[Mesh, TriangleTree]] | None = None
+    ):
+        """trees: those of meshes seen before, by the id of the mesh; new ones are added."""
+        self.checker = checker
+        self.asked_whole = 0
+        """How often FCL had to measure whole arms."""
+        known = {} if trees is None else trees
+        self._trees = []
+        for body in checker.bodies:
+            mesh = body.mesh
+            held = known.get(id(mesh))
+            if held is None or held[0] is not mesh:  # a copy of the dict has ids of other meshes
+                held = known[id(mesh)] = mesh, build_tree(mesh)
+            self._trees.append(held[1].arrays)
+        self._frames = [(inward[:3, :3].copy(), inward[:3, 3].copy()) for inward in checker._inward]
+        self._work = (np.empty(STACK, np.int64), np.empty(STACK))
+
+    def clearances(self, arms: Mapping[str, ArmShape]) -> tuple[list[float], ...]:
+        """Clearances (mm) of all arms: from each body, arm by arm; of each pair; of each itself."""
+        chains = [_Chain(name, shape) for name, shape in arms.items()]
+        bodies = [self._to_body(chain, n) for chain in chains for n in range(len(self._trees))]
+        pairs = [self._between(one, other) for one, other in combinations(chains, 2)]
+        return bodies, pairs, [self._to_itself(chain) for chain in chains]
+
+    def _to_body(self, chain: _Chain, index: int) -> float:
+        checker, line = self.checker, chain.shape.centreline_mm
+        bound, found = checker.horizon_mm + chain.shape.radius_mm, np.empty(2, np.int64)
+        guide = (bound, GUIDE_SLACK_MM, self._trees[index], found, *self._work)
+        least = nearest_to_surface(line, *self._frames[index], *guide)
+        body = checker._objects[index]
+        if least >= bound:  # the clearance saturates
+            centre = least
+        else:
+            centre = _least(chain.part(found[0], found[1] + 1), body)
+            if abs(centre - least) > GUIDE_SLACK_MM:
+                self.asked_whole += 1
+                centre = _least(chain.whole, body)
+        uncut = centre > ROUNDING_MM
+        low, high = checker.bodies[index].mesh.bounds_mm
+        if uncut:
+            turn, shift = self._frames[index]
+            first = turn @ line[0] + shift
+            if (first < low).any() or (first > high).any():
+                return checker._saturated(centre - chain.shape.radius_mm)
+        for point in checker._points_within(line, index, uncut):
+            ball = fcl.CollisionObject(fcl.Sphere(0.0), fcl.Transform(point))
+            centre = min(centre, -_distance(ball, body))
+        return checker._saturated(centre - chain.shape.radius_mm)
+
+    def _between(self, one: _Chain, other: _Chain) -> float:
+        radii = one.shape.radius_mm + other.shape.radius_mm
+        bound, found = self.checker.horizon_mm + radii, np.empty(4, np.int64)
+        lines = (one.shape.centreline_mm, other.shape.centreline_mm)
+        least = nearest_of_chains(*lines, bound, GUIDE_SLACK_MM, found)
+        if least < bound:
+            parts = one.part(found[0], found[1] + 1), other.part(found[2], found[3] + 1)
+            asked = _least(*parts)
+            if abs(asked - least) > GUIDE_SLACK_MM:
+                self.asked_whole += 1
+                asked = _least(one.whole, other.whole)
+            least = asked
+        return self.checker._saturated(least - radii)
+
+    def _to_itself(self, chain: _Chain) -> float:
+        radius, line = chain.shape.radius_mm, chain.shape.centreline_mm
+        bound, found = self.checker.horizon_mm + 2.0 * radius, np.empty(2, np.int64)
+        least = nearest_fold(line, self_contact_gap_mm(radius), bound, found)
+        if least >= bound:
+            return self.checker.horizon_mm
+        first, second = map(int, found)
+        asked = _least(chain.part(first, first + 1), chain.part(second, second + 1))
+        if abs(asked - least) <= GUIDE_SLACK_MM:
+            return self.checker._saturated(asked - 2.0 * radius)
+        self.asked_whole += 1
+        return self.checker._self_clearance(chain)
+
+    def cast(
+        self,
+        origin_mm: np.ndarray,
+        direction: np.ndarray,
+        range_mm: float,
+        arms: Mapping[str, ArmShape],
+        own: str | None = None,
+    ) -> tuple:
+        """Fields of the `RayHit` of one ray (3,) mm along (3,); see `CollisionChecker.cast`."""
+        direction = frames.normalise(direction)
+        ray = (origin_mm, direction, float(range_mm))
+        bodies = [
+            index
+            for index, tree in enumerate(self._trees)
+            if beam_near_surface(*ray, *self._frames[index], BEAM_SLACK_MM, tree, *self._work)
+        ]
+        near = {}
+        for name, shape in arms.items():
+            gap = self_contact_gap_mm(shape.radius_mm) if name == own else -1.0
+            if beam_near_chain(*ray, shape.centreline_mm, shape.radius_mm, gap, BEAM_SLACK_MM):
+                near[name] = shape
+        return self.checker._cast_one(*ray, near, own, bodies)
+
+    def cast_all(
+        self,
+        origins_mm: np.ndarray,
+        directions: np.ndarray,
+        range_mm: float,
+        arms: Mapping[str, ArmShape],
+        own: str | None = None,
+    ) -> RayHit:
+        """First hits of rays (..., 3) mm along (..., 3); see `CollisionChecker.cast`."""
+        shape = origins_mm.shape[:-1]
+        columns = [np.empty(shape + tail, kind) for kind, tail in _HIT_COLUMNS]
+        for index in np.ndindex(shape):
+            hit = self.cast(origins_mm[index], directions[index], range_mm, arms, own)
+            for column, value in zip(columns, hit, strict=True):
+                column[index] = value
+        return RayHit(*columns)
+
+
+class LoneExact:
+    """Clearance and beams by FCL of one environment among bodies at rest, in kept arrays.
+
+    `lines` name -> (1, K, 3) float32 mm are the arms' centrelines, which the caller overwrites
+    between two queries. It has the interface of `batched.LoneScene`.
+    """
+
+    def __init__(self, scene: ExactScene, lines: Mapping[str, np.ndarray]):
+        self.guided, self.lines = scene.guided(), dict(lines)
+        self.radii = {name: scene.radius_mm(name) for name in lines}
+        arms, bodies = len(lines), len(scene.bodies)
+        self.bodies_mm = np.empty((1, arms, bodies), np.float32)
+        """(1, A, N) mm: clearance of each arm from each body, see `BatchClearance`."""
+        self.arms_mm = np.empty((1, arms * (arms - 1) // 2), np.float32)
+        """(1, A (A - 1) / 2) mm: of each pair of arms."""
+        self.self_mm = np.empty((1, arms), np.float32)
+        """(1, A) mm: of each arm from itself."""
+
+    def shapes(self) -> dict[str, ArmShape] | None:
+        """The arms as they are; None where one is not finite."""
+        if not all(np.isfinite(line).all() for line in self.lines.values()):
+            return None
+        return {name: ArmShape(line[0], self.radii[name]) for name, line in self.lines.items()}
+
+    def clearance(self) -> None:
+        """Fill `bodies_mm`, `arms_mm` and `self_mm`."""
+        shapes = self.shapes()
+        if shapes is None:
+            for array in (self.bodies_mm, self.arms_mm, self.self_mm):
+                array[:] = np.nan
+            return
+        bodies, self.arms_mm[0], self.self_mm[0] = self.guided.clearances(shapes)
+        self.bodies_mm.reshape(-1)[:] = bodies
+
+    def beam(self, tip_mm: np.ndarray, aim: np.ndarray, range_mm: float, own: str) -> LoneExactBeam:
+        """The beam of the arm `own` from its tip (1, 3) mm along aim (1, 3), kept arrays."""
+        return LoneExactBeam(self, tip_mm, aim, range_mm, own)
+
+
+class LoneExactBeam:
+    """The end of one arm's beam by FCL in kept arrays, see `RayHit`; `cast` computes it."""
+
+    def __init__(self, scene: LoneExact, tip_mm, aim, range_mm: float, own: str):
+        self._scene, self._tip_mm, self._aim = scene, tip_mm, aim
+        self._range_mm, self._own = range_mm, own
+        self.struck = np.zeros(1, np.int8)
+        """(1,) what is met first, a `Struck`."""
+        self.body, self.face = np.empty(1, np.int32), np.empty(1, np.int32)
+        """(1,) body and face that are met, -1 for none."""
+        self.point_mm, self.normal = np.empty((1, 3), np.float32), np.empty((1, 3), np.float32)
+        """(1, 3) mm where the beam ends, and the outward unit normal there."""
+        self.distance_mm, self.incidence_rad = np.empty(1, np.float32), np.empty(1, np.float32)
+        """(1,) mm along the beam, and rad between it and the normal."""
+
+    def cast(self) -> None:
+        """Find what the beam meets now."""
+        origin, aim = self._tip_mm[0].astype(np.float64), self._aim[0].astype(np.float64)
+        shapes = self._scene.shapes()
+        if shapes is None or not (np.isfinite(origin).all() and np.isfinite(aim).all()):
+            fields = tuple(vars(_missed(origin, aim, self._range_mm)).values())
+        else:
+            fields = self._scene.guided.cast(origin, aim, self._range_mm, shapes, self._own)
+        names = ("struck", "body", "face", "distance_mm", "point_mm", "normal", "incidence_rad")
+        for name, value in zip(names, fields, strict=True):
+            getattr(self, name)[0] = value
+
+
+def _least(first: fcl.CollisionObject, second: fcl.CollisionObject) -> float:
+    """`_distance` without its nearest points, which cost more than a short arm's distance."""
+    return max(0.0, fcl.distance(first, second, _REQUEST, _WITHOUT_POINTS))
 
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:

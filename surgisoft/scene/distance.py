@@ -301,6 +301,26 @@ def longest_steps(lines, longest):
 
 
 @compiled
+def parts_of_steps(line, longest, most, parts):
+    """Parts (K - 1,) into which the steps of a line (K, 3) are divided, and their sum.
+
+    No part is longer than `longest` mm, and no step has more than `most` parts.
+    """
+    total = 0
+    for k in range(len(parts)):
+        x, y, z = (
+            line[k + 1, 0] - line[k, 0],
+            line[k + 1, 1] - line[k, 1],
+            line[k + 1, 2] - line[k, 2],
+        )
+        length = math.sqrt(np.float64(x) * x + np.float64(y) * y + np.float64(z) * z)
+        wanted = math.ceil(length / longest) if math.isfinite(length) else 1.0
+        parts[k] = int(min(max(wanted, 1.0), np.float64(most)))
+        total += parts[k]
+    return total
+
+
+@compiled
 def divide_steps(lines, parts, out):
     """Lines (B, K, 3) with the step from point k divided into parts[k], into out (B, K', 3)."""
     for n in range(len(lines)):
@@ -424,3 +444,149 @@ def _nearer(lines, n, i, j, best):
         _point(lines, n, i), _point(lines, n, i + 1), _point(lines, n, j), _point(lines, n, j + 1)
     )
     return math.sqrt(d2) if d2 < best * best else best
+
+
+@compiled
+def nearest_to_surface(line, turn, shift, bound, slack, tree, found, nodes, reach):
+    """Which segments of a line (K, 3) mm come nearest to a body, and at what distance (mm).
+
+    Fills found (2,) with the first and the last segment whose distance is within `slack` of the
+    least; returns the least, or `bound` where no segment is nearer than that. turn (3, 3) and
+    shift (3,): world to body.
+    """
+    segments, best = len(line) - 1, bound
+    distance = np.empty(segments)
+    p = _moved(turn, shift, line[segments])
+    for k in range(segments - 1, -1, -1):
+        q = _moved(turn, shift, line[k])
+        limit = best + slack
+        d2 = segment_surface_d2(
+            p, q, limit * limit, tree[0], tree[1], tree[2], tree[3], nodes, reach
+        )
+        distance[k] = math.sqrt(d2)
+        best, p = min(best, distance[k]), q
+    found[0], found[1] = segments, -1
+    for k in range(segments):
+        if distance[k] <= best + slack:
+            found[0], found[1] = min(found[0], k), k
+    return best
+
+
+@compiled
+def nearest_of_chains(one, other, bound, slack, found):
+    """Which segments of two lines (K, 3), (M, 3) mm come nearest to one another, and how near (mm).
+
+    Fills found (4,) with the first and the last such segment of each line; otherwise as
+    `nearest_to_surface`.
+    """
+    rows, columns, best = len(one) - 1, len(other) - 1, bound
+    distance = np.empty((rows, columns))
+    for i in range(rows):
+        p, q = _point_of(one, i), _point_of(one, i + 1)
+        for j in range(columns):
+            d2 = segments_d2(p, q, _point_of(other, j), _point_of(other, j + 1))
+            distance[i, j] = math.sqrt(d2)
+            best = min(best, distance[i, j])
+    found[0], found[1], found[2], found[3] = rows, -1, columns, -1
+    for i in range(rows):
+        for j in range(columns):
+            if distance[i, j] <= best + slack:
+                found[0], found[1] = min(found[0], i), i
+                found[2], found[3] = min(found[2], j), max(found[3], j)
+    return best
+
+
+@compiled
+def nearest_fold(line, gap, bound, found):
+    """Which parts of a line (K, 3) mm at least `gap` mm of arc apart come nearest (mm).
+
+    Fills found (2,) with a segment that is nearest to a later one, and with that one; returns their
+    distance, or `bound` where no two are nearer than that.
+    """
+    segments, best = len(line) - 1, bound
+    arc = np.zeros(segments + 1)
+    for k in range(segments):
+        arc[k + 1] = arc[k] + _gap(_point_of(line, k), _point_of(line, k + 1))
+    for i in range(segments):
+        p, q = _point_of(line, i), _point_of(line, i + 1)
+        for j in range(i + 1, segments):
+            if arc[j] - arc[i + 1] >= gap:
+                d2 = segments_d2(p, q, _point_of(line, j), _point_of(line, j + 1))
+                if d2 < best * best:
+                    best = math.sqrt(d2)
+                    found[0], found[1] = i, j
+    return best
+
+
+@compiled
+def _point_of(line, k):
+    """Point k of a line as a float64 tuple."""
+    return np.float64(line[k, 0]), np.float64(line[k, 1]), np.float64(line[k, 2])
+
+
+@compiled
+def beam_near_chain(origin, aim, range_mm, line, radius, gap, slack):
+    """Whether a beam may meet an arm (K, 3) mm; segments within `gap` of the tip do not count.
+
+    False only where the beam stays more than `slack` mm away from every capsule that counts.
+    """
+    end = (
+        origin[0] + range_mm * aim[0],
+        origin[1] + range_mm * aim[1],
+        origin[2] + range_mm * aim[2],
+    )
+    start, arc = (origin[0], origin[1], origin[2]), 0.0
+    for k in range(len(line) - 2, -1, -1):
+        p, q = _point_of(line, k), _point_of(line, k + 1)
+        if arc >= gap - slack:
+            reach = radius + slack
+            if segments_d2(start, end, p, q) <= reach * reach:
+                return True
+        arc += _gap(p, q)
+    return False
+
+
+@compiled
+def beam_near_surface(origin, aim, range_mm, turn, shift, slack, tree, nodes, reach):
+    """Whether a beam comes within `slack` mm of a body; turn (3, 3), shift (3,): world to body."""
+    p = _moved(turn, shift, origin)
+    q = _moved(turn, shift, origin + range_mm * aim)
+    limit = slack * slack
+    return segment_surface_d2(p, q, limit, tree[0], tree[1], tree[2], tree[3], nodes, reach) < limit
+
+
+@compiled
+def beams_beside_chains(origins, aims, ranges, lines, radius, gap, slack, sure):
+    """Clear the flags (N,) of beams that may meet an arm (N, K, 3) mm, see `beam_near_chain`."""
+    for n in range(len(sure)):
+        if sure[n] and beam_near_chain(
+            origins[n], aims[n], ranges[n], lines[n], radius, gap, slack
+        ):
+            sure[n] = False
+
+
+@compiled
+def beams_beside_body(origins, aims, ranges, turn, shift, slack, tree, sure):
+    """Clear the flags (N,) of beams that come within `slack` mm of a body; see above."""
+    nodes, reach = np.empty(STACK, np.int64), np.empty(STACK)
+    for n in range(len(sure)):
+        if sure[n] and beam_near_surface(
+            origins[n], aims[n], ranges[n], turn, shift, slack, tree, nodes, reach
+        ):
+            sure[n] = False
+
+
+@compiled
+def beams_inside_faces(ends, faces, bodies, which, turn, shift, triangles, margin, sure):
+    """Clear the flags (N,) of beams that end within `margin` mm of an edge of the face they meet.
+
+    ends (N, 3) mm, world frame; faces and bodies (N,); of body number `which`, whose triangles are
+    (F, 3, 3) mm in its own frame.
+    """
+    limit = margin * margin
+    for n in range(len(sure)):
+        if not sure[n] or bodies[n] != which:
+            continue
+        p, (a, b, c) = _moved(turn, shift, ends[n]), triangle(triangles, faces[n])
+        near = min(segments_d2(p, p, a, b), segments_d2(p, p, b, c), segments_d2(p, p, c, a))
+        sure[n] = near >= limit

@@ -9,6 +9,7 @@ Needs nibabel, pynrrd and scikit-image, the extra `segmentation`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,6 +35,9 @@ SMALLEST_ML = 0.05
 """Separate pieces of a label below this volume are noise of the segmentation (ml)."""
 MOST_VOXELS = 2**30
 """Largest number of voxels that is read: 1024 x 1024 x 1024."""
+DENSEST = 1032
+"""Most bytes that one byte of a packed file unpacks to (zlib documentation, 'Maximum compression
+factor')."""
 MM_PER_UNIT = {"mm": 1.0, "meter": 1000.0, "m": 1000.0, "cm": 10.0, "micron": 1e-3, "um": 1e-3}
 LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -242,6 +246,15 @@ def _check_size(shape, path: Path) -> None:
         )
 
 
+def _check_claim(size: int, path: Path) -> None:
+    """Raise InputError where a header claims more bytes than the file can hold, packed or not."""
+    if size > DENSEST * path.stat().st_size:
+        raise InputError(
+            f"{path}: its header claims {size} bytes, the file has {path.stat().st_size}; the file "
+            "is damaged or cut off"
+        )
+
+
 def _read_nifti(path: Path) -> Image:
     import nibabel
 
@@ -252,6 +265,7 @@ def _read_nifti(path: Path) -> Image:
     if len(shape) != 3:
         raise InputError(f"{path}: an image of shape {tuple(file.shape)}; expected a volume")
     _check_size(shape, path)
+    _check_claim(math.prod(shape) * file.get_data_dtype().itemsize, path)
     labels = _labels(np.asanyarray(file.dataobj).reshape(shape), path)
     unit = file.header.get_xyzt_units()[0]
     to_ras = np.array(file.affine, dtype=float)
@@ -268,6 +282,8 @@ def _read_nrrd(path: Path) -> Image:
     _check_size(shape[-3:], path)
     if len(shape) > 4:
         raise InputError(f"{path}: an image of shape {shape}; expected a volume")
+    if "data file" not in header and "datafile" not in header:
+        _check_claim(math.prod(shape), path)
     data, header = nrrd.read(str(path))
     directions = header.get("space directions")
     if directions is None:

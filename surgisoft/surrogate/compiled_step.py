@@ -7,6 +7,8 @@ Both agree to rounding.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -82,12 +84,110 @@ class CompiledStep:
         held = {} if self.name is None else {self.name: after}
         return ArmState(pressure, anchor, direction, held), points
 
+    def alone(self, state: ArmState, pressure: np.ndarray) -> LoneArmModel:
+        """Steps of the one arm (B = 1) of a state; see `LoneArmModel`."""
+        return LoneArmModel(self, state, pressure)
+
     def _read(self) -> list[np.ndarray]:
         """Constants of the compiled loops."""
         model, network = self.model, self._network
         chain = (model.still, model.idle, model.band)
         constants = [_array(t) for t in (*chain, network.centre, network.half_range, network.use)]
         return constants + ([] if self._hysteresis is None else _plays(self._hysteresis))
+
+
+class LoneArmModel:
+    """Steps of one arm in arrays that are allocated once; the model may not change meanwhile.
+
+    A step overwrites the state before the last one. `state` copies the present one.
+    """
+
+    def __init__(self, compiled_step: CompiledStep, state: ArmState, pressure: np.ndarray):
+        """pressure (1, m) kPa: where the caller puts the model's actuation before each step."""
+        network, name = compiled_step._network, compiled_step.name
+        self._name, self._pressure = name, pressure
+        pressure[:] = _array(state.pressure)
+        memory = state.memory[name] if name is not None else state.pressure.new_empty(1, 0)
+        now = [_array(t).copy() for t in (state.anchor, state.direction, memory)]
+        self._states = now, [np.empty_like(array) for array in now]
+        linear = [layer for layer in network.layers if isinstance(layer, nn.Linear)]
+        widths = [linear[0].in_features, *(layer.out_features for layer in linear)]
+        x = np.empty((1, widths[0]), np.float32)
+        self.points_mm = np.empty((1, network.key_points, 3), np.float32)
+        """(1, n, 3) mm, base frame: key points after the last step."""
+        constants = compiled_step._read()
+        self._advance = _advance if name is None else _advance_with_plays
+        self._calls = []
+        for before, after in (self._states, self._states[::-1]):
+            given = (pressure, *before[:2], *after[:2], x, *constants)
+            self._calls.append(given if name is None else (*given, before[2], after[2]))
+        self._network = (
+            x,
+            np.array(widths),
+            np.concatenate([_array(layer.weight.t()).ravel() for layer in linear]),
+            np.concatenate([_array(layer.bias) for layer in linear]),
+            _array(network.mean),
+            _array(network.scale),
+            np.empty((2, max(widths)), np.float32),
+            self.points_mm.reshape(-1),
+        )
+        self._turn = 0
+
+    @property
+    def anchor(self) -> np.ndarray:
+        """(1, m) kPa: see `ArmState`; overwritten by the step after the next."""
+        return self._states[self._turn][0]
+
+    @property
+    def direction(self) -> np.ndarray:
+        """(1, m): see `ArmState`; overwritten by the step after the next."""
+        return self._states[self._turn][1]
+
+    @property
+    def state(self) -> ArmState:
+        """A copy of the present state."""
+        pressure, anchor, direction, memory = (
+            torch.from_numpy(array.copy()) for array in (self._pressure, *self._states[self._turn])
+        )
+        return ArmState(
+            pressure, anchor, direction, {} if self._name is None else {self._name: memory}
+        )
+
+    def step(self) -> None:
+        """Advance to the actuation that stands in `pressure`, and compute the key points."""
+        self._advance(*self._calls[self._turn])
+        self._turn = 1 - self._turn
+        _layers(*self._network)
+
+
+@compiled
+def _layers(x, widths, weights, biases, mean, scale, work, out):
+    """Outputs (o,) of a network of linear layers with SiLU in between, for inputs x (1, i).
+
+    weights: each layer's (inputs, outputs) one after the other, biases likewise. An inner loop
+    over the outputs needs no other order of its sums to be vectorised.
+    """
+    last, w, b = len(widths) - 2, 0, 0
+    for i in range(widths[0]):
+        work[0, i] = x[0, i]
+    for layer in range(last + 1):
+        rows, columns = widths[layer], widths[layer + 1]
+        here, there = work[layer % 2], work[1 - layer % 2]
+        for j in range(columns):
+            there[j] = biases[b + j]
+        for i in range(rows):
+            value = here[i]
+            line = weights[w + i * columns : w + (i + 1) * columns]
+            for j in range(columns):
+                there[j] += value * line[j]
+        w += rows * columns
+        b += columns
+        if layer < last:
+            for j in range(columns):
+                there[j] = there[j] / (np.float32(1.0) + math.exp(-there[j]))
+        else:
+            for j in range(columns):
+                out[j] = mean[j] + there[j] * scale[j]
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -56,10 +56,12 @@ class ErrorInterval:
         Between two stored coverages the logarithm of the quantile is interpolated over that of the
         share outside; beyond them the nearest is taken.
         """
-        quantile = torch.tensor(self._quantile(coverage), device=distance.device)
+        quantile = distance.new_tensor(self._quantile(coverage))
         return (1 + self.growth * distance).unsqueeze(-1) * quantile
 
     def _quantile(self, coverage: float) -> list[float]:
+        if coverage in self.levels:  # exactly, so that the rows that calibrated it are covered
+            return list(self.quantiles_mm[self.levels.index(coverage)])
         place = [-math.log(1 - level) for level in self.levels]
         x = min(max(-math.log(max(1 - coverage, 1e-12)), place[0]), place[-1])
         above = next(i for i, at in enumerate(place) if at >= x)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
 from surgisoft.tasks.supervision import BEAMLESS, ExperimentTask
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
-from surgisoft.tasks.world.scene import SceneState
+from surgisoft.tasks.world.scene import BatchClearance, SceneState
 from surgisoft.tasks.world.world import World, WorldState
 
 Goal = TypeVar("Goal", bound=TensorDataclass)
@@ -89,14 +90,22 @@ class Signal:
     """Lowest value."""
     high: float
     """Highest value."""
+    true: Callable[[Any, TaskState | None, TaskState], Tensor] = field(repr=False, compare=False)
+    """(task, before, after) -> (B,): the value after a simulated step; before: None at the start of
+    an episode."""
     default: float | None = None
     """Value where none is given; None: it has to be given; nan: the controller's own estimate."""
+
+
+FEED_SIGNAL = "out_mm"
+"""Name of the signal that gives by how much the arms' bases are behind their mounts, mm."""
 
 
 class MeasuredTask(Task, Protocol):
     """A task in a scene whose controller can be exported: what it needs of the scene is measured.
 
-    Tasks in empty space need nothing else than their arms, and none of this.
+    Tasks in empty space need nothing else than their arms, and none of this. A task whose world has
+    a feed has the signal `FEED_SIGNAL`.
     """
 
     signals: tuple[Signal, ...]
@@ -105,11 +114,15 @@ class MeasuredTask(Task, Protocol):
     def measured_scene(self, signals: Mapping[str, Tensor], lesion: Tensor) -> SceneState:
         """The scene as far as observations need it, from signals name -> (B,)."""
 
-    def true_signals(self, before: TaskState | None, after: TaskState) -> dict[str, Tensor]:
-        """Name -> (B,): the signals at a simulated state, and before it None at the start."""
-
     def advance_measured(self, state: TaskState, signals: Mapping[str, Tensor]) -> TaskState:
         """Advance one step after which the world is as measured, signals name -> (B,)."""
+
+
+def clearance(state: TaskState) -> BatchClearance:
+    """Clearances of all arms; of a task with bodies."""
+    found = state.world.scene.clearance
+    assert found is not None, "the task has bodies"
+    return found
 
 
 class DocumentedTask(Task, Protocol):
@@ -120,6 +133,41 @@ class DocumentedTask(Task, Protocol):
 
     def blocks(self, state: TaskState) -> dict[str, ObservationBlocks]:
         """agent -> the named blocks of its observation, in order."""
+
+
+class LoneEpisode(Protocol):
+    """One episode of a task, advanced in arrays that are allocated once.
+
+    A task may have a method `alone(state)` that gives one for the only environment of a state, or
+    None where it can be advanced by the task alone. The numbers are the task's own, to rounding.
+    """
+
+    def step(self, actions: Mapping[str, np.ndarray]) -> None:
+        """Advance one step; actions: agent -> (m,) changes of the commanded pressure, kPa."""
+
+    @property
+    def observations(self) -> dict[str, np.ndarray]:
+        """Agent -> (D,) float32, see `Episodes.observe`; arrays that the caller may change."""
+
+    @property
+    def terms(self) -> dict[str, dict[str, float]]:
+        """Agent -> weighted reward term, see `Outcome`."""
+
+    @property
+    def terminated(self) -> bool:
+        """See `Outcome`."""
+
+    @property
+    def truncated(self) -> bool:
+        """See `Outcome`."""
+
+    @property
+    def measures(self) -> dict[str, float]:
+        """Quantities for people; nan where one does not apply."""
+
+    @property
+    def state(self) -> TaskState:
+        """A copy of the present state."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +189,13 @@ class TaskSpec:
     success_rule: Callable[[Any], str] | None = None
     """(config) -> what an episode needs to be a success, in words; None: the task has no success.
     """
+
+
+def term_names(weights: Any) -> list[str]:
+    """Names of an agent's reward terms in the order in which they are added: that of the fields of
+    its dataclass of weights, `contact` last, so that terms of a class that extends another one
+    stand before it."""
+    return sorted((f.name for f in fields(weights)), key=lambda name: name == "contact")
 
 
 def weighted(terms: Mapping[str, Tensor], weights: Any) -> dict[str, Tensor]:

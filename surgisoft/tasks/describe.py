@@ -19,7 +19,7 @@ from typing import Any
 
 from surgisoft.config import to_table, write_atomically
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import DocumentedTask, Episodes, Signal
+from surgisoft.tasks.base import DocumentedTask, Episodes, Signal, term_names
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.registry import TASKS, make_task, spec_of
 
@@ -133,7 +133,7 @@ class TaskDescription:
 def describe(name: str, config: Any = None) -> TaskDescription:
     """The facts of the named task; it is built, and started once, to know its sizes."""
     spec = spec_of(name)
-    task: DocumentedTask = make_task(name, config)
+    task = make_task(name, config)
     return TaskDescription(
         name=name,
         summary=_summary(spec.build),
@@ -155,15 +155,25 @@ def describe_agents(task: DocumentedTask) -> dict[str, AgentDescription]:
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """The docstring under each field of a dataclass, on one line."""
+    """The docstring under each field of a dataclass, and of those it extends, on one line."""
+    docs: dict[str, str] = {}
+    for one in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(one):
+            docs.update(_own_field_docs(one))
+    return {f.name: docs.get(f.name, "") for f in dataclasses.fields(kind)}
+
+
+def _own_field_docs(kind: type) -> Iterator[tuple[str, str]]:
+    """Name and docstring of each field that stands in the body of a dataclass."""
     (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    docs, field = {}, None
+    assert isinstance(body, ast.ClassDef)
+    field = None
     for node in body.body:
-        if isinstance(node, ast.AnnAssign):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             field = node.target.id
         elif isinstance(node, ast.Expr) and field and isinstance(node.value, ast.Constant):
-            docs[field], field = " ".join(str(node.value.value).split()), None
-    return {f.name: docs.get(f.name, "") for f in dataclasses.fields(kind)}
+            yield field, " ".join(str(node.value.value).split())
+            field = None
 
 
 def pages() -> dict[str, str]:
@@ -245,8 +255,7 @@ def _agent(task: DocumentedTask, agent: str, blocks) -> AgentDescription:
         chambers=arm.chambers,
         step_kPa=arm.pneumatics.step_kPa,
         rewards=tuple(
-            RewardTerm(f.name, getattr(weights, f.name), meanings[f.name])
-            for f in dataclasses.fields(weights)
+            RewardTerm(term, getattr(weights, term), meanings[term]) for term in term_names(weights)
         ),
         symbols=" ".join((inspect.getdoc(weights) or "").split("\n\n")[0].split()),
     )

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, clearance, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
 from surgisoft.tasks.trajectories.waypoints import (
@@ -95,13 +95,21 @@ class Keyhole:
 
     name, agents = "keyhole", ("arm",)
     signals = (
-        Signal("clearance_mm", "least distance of the arm from the plate", "mm", -20.0, 100.0),
+        Signal(
+            "clearance_mm",
+            "least distance of the arm from the plate",
+            "mm",
+            -20.0,
+            100.0,
+            lambda task, before, after: clearance(after).least_mm,
+        ),
         Signal(
             "at_target",
             "1 if the tip is within reach_mm of its target, else 0",
             "-",
             0.0,
             1.0,
+            lambda task, before, after: task.visited(before, after).float(),
             float("nan"),
         ),
     )
@@ -155,13 +163,11 @@ class Keyhole:
         """The arm's clearance; see `MeasuredTask.measured_scene`."""
         return measured_clearance(signals["clearance_mm"])
 
-    def true_signals(
+    def visited(
         self, before: TaskState[WaypointSequence] | None, after: TaskState[WaypointSequence]
-    ) -> dict[str, Tensor]:
-        """The signals of a simulated step; see `MeasuredTask.true_signals`."""
-        least = after.world.scene.clearance.least_mm
-        reached = after.goal.reached - (0 if before is None else before.goal.reached)
-        return {"clearance_mm": least, "at_target": reached.float()}
+    ) -> Tensor:
+        """(B,) int64: targets reached in the step from `before`, or since the episode began."""
+        return after.goal.reached - (0 if before is None else before.goal.reached)
 
     def advance_measured(
         self, state: TaskState[WaypointSequence], signals: Mapping[str, Tensor]
@@ -180,7 +186,7 @@ class Keyhole:
                 **body_blocks(self.arm, part),
                 TARGET: (route[:, -1] - tip).asinh(),
                 ONWARD: (onward - tip).asinh(),
-                CLEARANCE: state.world.scene.clearance.least_mm[:, None] / 10.0,
+                CLEARANCE: clearance(state).least_mm[:, None] / 10.0,
                 VISITS: state.goal.reached[:, None] / self.config.visits,
                 TIME: state.world.steps[:, None] / self.steps,
             }
@@ -192,7 +198,7 @@ class Keyhole:
 
     def rewards(self, state: TaskState[WaypointSequence]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `KeyholeWeights`."""
-        clear, tip = state.world.scene.clearance.least_mm, state.world.arms["arm"].tip_mm
+        clear, tip = clearance(state).least_mm, state.world.arms["arm"].tip_mm
         left = progress(self.route_mm(state), tip).remaining_mm
         terms = {
             "way": (-left / self.config.far_mm).exp(),
@@ -204,17 +210,17 @@ class Keyhole:
 
     def ended(self, state: TaskState[WaypointSequence]) -> Tensor:
         """When the arm touches the plate or itself."""
-        return state.world.scene.clearance.collides
+        return clearance(state).collides
 
     def measures(self, state: TaskState[WaypointSequence]) -> dict[str, Tensor]:
         """Remaining route, share of visits, clearance, collision and success."""
-        clearance, goal = state.world.scene.clearance, state.goal
-        done, hit = goal.reached >= self.config.visits, clearance.collides
+        found, goal = clearance(state), state.goal
+        done, hit = goal.reached >= self.config.visits, found.collides
         route = progress(self.route_mm(state), state.world.arms["arm"].tip_mm)
         return {
             "left_mm": route.remaining_mm,
             "visited": goal.reached / self.config.visits,
-            "clearance_mm": clearance.least_mm,
+            "clearance_mm": found.least_mm,
             "collided": hit.float(),
             "success": (done & ~hit).float(),
         }

@@ -6,7 +6,6 @@ and at work. The arm models know no contact forces, so touching the wall ends an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,17 +14,27 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks import laser_work
-from surgisoft.tasks.base import TaskSpec, TaskState
-from surgisoft.tasks.circle_ablation import RING_DIRECTION, RING_PLACE
-from surgisoft.tasks.inverse_kinematics import Pointing
+from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskSpec, TaskState, clearance
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
-from surgisoft.tasks.observations import Block, ObservationBlocks, joined
-from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut, point_on_closed
+from surgisoft.tasks.laser_work import (
+    AGENTS,
+    ENDOSCOPE,
+    LASER,
+    LASER_PRESET,
+    LASER_STEPS,
+    EndoscopeWeights,
+    LaserConfig,
+    LaserWeights,
+    LaserWorkWeights,
+    RingTask,
+    check_config,
+)
+from surgisoft.tasks.observations import Block, ObservationBlocks
+from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
-from surgisoft.tasks.world.world import Feed, WorldConfig, scene_world
+from surgisoft.tasks.world.world import Feed, WorldConfig
 
 PORTS = PHANTOM / "ports.toml"
 """The liver phantom below a wall with two ports."""
@@ -39,48 +48,55 @@ RIM = Block(
 CENTRED = Block("centred", "measured tip's offset from the port's axis", "mm", "asinh(x / 1 mm)")
 
 
+BEHIND = Signal(
+    FEED_SIGNAL, OUT.meaning, "mm", 0.0, 200.0, lambda task, before, after: task.out_mm(after)
+)
+
+
+def _rim(agent: str) -> Signal:
+    return Signal(
+        f"{agent}_rim_mm",
+        f"least distance of the body of the arm `{agent}` from the wall",
+        "mm",
+        -40.0,
+        100.0,
+        lambda task, before, after: task.wall_mm(after, agent),
+    )
+
+
+RIMS = {agent: _rim(agent) for agent in AGENTS}
+"""Arm -> what its controller has to be given of the wall."""
+
+
 @dataclass(frozen=True)
-class PortLaserWeights:
+class CentredWeights:
+    """Weight of the place in the port; c is the distance of the own tip from the axis of its port,
+    mm, while the arms enter."""
+
+    centred: float = 5.0
+    """exp(-c / centred_mm) while the arms enter, 1 afterwards."""
+
+
+@dataclass(frozen=True)
+class PortLaserWeights(LaserWeights, CentredWeights):
     """Weights of the laser's reward terms; e is the distance of the beam from its target, mm; c is
     the distance of the own tip from the axis of its port, mm, while the arms enter."""
 
-    centred: float = 5.0
-    """exp(-c / centred_mm) while the arms enter, 1 afterwards."""
-    far: float = 1.0
-    """1 / (1 + e / far_mm)."""
-    aim: float = 1.0
-    """exp(-e / 1 mm)."""
-    fine: float = 1.0
-    """exp(-e / fine_mm)."""
-    cut: float = 1.0
-    """1 while the beam is on, else 0."""
     rim: float = -3.0
     """1 while the own body is nearer than rim_mm to the wall, else 0."""
-    contact: float = -1.0
-    """1 while the clearance of any arm is below the scene's limit, else 0."""
 
 
 @dataclass(frozen=True)
-class PortEndoscopeWeights:
+class PortEndoscopeWeights(EndoscopeWeights, CentredWeights):
     """Weights of the endoscope's reward terms; e is the distance of the camera's axis from the
     ring's centre, mm; c is the distance of the own tip from the axis of its port, mm."""
 
-    centred: float = 5.0
-    """exp(-c / centred_mm) while the arms enter, 1 afterwards."""
-    look: float = 1.0
-    """1 / (1 + e / far_mm)."""
-    view: float = 1.0
-    """Share of what is to be seen that the endoscope sees."""
-    cut: float = 1.0
-    """1 while the beam is on, else 0."""
     rim: float = -3.0
     """1 while the own body is nearer than rim_mm to the wall, else 0."""
-    contact: float = -1.0
-    """1 while the clearance of any arm is below the scene's limit, else 0."""
 
 
 @dataclass(frozen=True)
-class KeyholeAblationWeights:
+class KeyholeAblationWeights(LaserWorkWeights):
     """Weights of the reward terms of both agents."""
 
     laser: PortLaserWeights = field(default_factory=PortLaserWeights)
@@ -90,7 +106,7 @@ class KeyholeAblationWeights:
 
 
 @dataclass(frozen=True)
-class KeyholeAblationConfig:
+class KeyholeAblationConfig(LaserConfig):
     """The scene, the feed, the speed of the cut, the observation and the reward.
 
     Time and safety limits come from the scene's file.
@@ -100,8 +116,6 @@ class KeyholeAblationConfig:
     """Scene with a wall whose ports the arms `laser` and `endoscope` enter: its folder or file."""
     wall: str = "wall"
     """Name of the wall among the scene's bodies."""
-    arm: str | Path | None = None
-    """Arm model of both arms: `default`, or a folder; None: the models that the scene names."""
     feed: Feed = field(default_factory=Feed)
     """How the carriages feed the arms in."""
     rim_mm: float = 1.0
@@ -110,30 +124,20 @@ class KeyholeAblationConfig:
     """Longest time that the bodies may be at the rim in an episode that is a success, s."""
     cut_s: float = 45.0
     """Time for once around with the beam on, s."""
-    fire_mm: float = 0.5
-    """Measured distance of the beam from its target within which the beam is switched on, mm."""
     approach_s: float = 18.0
     """Time at the beginning that the measure `pointing_error_mm` leaves out, s: feed and approach.
     """
     centred_mm: float = 2.0
     """Scale of the reward term `centred`, mm."""
-    fine_mm: float = 0.1
-    """Scale of the reward term `fine`, mm."""
-    far_mm: float = 10.0
-    """Scale of the reward terms `far` and `look`, mm."""
     weights: KeyholeAblationWeights = field(default_factory=KeyholeAblationWeights)
     """Weights of the reward terms."""
-    preview: int = 2
-    """Future targets in the laser's observation, one per step (a count)."""
     world: WorldConfig = field(
         default_factory=lambda: WorldConfig(randomisation=Randomisation(start_kPa=1.0))
     )
     """The simulator and its domain randomization."""
 
     def __post_init__(self):
-        positive = ("rim_mm", "rim_s", "cut_s", "fire_mm", "approach_s", "centred_mm")
-        positive = (*positive, "fine_mm", "far_mm", "preview")
-        laser_work.check_config("keyhole_ablation", self, positive)
+        check_config("keyhole_ablation", self, "rim_mm", "rim_s", "cut_s", "centred_mm")
 
 
 def success_rule(config: KeyholeAblationConfig) -> str:
@@ -146,73 +150,49 @@ def success_rule(config: KeyholeAblationConfig) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class PortCut:
+class PortCut(RingCut):
     """Progress of B cuts, and how long the bodies were at the rims of the ports."""
 
-    cut: RingCut
-    """The cut around the ring."""
     at_rim: Tensor
     """(B,) int64: steps in which a body was at the rim."""
 
-    @property
-    def fired(self) -> Tensor:
-        """(B,) bool: the beam was on in the last step."""
-        return self.cut.fired
 
-
-class KeyholeAblation:
+class KeyholeAblation(RingTask[PortCut]):
     """Two arms of a scene with a wall: agents `laser` and `endoscope`."""
 
-    name, agents = "keyhole_ablation", laser_work.AGENTS
+    name = "keyhole_ablation"
+    signals = (*RingTask.signals, BEHIND, *RIMS.values())
 
     def __init__(
         self, config: KeyholeAblationConfig | None = None, device: str | torch.device = "cpu"
     ):
-        c = self.config = config or KeyholeAblationConfig()
-        self.world = scene_world(
-            c.scene, c.world, device, arm=c.arm, agents=self.agents, feed=c.feed
-        )
-        self.scene, self.dt_s = self.world.scene, self.world.config.dt_s
-        self.spec = self.scene.spec
+        c = config or KeyholeAblationConfig()
+        super().__init__(c, device, feed=c.feed)
         names = [body.name for body in self.spec.bodies]
         if c.wall not in names:
             raise InputError(
                 f"scene '{self.spec.name}' has the bodies {', '.join(names)}, expected the wall "
                 f"'{c.wall}' among them"
             )
-        self.steps = round(self.spec.limits.time_s / self.dt_s)
-        self.round = round(c.cut_s / self.dt_s)
-        self.weights = {agent: getattr(c.weights, agent) for agent in self.agents}
         self._wall = names.index(c.wall)
-
-    @property
-    def pointing(self) -> dict[str, Pointing]:
-        """Inverse kinematics of each arm's axis, by the arm's name."""
-        return laser_work.pointing(self)
 
     def goal(self, stream: Stream) -> tuple[Stream, PortCut]:
         """Draw start and direction of the cut for each random number stream."""
         stream, cut = draw_cut(stream)
-        return stream, PortCut(cut, torch.zeros_like(stream.count))
-
-    def target_mm(self, state: TaskState[PortCut], ahead: int = 0) -> Tensor:
-        """(B, 3) mm: the reference point on the ring `ahead` steps further on."""
-        share = state.goal.cut.share(self.round, ahead)
-        return point_on_closed(self.scene.paths_mm, state.world.scene.lesion, share)
-
-    def watched_mm(self, state: TaskState[PortCut]) -> Tensor:
-        """(B, 3) mm: the lesion's centre."""
-        return self.scene.centres_mm[state.world.scene.lesion]
+        return stream, PortCut(**vars(cut), at_rim=torch.zeros_like(stream.count))
 
     def out_mm(self, state: TaskState[PortCut]) -> Tensor:
         """(B,) mm: by how much the bases are behind their mounts."""
         out = state.world.out_mm
         return torch.zeros_like(state.world.steps, dtype=torch.float32) if out is None else out
 
+    def wall_mm(self, state: TaskState[PortCut], agent: str) -> Tensor:
+        """(B,) mm: least distance of an arm's body from the wall, as simulated."""
+        return clearance(state).bodies_mm[:, [*self.world.arms].index(agent), self._wall]
+
     def rims_mm(self, state: TaskState[PortCut]) -> dict[str, Tensor]:
         """Least distance of each arm's body from the wall, by the arm's name, (B,) mm."""
-        bodies = state.world.scene.clearance.bodies_mm
-        return {name: bodies[:, k, self._wall] for k, name in enumerate(self.world.arms)}
+        return {agent: self.reading(signal, state) for agent, signal in RIMS.items()}
 
     def off_axis_mm(self, agent: str, points_mm: Tensor) -> Tensor:
         """(B, 3) mm: offset of the tip of key points (B, n, 3) mm from the axis of its port."""
@@ -221,8 +201,8 @@ class KeyholeAblation:
         return away - (away @ axis)[:, None] * axis
 
     def fires(self, state: TaskState[PortCut]) -> Tensor:
-        """(B,) bool: the arms are in, and the beam is released, see `laser_work.beam_released`."""
-        return (self.out_mm(state) <= 0.0) & laser_work.beam_released(self, state)
+        """(B,) bool: whether the beam would be on: where the arms are in, and it is `released`."""
+        return (self.out_mm(state) <= 0.0) & self.released(state)
 
     def advance(
         self,
@@ -230,25 +210,17 @@ class KeyholeAblation:
         actions: Mapping[str, Tensor],
         fired: Tensor | None = None,
     ) -> TaskState[PortCut]:
-        """Advance arms and tissue; where `fired` (B,) bool is set the beam burns for the step and
-        the reference moves on. None: where `fires` holds.
-        """
-        fired = self.fires(state) if fired is None else fired
-        power_w = {laser_work.LASER: fired * self.spec.laser.power_w}
-        world = self.world.step(state.world, actions, power_w)
-        after = TaskState(world, replace(state.goal, cut=state.goal.cut.after(fired)))
+        """As `OneLaserTask.advance`; counts the steps in which a body is at the rim."""
+        after = super().advance(state, actions, fired)
         near = torch.stack([*self.rims_mm(after).values()]).amin(0) < self.config.rim_mm
         return replace(after, goal=replace(after.goal, at_rim=after.goal.at_rim + near))
 
+    def shared_blocks(self, state: TaskState[PortCut]) -> ObservationBlocks:
+        """By how much the bases are behind their mounts."""
+        return {OUT: self.out_mm(state)[:, None] / 50.0}
+
     def blocks(self, state: TaskState[PortCut]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body, pointing error and place in the port of each arm, the cut."""
-        cut = state.goal.cut
-        angle = 2.0 * math.pi * cut.share(self.round)[:, None]
-        ring = {
-            RING_PLACE: torch.cat((angle.sin(), angle.cos()), 1),
-            RING_DIRECTION: cut.direction[:, None],
-        }
-        found = laser_work.blocks(self, state, ring, {OUT: self.out_mm(state)[:, None] / 50.0})
         rims, arms = self.rims_mm(state), state.world.arms
         return {
             agent: {
@@ -256,15 +228,11 @@ class KeyholeAblation:
                 RIM: rims[agent][:, None].clamp(-40.0, 20.0) / 10.0,
                 CENTRED: self.off_axis_mm(agent, arms[agent].seen_mm).asinh(),
             }
-            for agent, blocks in found.items()
+            for agent, blocks in super().blocks(state).items()
         }
 
-    def observe(self, state: TaskState[PortCut]) -> dict[str, Tensor]:
-        """Concatenated observation blocks, agent -> (B, D)."""
-        return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
-
-    def rewards(self, state: TaskState[PortCut]) -> dict[str, dict[str, Tensor]]:
-        """Weighted reward terms, see `PortLaserWeights` and `PortEndoscopeWeights`."""
+    def own_terms(self, state: TaskState[PortCut]) -> dict[str, dict[str, Tensor]]:
+        """The terms of `PortLaserWeights` and `PortEndoscopeWeights`."""
         entering, rims, c = self.out_mm(state) > 0.0, self.rims_mm(state), self.config
         own = {}
         for agent in self.agents:
@@ -274,63 +242,47 @@ class KeyholeAblation:
                 "centred": centred.where(entering, torch.ones_like(centred)),
                 "rim": (rims[agent] < c.rim_mm).float(),
             }
-        return laser_work.rewards(self, state, of_agent=own)
+        return own
 
     def ended(self, state: TaskState[PortCut]) -> Tensor:
         """When the ring is cut all around, or an arm touches the wall, a body, the other arm or
         itself."""
-        done = self.scene.ablation.report(state.world.scene.dose).completion >= 1.0
-        return done | state.world.scene.clearance.collides
+        return super().ended(state)
 
     def measures(self, state: TaskState[PortCut]) -> dict[str, Tensor]:
         """Beam error, progress of the cut, healthy tissue burnt, place in the ports, view, success.
 
         rim_mm: least distance of both bodies from the wall. at_rim_s: time at the rim so far.
         """
-        ring = self.scene.ablation.report(state.world.scene.dose)
+        ring = self.ring_measures(state)
         at_rim_s = state.goal.at_rim * self.dt_s
-        done = (ring.completion >= 1.0) & (at_rim_s <= self.config.rim_s + 0.5 * self.dt_s)
+        in_time = at_rim_s <= self.config.rim_s + 0.5 * self.dt_s
         return {
-            **laser_work.errors(self, state),
-            "completion": ring.completion,
-            "largest_gap_mm": ring.largest_gap_mm,
-            "healthy_mm2": ring.healthy_mm2,
+            **self.errors(state),
+            **ring,
             "rim_mm": torch.stack([*self.rims_mm(state).values()]).amin(0),
             "at_rim_s": at_rim_s,
-            **laser_work.safety(state, done),
+            **self.safety(state, (ring["completion"] >= 1.0) & in_time),
         }
-
-    def trace(self, state: TaskState[PortCut]) -> tuple[Tensor, Tensor]:
-        """Reference point on the ring and end of the beam, each (B, 1, 3) mm."""
-        end = state.world.scene.hits[laser_work.LASER].point_mm
-        return self.target_mm(state)[:, None], end[:, None]
 
     def script(self, state: TaskState[PortCut]) -> dict[str, Tensor]:
         """Scripted expert: keeps each arm straight on its port's axis while the arms enter; then
         points the laser at its next target, the endoscope at the lesion."""
         entering = self.out_mm(state) > 0.0
-        targets = {
-            laser_work.LASER: self.target_mm(state, 1),
-            laser_work.ENDOSCOPE: self.watched_mm(state),
-        }
+        targets = {LASER: self.target_mm(state, 1), ENDOSCOPE: self.watched_mm(state)}
         for agent, target in targets.items():
             pose = self.world.arms[agent].pose
             ahead = (pose[:3, 3] + AXIS_MM * pose[:3, 2]).expand_as(target)
             targets[agent] = torch.where(entering[:, None], ahead, target)
-        return laser_work.script(self, state, *targets.values())
+        return self.pointed(state, *targets.values())
 
 
 KEYHOLE_ABLATION = TaskSpec(
     KeyholeAblation,
     KeyholeAblationConfig(),
-    laser_work.AGENTS,
-    preset={
-        "rollout": 16,
-        "last_noise": 0.05,
-        "evaluate_every": 50,
-        "evaluation_episodes": 16,
-    },
-    training_steps=1_500_000,
+    AGENTS,
+    preset=LASER_PRESET,
+    training_steps=LASER_STEPS,
     experiment=LASER_EXPERIMENT,
     success_rule=success_rule,
 )

@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from surgisoft.tasks import laser_work
-from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.laser_work import LaserTask
+from surgisoft.tasks.base import TaskState, clearance
+from surgisoft.tasks.laser_work import LaserTask, view
 from surgisoft.tasks.supervision import NEVER, Condition, ExperimentTask, Row
-
-
-def _view(state: TaskState) -> Any:
-    view = state.world.scene.view
-    assert view is not None, "a task with a laser has an endoscope"
-    return view
-
-
-def _clearance(state: TaskState) -> Any:
-    clearance = state.world.scene.clearance
-    assert clearance is not None, "a task with a laser has bodies"
-    return clearance
 
 
 class LaserSupervision:
@@ -35,15 +21,15 @@ class LaserSupervision:
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the endoscope sees as much of the target as the scene requires."""
-        return _view(state).fraction >= self.task.spec.limits.view_fraction
+        return view(state).fraction >= self.task.spec.limits.view_fraction
 
     def clearance_mm(self, state: TaskState) -> Tensor:
         """(B,) mm: least clearance to bodies and between arms."""
-        return _clearance(state).least_mm
+        return clearance(state).least_mm
 
     def collides(self, state: TaskState) -> Tensor:
         """(B,) bool: an arm touches a body, the other arm or itself."""
-        return _clearance(state).collides
+        return clearance(state).collides
 
     def fires(self, state: TaskState) -> Tensor:
         """(B,) bool: the task would switch its beam on, see `LaserTask.fires`."""
@@ -59,20 +45,20 @@ class LaserSupervision:
 
     def action_through(self, agent: str, state: TaskState, target_mm: Tensor) -> Tensor:
         """(B, m) kPa: inverse kinematics of the arm's axis through targets (B, 3) mm."""
-        return laser_work.pointing(self.task)[agent].action(state.world.arms[agent], target_mm)
+        return self.task.pointing[agent].action(state.world.arms[agent], target_mm)
 
 
 def _centred(task: LaserTask, state: TaskState, within: float) -> Tensor:
-    view = _view(state)
-    return (view.axis_error_mm <= within) & (view.fraction >= task.spec.limits.view_fraction)
+    found = view(state)
+    return (found.axis_error_mm <= within) & (found.fraction >= task.spec.limits.view_fraction)
 
 
 def _seen(task: LaserTask, state: TaskState, within: float) -> Tensor:
-    return _view(state).fraction >= max(within, task.spec.limits.view_fraction)
+    return view(state).fraction >= max(within, task.spec.limits.view_fraction)
 
 
 def _aimed(task: LaserTask, state: TaskState, within: float) -> Tensor:
-    return laser_work.measured_error_mm(task, state) <= within
+    return task.measured_error_mm(state) <= within
 
 
 def completed(task: LaserTask, state: TaskState, within: float) -> Tensor:

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from gymnasium.spaces import Dict as DictSpace
 
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.base import Episodes, Outcome, Task, TaskState
+from surgisoft.tasks.base import Episodes, LoneEpisode, Outcome, Task, TaskState
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
 from surgisoft.tasks.world.images import VECTOR, images_of
 from surgisoft.tasks.world.picture import WorldPicture
@@ -108,6 +108,24 @@ class NumpyAdapter:
         """Start new episodes where mask (B,) is set (None: everywhere), from their streams."""
         mask = torch.ones_like(state.world.failed) if mask is None else mask
         return self.episodes.reset(state, mask)
+
+    @torch.inference_mode()
+    def alone(self, state: TaskState) -> LoneEpisode | None:
+        """The only environment of a state, advanced without tensors; None where the task cannot."""
+        found = getattr(self.task, "alone", None)
+        return found(state) if found is not None and self.images is None else None
+
+    def checked(self, actions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Agent -> (m,) float32 kPa: the actions of one environment; an InputError for others."""
+        held = {}
+        for agent in self.task.agents:
+            held[agent] = np.asarray(actions[agent], dtype=np.float32)
+            expected = (self.task.world.arms[agent].chambers,)
+            if held[agent].shape != expected:
+                raise InputError(
+                    f"action of '{agent}' has shape {held[agent].shape}, expected {expected}"
+                )
+        return held
 
     @torch.inference_mode()
     def step(

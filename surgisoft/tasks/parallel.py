@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from gymnasium.spaces import Dict as DictSpace
 from pettingzoo import ParallelEnv
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Task
+from surgisoft.tasks.base import LoneEpisode, Task, TaskState
 from surgisoft.tasks.numpy_adapter import (
     RGB_ARRAY,
     NumpyAdapter,
@@ -40,7 +41,9 @@ class SurgicalEnv(ParallelEnv):
             "is_parallelizable": True,
         }
         self.render_mode, self._pictures = render_mode, Pictures(task, render_mode)
-        self.task, self._adapter, self._state = task, NumpyAdapter(task), None
+        self.task, self._adapter = task, NumpyAdapter(task)
+        self._batch: TaskState | None = None
+        self._lone: LoneEpisode | None = None
         self.possible_agents = list(task.agents)
         self.agents: list[str] = []
         self._observed = {a: self._adapter.observation_space(a) for a in task.agents}
@@ -48,6 +51,21 @@ class SurgicalEnv(ParallelEnv):
         each = [Box(*self._adapter.observation_bounds(a)) for a in task.agents]
         low = np.concatenate([box.low for box in each])
         self.state_space = Box(low, -low)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy's state: arrays that share memory with one another cannot be copied one by one."""
+        return {**self.__dict__, "_batch": self._state, "_lone": self._lone is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on from a copy's state."""
+        self.__dict__.update(state)
+        batch = self._batch
+        self._lone = self._adapter.alone(batch) if state["_lone"] and batch is not None else None
+
+    @property
+    def _state(self) -> TaskState | None:
+        """State of the episode, a batch of one; None before the first reset."""
+        return self._batch if self._lone is None else self._lone.state
 
     def observation_space(self, agent: str) -> Box | DictSpace:
         """The Box of an agent's observation (D,); with images a Dict of it and of their Boxes."""
@@ -62,10 +80,12 @@ class SurgicalEnv(ParallelEnv):
 
         Without a seed the random number stream of the last episode continues.
         """
-        if seed is None and self._state is not None:
-            self._state = self._adapter.restart(self._state)
+        state = self._state
+        if seed is None and state is not None:
+            self._batch = self._adapter.restart(state)
         else:
-            self._state = self._adapter.seeded([entropy_seed() if seed is None else seed])
+            self._batch = self._adapter.seeded([entropy_seed() if seed is None else seed])
+        self._lone = self._adapter.alone(self._batch)
         self.agents = list(self.possible_agents)
         return self._observations(), {agent: {} for agent in self.agents}
 
@@ -74,15 +94,17 @@ class SurgicalEnv(ParallelEnv):
 
         Raises InputError before the first reset, or if a live agent has no action.
         """
-        if self._state is None:
+        if self._batch is None:
             raise InputError("step before reset: call reset() first")
         if not self.agents:
             return {}, {}, {}, {}, {}
         absent = [agent for agent in self.agents if agent not in actions]
         if absent:
             raise InputError(f"no action for {', '.join(absent)}: expected one for each live agent")
+        if self._lone is not None:
+            return self._lone_step(self._lone, actions)
         held = {agent: np.asarray(actions[agent])[None] for agent in self.agents}
-        self._state, outcome = self._adapter.step(self._state, held)
+        self._batch, outcome = self._adapter.step(self._batch, held)
         measures = {
             name: value.item() for name, value in outcome.measures.items() if value.isfinite().all()
         }
@@ -99,9 +121,28 @@ class SurgicalEnv(ParallelEnv):
             self.agents = []
         return observations, rewards, terminated, truncated, infos
 
+    def _lone_step(self, lone: LoneEpisode, actions: dict):
+        """`step` where the task advances its only environment without tensors."""
+        lone.step(self._adapter.checked(actions))
+        measures = {name: value for name, value in lone.measures.items() if math.isfinite(value)}
+        terms, live = lone.terms, self.agents
+        infos = {agent: {**terms[agent], **measures} for agent in live}
+        rewards = {agent: sum(terms[agent].values()) for agent in live}
+        terminated, truncated = lone.terminated, lone.truncated
+        observations = lone.observations
+        if terminated or truncated:
+            self.agents = []
+        ends = dict.fromkeys(live, terminated), dict.fromkeys(live, truncated)
+        return observations, rewards, *ends, infos
+
     def state(self) -> np.ndarray:
         """(sum of D,) the concatenated vectors of all agents, for centralised critics."""
-        seen = self._adapter.vectors(self._state)
+        if self._lone is not None:
+            seen = self._lone.observations
+            return np.concatenate([seen[agent] for agent in self.possible_agents])
+        if self._batch is None:
+            raise InputError("state before reset: call reset() first")
+        seen = self._adapter.vectors(self._batch)
         return np.concatenate([seen[agent][0] for agent in self.possible_agents])
 
     def render(self) -> np.ndarray | None:
@@ -112,7 +153,10 @@ class SurgicalEnv(ParallelEnv):
         """Do nothing: the environment holds no resources."""
 
     def _observations(self) -> dict[str, Any]:
-        seen = self._adapter.observations(self._state)
+        if self._lone is not None:
+            return self._lone.observations
+        assert self._batch is not None, "there is one after a reset"
+        seen = self._adapter.observations(self._batch)
         return {agent: in_one(seen[agent]) for agent in self.agents}
 
 

@@ -8,6 +8,7 @@ a task of one agent follows from its name in `surgisoft.environments.ONE_AGENT`.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
-from surgisoft.tasks.base import Task, TaskSpec
+from surgisoft.tasks.base import DocumentedTask, Task, TaskSpec
 from surgisoft.tasks.breathing_ablation import BREATHING_ABLATION
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
 from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
@@ -50,7 +51,7 @@ def spec_of(task: str) -> TaskSpec:
     return TASKS[task]
 
 
-def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> Task:
+def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
     """Build the named task; without a config with its default one."""
     spec = spec_of(name)
     return spec.build(spec.config if config is None else config, device)
@@ -146,7 +147,9 @@ def with_present_names(config: Any, table: Any) -> Any:
     """
     if not isinstance(table, dict):
         return table
-    former, moved, result = getattr(config, "FORMER_NAMES", {}), {}, {}
+    former: Mapping[str, str] = getattr(config, "FORMER_NAMES", {})
+    moved: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, value in table.items():
         if name in former:
             for part in reversed(former[name].split(".")):

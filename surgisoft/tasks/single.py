@@ -20,7 +20,7 @@ from torch import Tensor
 
 from surgisoft.environments import register
 from surgisoft.errors import InputError, unknown_name
-from surgisoft.tasks.base import Task, TaskState
+from surgisoft.tasks.base import DocumentedTask, Task, TaskState
 from surgisoft.tasks.numpy_adapter import RGB_ARRAY, NumpyAdapter, Pictures, entropy_seed, in_one
 from surgisoft.tasks.observations import ObservationBlocks
 from surgisoft.tasks.registry import make_with
@@ -60,7 +60,7 @@ class OneAgent:
     """
 
     def __init__(self, task: Task, agent: str):
-        self._task, self.agents = task, (agent,)
+        self._task, self.agents = cast(DocumentedTask, task), (agent,)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "_task":
@@ -124,7 +124,7 @@ class SingleEnv(gymnasium.Env):
         self.render_mode = render_mode
         fps = round(1.0 / self._adapter.task.world.config.dt_s)
         self.metadata = {**self.metadata, "render_fps": fps}
-        self._state = None
+        self._state: TaskState | None = None
         self.observation_space = self._adapter.observation_space(self._agent)
         self.action_space = Box(*self._adapter.action_bounds(self._agent))
 
@@ -187,7 +187,8 @@ class BatchedEnv(VectorEnv):
             raise InputError(f"num_envs is {num_envs}, expected 1 or more")
         shown = (agent, images, image_pixels)
         self._adapter, self._agent = _adapter(task, config, device, scene, arm, geometry, *shown)
-        self._state, self.num_envs = None, num_envs
+        self._state: TaskState | None = None
+        self.num_envs = num_envs
         self.single_observation_space = self._adapter.observation_space(self._agent)
         self.single_action_space = Box(*self._adapter.action_bounds(self._agent))
         self.observation_space = batch_space(self.single_observation_space, num_envs)

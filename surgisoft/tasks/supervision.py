@@ -41,10 +41,12 @@ class Supervision(Protocol):
     Tensors have the batch in front.
     """
 
-    task: Task
-    """The task, in simulation or on rigs."""
     clearance_limit_mm: float
     """Limit of clearance of the scene, which no experiment can lower, mm."""
+
+    @property
+    def task(self) -> Task:
+        """The task, in simulation or on rigs."""
 
     def in_sight(self, state: TaskState) -> Tensor:
         """(B,) bool: the target is seen well enough to work on it."""

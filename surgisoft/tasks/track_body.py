@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ class TrackBody:
         self.dt_s, self.weights = c.world.dt_s, {"arm": c.weights}
         self.approach = round(c.approach_s / self.dt_s)
         self.steps = self.approach + round(c.time_s / self.dt_s)
-        row = {"dtype": torch.float32, "device": self.world.device}
+        row: dict[str, Any] = {"dtype": torch.float32, "device": self.world.device}
         self._pace = torch.tensor([1.0 / c.slow_s, 1.0 / c.fast_s], **row)[:, None]
         self._swing = c.swing_kPa * torch.tensor(WAVE_SHARES, **row)[:, None]
         self._rest = self.arm.model.rest_mm.to(**row)

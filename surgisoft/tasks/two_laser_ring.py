@@ -15,26 +15,32 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
-from surgisoft.tasks.circle_ablation import RING_DIRECTION, RING_PLACE
+from surgisoft.tasks.base import Signal, TaskSpec, TaskState, clearance, term_names, weighted
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
-from surgisoft.tasks.laser_work import BEAM_ERROR, VIEW, VIEW_ERROR, arms_clear, pointing
-from surgisoft.tasks.observations import (
-    TIME,
-    Block,
-    ObservationBlocks,
-    body_blocks,
-    joined,
-    numbered,
+from surgisoft.tasks.laser_work import (
+    BEAM_ERROR,
+    ENDOSCOPE,
+    LASER_PRESET,
+    LASER_STEPS,
+    RING_DIRECTION,
+    RING_PLACE,
+    VIEW,
+    VIEW_ERROR,
+    VIEW_FRACTION,
+    LaserConfig,
+    LaserTask,
+    LaserWeights,
+    check_config,
+    lesion,
+    view,
 )
+from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, numbered
 from surgisoft.tasks.trajectories.closed_path import draw_traversal, point_on_closed
 from surgisoft.tasks.world.arm import ArmPart
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.scene import PHANTOM
-from surgisoft.tasks.world.world import WorldConfig, scene_world
 
 LASERS = ("laser_1", "laser_2")
-ENDOSCOPE = "endoscope"
 AGENTS = (*LASERS, ENDOSCOPE)
 """Names of the three arms, which are the agents."""
 TWO_LASERS = PHANTOM / "two_lasers.toml"
@@ -63,22 +69,38 @@ FIRED = Block("fired", "1 if a beam was on in the last step, own beam first", "-
 APART = Block("apart", "measured tips of the other arms minus the own one", "mm", "x / 50")
 
 
-@dataclass(frozen=True)
-class RingLaserWeights:
-    """Weights of a laser's reward terms; e is the distance of its beam from its target, mm."""
+def _beam_on(k: int) -> Signal:
+    return Signal(
+        f"{LASERS[k]}_on",
+        f"1 if the beam of `{LASERS[k]}` was on since the last decision, else 0",
+        "-",
+        0.0,
+        1.0,
+        lambda task, before, after: after.goal.fired[:, k].float(),
+    )
 
-    far: float = 1.0
-    """1 / (1 + e / far_mm)."""
-    aim: float = 1.0
-    """exp(-e / 1 mm)."""
-    fine: float = 1.0
-    """exp(-e / fine_mm)."""
-    cut: float = 1.0
-    """1 while the own beam is on, else 0."""
+
+def _target_seen(k: int) -> Signal:
+    return Signal(
+        f"{LASERS[k]}_target_seen",
+        f"1 if the endoscope sees the target of `{LASERS[k]}`, else 0",
+        "-",
+        0.0,
+        1.0,
+        lambda task, before, after: task.spots_seen(after)[:, k].float(),
+    )
+
+
+BEAMS_ON = tuple(_beam_on(k) for k in range(len(LASERS)))
+SPOTS_SEEN = tuple(_target_seen(k) for k in range(len(LASERS)))
+
+
+@dataclass(frozen=True)
+class RingLaserWeights(LaserWeights):
+    """Weights of a laser's reward terms; e is the distance of its own beam from its target, mm."""
+
     crossed: float = -1.0
     """1 while the path of either beam comes nearer than beam_mm to another arm, else 0."""
-    contact: float = -1.0
-    """1 while the clearance of any arm is below the scene's limit, else 0."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +133,7 @@ class TwoLaserRingWeights:
 
 
 @dataclass(frozen=True)
-class TwoLaserRingConfig:
+class TwoLaserRingConfig(LaserConfig):
     """The scene, the speed of the cut, the observation and the reward.
 
     Time and safety limits come from the scene's file.
@@ -119,34 +141,15 @@ class TwoLaserRingConfig:
 
     scene: str | Path = TWO_LASERS
     """Scene with the arms `laser_1`, `laser_2` and `endoscope`: its folder or file."""
-    arm: str | Path | None = None
-    """Arm model of all arms: `default`, or a folder; None: the models that the scene names."""
     cut_s: float = 45.0
     """Time in which one laser would go once around with its beam on, s; two share the ring."""
-    fire_mm: float = 0.5
-    """Measured distance of a beam from its target within which the beam is switched on, mm."""
     beam_mm: float = 3.0
     """Distance of a beam's path from the skin of another arm below which the beam stays off, mm."""
-    approach_s: float = 5.0
-    """Time at the beginning that the measure `pointing_error_mm` leaves out, s."""
-    fine_mm: float = 0.1
-    """Scale of the reward term `fine`, mm."""
-    far_mm: float = 10.0
-    """Scale of the reward terms `far` and `look`, mm."""
     weights: TwoLaserRingWeights = field(default_factory=TwoLaserRingWeights)
     """Weights of the reward terms."""
-    preview: int = 2
-    """Future targets in a laser's observation, one per step (a count)."""
-    world: WorldConfig = field(default_factory=WorldConfig)
-    """The simulator and its domain randomization."""
 
     def __post_init__(self):
-        names = ("cut_s", "fire_mm", "beam_mm", "approach_s", "fine_mm", "far_mm", "preview")
-        for name in names:
-            if not getattr(self, name) > 0:
-                raise InputError(f"two_laser_ring: {name} is {getattr(self, name)}, expected > 0")
-        for agent in AGENTS:
-            check_weights(f"two_laser_ring: {agent}", getattr(self.weights, agent))
+        check_config("two_laser_ring", self, "cut_s", "beam_mm")
 
 
 def success_rule(config: TwoLaserRingConfig) -> str:
@@ -184,27 +187,24 @@ class SharedCut:
         return replace(self, done=self.done + fired, fired=fired)
 
 
-class TwoLaserRing:
+class TwoLaserRing(LaserTask[SharedCut]):
     """Three arms of a scene: agents `laser_1`, `laser_2` and `endoscope`."""
 
     name, agents = "two_laser_ring", AGENTS
+    signals = (VIEW_FRACTION, *BEAMS_ON, *SPOTS_SEEN)
 
     def __init__(
         self, config: TwoLaserRingConfig | None = None, device: str | torch.device = "cpu"
     ):
-        c = self.config = config or TwoLaserRingConfig()
-        self.world = scene_world(c.scene, c.world, device, arm=c.arm, agents=self.agents)
-        self.scene, self.dt_s = self.world.scene, self.world.config.dt_s
-        self.spec = self.scene.spec
+        c = config or TwoLaserRingConfig()
+        super().__init__(c, device)
         if self.scene.lasers != LASERS or self.scene.endoscopes != (ENDOSCOPE,):
             raise InputError(
                 f"scene '{self.spec.name}' has the lasers {', '.join(self.scene.lasers)} and the "
                 f"endoscopes {', '.join(self.scene.endoscopes)}; two_laser_ring expects "
                 f"{' and '.join(LASERS)}, and {ENDOSCOPE}"
             )
-        self.steps = round(self.spec.limits.time_s / self.dt_s)
         self.round = round(c.cut_s / self.dt_s)
-        self.weights = {agent: getattr(c.weights, agent) for agent in AGENTS}
 
     def goal(self, stream: Stream) -> tuple[Stream, SharedCut]:
         """Draw start and direction of the cut for each random number stream."""
@@ -214,13 +214,8 @@ class TwoLaserRing:
 
     def targets_mm(self, state: TaskState[SharedCut], ahead: int = 0) -> list[Tensor]:
         """(B, 3) mm for each laser: its reference point on the ring `ahead` steps further on."""
-        lesion = state.world.scene.lesion
         shares = (state.goal.share(k, self.round, ahead) for k in range(len(LASERS)))
-        return [point_on_closed(self.scene.paths_mm, lesion, share) for share in shares]
-
-    def centre_mm(self, state: TaskState[SharedCut]) -> Tensor:
-        """(B, 3) mm: the lesion's centre."""
-        return self.scene.centres_mm[state.world.scene.lesion]
+        return [point_on_closed(self.scene.paths_mm, lesion(state), share) for share in shares]
 
     def beam_errors_mm(self, state: TaskState[SharedCut]) -> Tensor:
         """(B, 2) mm: true perpendicular distance of each beam's axis from its target."""
@@ -235,7 +230,7 @@ class TwoLaserRing:
         return self.measured_errors_mm(state).amax(1)
 
     def _off_targets_mm(self, state: TaskState[SharedCut], points_mm: list[Tensor]) -> Tensor:
-        point, targets = pointing(self), self.targets_mm(state)
+        point, targets = self.pointing, self.targets_mm(state)
         off = [
             point[name].offset_mm(points, target).norm(dim=1)
             for name, points, target in zip(LASERS, points_mm, targets, strict=True)
@@ -244,7 +239,10 @@ class TwoLaserRing:
 
     def spots_seen(self, state: TaskState[SharedCut]) -> Tensor:
         """(B, 2) bool: the endoscope sees the stretch of the ring with each laser's target."""
-        visible = state.world.scene.views[ENDOSCOPE].visible
+        measured = state.world.scene.measured
+        if measured:
+            return torch.stack([measured[each.name] > 0.5 for each in SPOTS_SEEN], 1)
+        visible = view(state).visible
         count = visible.shape[1]
         place = [
             (state.goal.share(k, self.round) * count).floor().long() for k in range(len(LASERS))
@@ -267,15 +265,6 @@ class TwoLaserRing:
         ]
         return torch.stack(found, 1)
 
-    def _measured_arms(self, state: TaskState[SharedCut]) -> Mapping[str, ArmPart]:
-        """The arms with their bodies where they are measured; the state itself where exact."""
-        arms = state.world.arms
-        if all(torch.equal(part.seen_mm, part.points_mm) for part in arms.values()):
-            return arms
-        return {
-            name: self.world.arms[name].posed(part, part.seen_mm) for name, part in arms.items()
-        }
-
     def fires(self, state: TaskState[SharedCut]) -> Tensor:
         """(B,) bool: some beam is released, see `released`."""
         return self.released(state).any(1)
@@ -284,15 +273,12 @@ class TwoLaserRing:
         """(B, 2) bool: as far as is measured the beam is near its target, clear of the other arms
         and meets the organ, the endoscope sees its target and enough of the ring, and all arms
         keep the scene's clearance."""
-        fraction = state.world.scene.views[ENDOSCOPE].fraction
-        seen = (fraction >= self.spec.limits.view_fraction)[:, None] & self.spots_seen(state)
+        enough = view(state).fraction >= self.spec.limits.view_fraction
+        seen = enough[:, None] & self.spots_seen(state)
         near = self.measured_errors_mm(state) <= self.config.fire_mm
-        arms, hits = self._measured_arms(state), state.world.scene.hits
-        exact = arms is state.world.arms  # the rays were cast already
-        hit = [hits[n] if exact else self.scene.aimed(arms, n) for n in LASERS]
-        clear = self.beam_clearance_mm(state, arms) >= self.config.beam_mm
-        clear = clear & arms_clear(self, state)[:, None]
-        return seen & near & clear & torch.stack([one.on_organ for one in hit], 1)
+        clear = self.beam_clearance_mm(state, self.measured_arms(state)) >= self.config.beam_mm
+        clear = clear & self.arms_clear(state)[:, None]
+        return seen & near & clear & torch.stack(self.on_organ(state, LASERS), 1)
 
     def advance(
         self,
@@ -305,16 +291,28 @@ class TwoLaserRing:
         """
         on = self.released(state)
         on = on if fired is None else on & fired[:, None]
+        return self._advanced(state, actions, on)
+
+    def advance_measured(
+        self, state: TaskState[SharedCut], signals: Mapping[str, Tensor]
+    ) -> TaskState[SharedCut]:
+        """Advance where the beams were on or off as measured; see `MeasuredTask`."""
+        on = torch.stack([signals[each.name] > 0.5 for each in BEAMS_ON], 1)
+        return self._advanced(state, self.held(), on)
+
+    def _advanced(
+        self, state: TaskState[SharedCut], actions: Mapping[str, Tensor], on: Tensor
+    ) -> TaskState[SharedCut]:
         power_w = {name: on[:, k] * self.spec.laser.power_w for k, name in enumerate(LASERS)}
         world = self.world.step(state.world, actions, power_w)
         return TaskState(world, state.goal.after(on))
 
     def blocks(self, state: TaskState[SharedCut]) -> dict[str, ObservationBlocks]:
         """Observation blocks: body and pointing error of each arm, and the state of the cut."""
-        arms, scene, cut = state.world.arms, state.world.scene, state.goal
-        point, tips = pointing(self), {name: arms[name].seen_mm[:, -1] for name in AGENTS}
+        arms, cut, point = state.world.arms, state.goal, self.pointing
+        tips = {name: arms[name].seen_mm[:, -1] for name in AGENTS}
         ahead = [self.targets_mm(state, k) for k in range(self.config.preview + 1)]
-        clear = self.beam_clearance_mm(state, self._measured_arms(state))
+        clear = self.beam_clearance_mm(state, self.measured_arms(state))
         clear = clear.clamp(-20.0, 60.0) / 10.0
         lead = (cut.done[:, :1] - cut.done[:, 1:]) / self.round
         seen, fired = self.spots_seen(state).float(), cut.fired.float()
@@ -338,22 +336,18 @@ class TwoLaserRing:
             name: {
                 **body_blocks(self.world.arms[name], arms[name]),
                 **own[name],
-                VIEW: scene.views[ENDOSCOPE].fraction[:, None],
+                VIEW: self.reading(VIEW_FRACTION, state)[:, None],
                 TIME: state.world.steps[:, None] / self.steps,
                 APART: torch.cat([tips[o] - tips[name] for o in AGENTS if o != name], 1) / 50.0,
             }
             for name in AGENTS
         }
 
-    def observe(self, state: TaskState[SharedCut]) -> dict[str, Tensor]:
-        """Concatenated observation blocks, agent -> (B, D)."""
-        return {agent: joined(blocks) for agent, blocks in self.blocks(state).items()}
-
     def rewards(self, state: TaskState[SharedCut]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `RingLaserWeights` and `RingEndoscopeWeights`."""
-        errors, scene, fired = self.beam_errors_mm(state), state.world.scene, state.goal.fired
-        view, c = scene.views[ENDOSCOPE], self.config
-        contact = (scene.clearance.least_mm < self.spec.limits.clearance_mm).float()
+        errors, fired = self.beam_errors_mm(state), state.goal.fired
+        seen, c = view(state), self.config
+        contact = (clearance(state).least_mm < self.spec.limits.clearance_mm).float()
         crossed = (self.beam_clearance_mm(state) < c.beam_mm).any(1).float()
         terms = {
             name: {
@@ -367,18 +361,16 @@ class TwoLaserRing:
             for k, name in enumerate(LASERS)
         }
         terms[ENDOSCOPE] = {
-            "look": 1.0 / (1.0 + view.axis_error_mm / c.far_mm),
-            "view": view.fraction,
+            "look": 1.0 / (1.0 + seen.axis_error_mm / c.far_mm),
+            "view": seen.fraction,
             "spots": self.spots_seen(state).float().mean(1),
             "cut": fired.float().mean(1),
             "contact": contact,
         }
-        return {agent: weighted(terms[agent], self.weights[agent]) for agent in AGENTS}
-
-    def ended(self, state: TaskState[SharedCut]) -> Tensor:
-        """When the ring is cut all around, or an arm touches a body, another arm or itself."""
-        done = self.scene.ablation.report(state.world.scene.dose).completion >= 1.0
-        return done | state.world.scene.clearance.collides
+        return {
+            agent: weighted({name: terms[agent][name] for name in term_names(weights)}, weights)
+            for agent, weights in self.weights.items()
+        }
 
     def measures(self, state: TaskState[SharedCut]) -> dict[str, Tensor]:
         """Beam errors, progress of the cut, healthy tissue burnt, view, clearances, success.
@@ -387,21 +379,19 @@ class TwoLaserRing:
         of both at every step after `approach_s`, with the beams on or off. spots_seen: share of the
         two targets in view. beam_clearance_mm: least distance of a beam's path from another arm.
         """
-        scene, errors, fired = state.world.scene, self.beam_errors_mm(state), state.goal.fired
-        ring, hit = self.scene.ablation.report(scene.dose), scene.clearance.collides
+        errors, fired = self.beam_errors_mm(state), state.goal.fired
+        ring, found = self.ring_measures(state), clearance(state)
         late = state.world.steps * self.dt_s > self.config.approach_s
         return {
             "beam_error_mm": errors.where(fired, float("nan")).nanmean(1),
             "pointing_error_mm": errors.mean(1).where(late, float("nan")),
-            "completion": ring.completion,
-            "largest_gap_mm": ring.largest_gap_mm,
-            "healthy_mm2": ring.healthy_mm2,
-            "view_fraction": scene.views[ENDOSCOPE].fraction,
+            **ring,
+            "view_fraction": view(state).fraction,
             "spots_seen": self.spots_seen(state).float().mean(1),
             "beam_clearance_mm": self.beam_clearance_mm(state).amin(1),
-            "clearance_mm": scene.clearance.least_mm,
-            "collided": hit.float(),
-            "success": ((ring.completion >= 1.0) & ~hit).float(),
+            "clearance_mm": found.least_mm,
+            "collided": found.collides.float(),
+            "success": ((ring["completion"] >= 1.0) & ~found.collides).float(),
         }
 
     def trace(self, state: TaskState[SharedCut]) -> tuple[Tensor, Tensor]:
@@ -414,7 +404,7 @@ class TwoLaserRing:
         """Scripted expert: points each laser at its next target, the endoscope at the lesion."""
         targets = dict(zip(LASERS, self.targets_mm(state, 1), strict=True))
         targets[ENDOSCOPE] = self.centre_mm(state)
-        point, arms = pointing(self), state.world.arms
+        point, arms = self.pointing, state.world.arms
         return {name: point[name].action(arms[name], targets[name]) for name in AGENTS}
 
 
@@ -430,13 +420,8 @@ TWO_LASER_RING = TaskSpec(
     TwoLaserRing,
     TwoLaserRingConfig(),
     AGENTS,
-    preset={
-        "rollout": 16,
-        "last_noise": 0.05,
-        "evaluate_every": 50,
-        "evaluation_episodes": 16,
-    },
-    training_steps=1_500_000,
+    preset=LASER_PRESET,
+    training_steps=LASER_STEPS,
     experiment=replace(LASER_EXPERIMENT, supervise=TwoLaserSupervision),
     success_rule=success_rule,
 )

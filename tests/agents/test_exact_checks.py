@@ -2,24 +2,33 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from surgisoft.agents.evaluate import evaluate
-from surgisoft.agents.exact_checks import Contact, ExactChecks, has_obstacles
+from surgisoft.agents.exact_checks import Contact, ExactChecks, has_obstacles, out_of_contact
 from surgisoft.agents.policies import Random
 from surgisoft.agents.rollout import Instant
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import CollisionChecker
+from surgisoft.scene.collision import Collision, CollisionChecker
 from surgisoft.scene.folder import open_scene
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.circle_ablation import PHANTOM, CircleAblation, CircleAblationConfig
+from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
 from surgisoft.tasks.registry import make_task
+from surgisoft.tasks.world.scene import PHANTOM
 
 
 @pytest.fixture(scope="module")
 def task():
     return CircleAblation()
+
+
+@pytest.fixture(scope="module")
+def checker(task):
+    return CollisionChecker(task.world.scene.geometry.bodies)
 
 
 def at(state, line_mm):
@@ -104,6 +113,81 @@ def test_on_real_episodes_the_batched_path_agrees(task):
         assert check.beam_off_mm < 1e-3
         assert check.clearance_off_mm < 0.05
     assert found.per_episode["clearance_mm"].tolist() == [v.clearance_mm for v in found.checks]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.0, 25.0), st.floats(0.0, 0.6))
+def test_where_fcl_is_not_asked_it_does_not_differ(task, checker, seed, spread_mm, towards):
+    """Random poses between the arms' own and one inside the organ, with beams at random."""
+    around, rng = task.world.scene, np.random.default_rng(seed)
+    scene, count, lines = around.geometry, 12, {}
+    for name, part in Episodes(task).seeded(seed, count).world.arms.items():
+        line = part.line_mm.numpy()
+        step = towards * (around.centre_mm.numpy() - line[:, -1:])
+        moved = line + step + spread_mm * rng.normal(size=(count, 1, 3))
+        lines[name] = (moved + 0.1 * rng.normal(size=line.shape)).astype(np.float32)
+    clear = out_of_contact(scene, {name: torch.from_numpy(line) for name, line in lines.items()})
+    radii, asked = scene.radii_mm, {name: line.astype(float) for name, line in lines.items()}
+    for n in np.flatnonzero(clear):
+        assert not checker.collisions({a: ArmShape(line[n], radii[a]) for a, line in lines.items()})
+    tips = lines["laser"][:, -1]
+    aims = (around.centre_mm.numpy() + 15.0 * rng.normal(size=(count, 3)) - tips).astype("f4")
+    kind, end, sure = scene.sure_hits(tips, aims, around.beam_mm, lines, "laser")
+    exact = checker.cast_each(
+        tips.astype(float), aims.astype(float), around.beam_mm, asked, radii, "laser"
+    )
+    assert np.array_equal(kind[sure], exact[0][sure])
+    np.testing.assert_allclose(end[sure], exact[1][sure], rtol=0.0, atol=1e-6)
+
+
+def test_a_beam_that_grazes_an_edge_or_an_arm_is_left_to_fcl(task, checker):
+    """Aimed at vertices and edges of the organ, and along the skin of the other arm."""
+    scene, mesh = task.world.scene.geometry, open_scene(PHANTOM).organ.world_mesh
+    rng = np.random.default_rng(0)
+    faces = mesh.faces[rng.integers(len(mesh.faces), size=60)]
+    corners = mesh.vertices_mm[faces]
+    share = rng.uniform(size=(60, 1)) * (np.arange(60) % 2)[:, None]
+    ends = corners[:, 0] + share * (corners[:, 1] - corners[:, 0])
+    origins = ends + 50.0 * np.array([0.1, 0.2, 1.0])
+    lines = {"endoscope": np.full((60, 2, 3), 900.0) + np.array([[0.0, 0, 0], [0, 0, 9]])}
+    _, found, sure = scene.sure_hits(origins, ends - origins, 110.0, lines)
+    upon = np.linalg.norm(found - ends, axis=1) < 1e-6
+    assert upon.sum() > 20  # the others meet something before
+    assert not sure[upon].any()
+    middles = corners.mean(1)
+    origins = middles + 50.0 * np.array([0.1, 0.2, 1.0])
+    _, found, sure = scene.sure_hits(origins, middles - origins, 110.0, lines)
+    upon = np.linalg.norm(found - middles, axis=1) < 1e-6
+    assert sure[upon].mean() > 0.9
+    n = np.flatnonzero(upon & sure)[0]
+    radius = scene.radii_mm["endoscope"]
+    for beside, expected in ((radius + 1e-4, False), (radius + 0.01, True)):
+        across = np.cross(middles[n] - origins[n], [1.0, 0.0, 0.0])
+        across *= beside / np.linalg.norm(across)
+        foot = 0.5 * (middles[n] + origins[n]) + across
+        arm = {"endoscope": foot + np.array([[[-40.0, 0, 0], [40.0, 0, 0]]])}
+        aim = (middles[n] - origins[n])[None]
+        *_, sure_now = scene.sure_hits(origins[n][None], aim, 110.0, arm)
+        assert sure_now.tolist() == [expected]
+
+
+def test_fcl_audits_what_it_need_not_see(task, monkeypatch):
+    """A batched clearance that is wrong everywhere is found out by the audit."""
+    short = CircleAblation(CircleAblationConfig())
+    short.steps = 130
+    seen = []
+    whole = CollisionChecker.collisions
+    monkeypatch.setattr(
+        CollisionChecker, "collisions", lambda self, arms: seen.append(1) or whole(self, arms)
+    )
+    (check,) = evaluate(short, "random", Random(2), 1, seed=1).checks
+    assert check.steps == 131
+    assert len(seen) == check.asked >= check.audited == 3
+    touching = lambda self, arms: (Collision("laser", "liver", "body", False, 0),)  # noqa: E731
+    monkeypatch.setattr(CollisionChecker, "collisions", touching)
+    (check,) = evaluate(short, "random", Random(2), 1, seed=1).checks
+    assert check.contact == Contact(0.0, ("laser", "liver"))
+    assert check.contact_differs >= 3
 
 
 def test_nothing_around_needs_no_referee():

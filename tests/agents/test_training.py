@@ -116,6 +116,51 @@ def test_a_kill_between_checkpoints_loses_nothing(run, tmp_path):
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("name", [*PRESETS, "normalised"])
+def test_every_preset_goes_on_as_if_uninterrupted(name, tmp_path):
+    """Also what only some presets have: observers, learned noise, running normalisers."""
+    small = {"envs": 4, "rollout": 4, "epochs": 1, "batches": 2, "hidden": (8,)}
+    preset = PRESETS.get(name, Preset(normalise=True, last_noise=None))
+    preset = replace(preset, **small, evaluate_every=1, evaluation_episodes=1)
+    config = config_for(name, config_of("track_circle"))
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+
+    def cut_after_one(progress):
+        if progress.steps == 32:  # the second of three iterations: its checkpoint comes later
+            shutil.copytree(whole, cut)
+
+    plan = Plan("track_circle", config, "fast", preset, steps=48)
+    assert train_new(whole, plan, Processes(), CPU, cut_after_one).done
+    assert RunFolder(cut).load(LAST)["iteration"] == 1
+    torch.manual_seed(99)
+    assert resume(cut, Processes(), CPU).done
+    one, other = (RunFolder(path).load(LAST) for path in (whole, cut))
+    assert one["iteration"] == other["iteration"] == 3
+    for part in ("agents", "processes", "best"):
+        assert same(one[part], other[part]), part
+    if name == "normalised":
+        count = [v for k, v in leaves(one["agents"]) if "count" in k and "normalizer" in k]
+        assert count
+        assert all(value > 0 for value in count)
+
+
+def leaves(tree, path=""):
+    """(path, value) of everything in nested tables and lists."""
+    if isinstance(tree, dict | list | tuple):
+        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        return [leaf for key, part in pairs for leaf in leaves(part, f"{path}/{key}")]
+    return [(path, tree)]
+
+
+def same(one, other):
+    """Whether two trees have the same leaves, every bit."""
+    pairs = list(zip(leaves(one), leaves(other), strict=True))
+    return bool(pairs) and all(
+        a == b and (torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y)
+        for (a, x), (b, y) in pairs
+    )
+
+
 def test_a_finished_run_stays_as_it_is(run):
     before = weights(run)
     assert resume(run.path, Processes(), CPU).done

@@ -135,6 +135,8 @@ def test_an_experiment_gets_the_report_of_its_scenario(bench, tmp_path):
         ("error_mm = 2.0", "error_mm = 0.0", "limits.error_mm: got number 0.0; expected a number"),
         ("question", "qestion", "qestion: unknown field (did you mean 'question'?)"),
         ('states = ["a', 'states = ["b', "there is no 'b.parquet' beside this file"),
+        ('states = ["a', 'states = ["\\u0000', "there is no '\\x00.parquet' beside this file"),
+        ('states = ["a', 'states = ["' + 300 * "a", "there is no 'aaaa"),
         ("[scenario]", '[[sources]]\nname = "a"\n[scenario]', "a second 'a'; expected each"),
     ],
 )

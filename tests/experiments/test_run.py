@@ -115,6 +115,7 @@ def test_a_damaged_row_is_one_line(whole, tmp_path):
     content = json.loads(row.read_text())
     texts = ["[]", "[" * 10**5, json.dumps(content | {"episode": 7})]
     texts += [json.dumps(content | {"clearance_mm": "x"}), json.dumps(content | {"new": 1})]
+    texts.append(json.dumps(content | {"clearance_mm": 10**400}))
     for text in texts:
         row.write_text(text)
         with pytest.raises(InputError, match=row.name):

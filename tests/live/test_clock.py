@@ -19,13 +19,16 @@ class Time:
         self.s += seconds
 
 
-def loop(pace, work_s, period_s=0.05):
+def loop(pace, work_s, period_s=0.05, waited_s=0.0):
+    """A loop that computes and, in periods that are longer than one, waits for a part of it [s]."""
     time = Time()
-    clock = Clock(period_s, pace, time.now, time.sleep)
+    computed = [0.0]
+    clock = Clock(period_s, pace, time.now, time.sleep, lambda: computed[0])
     clock.tick()
     ticks = [time.s]
     for each in work_s:
         time.s += each
+        computed[0] += each - (waited_s if each > period_s else 0.0)
         clock.tick()
         ticks.append(time.s)
     return clock.timing(), ticks
@@ -63,3 +66,14 @@ def test_a_simulated_clock_never_waits_and_measures_the_work():
 def test_a_late_sample_of_a_rig_is_an_overrun():
     timing, _ = loop("rig", [0.05, 0.05, 0.11, 0.05])
     assert timing.overruns == 1
+
+
+def test_an_overrun_names_its_time_and_whether_the_loop_computed_or_waited():
+    work = [0.01, 0.01, 0.07, 0.01, 0.01]
+    own, _ = loop("real", work)
+    assert (own.overruns, own.overruns_waiting) == (1, 0)
+    assert own.overruns_s == pytest.approx([0.1], abs=1e-3)
+    assert "at 0.1 s; in 1 the loop's own work took longer" in own.sentence
+    waited, _ = loop("real", work, waited_s=0.05)
+    assert (waited.overruns, waited.overruns_waiting) == (1, 1)
+    assert "in 1 the loop waited" in waited.sentence

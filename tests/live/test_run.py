@@ -292,3 +292,28 @@ def test_ctrl_c_leaves_a_complete_recording(schedule, tmp_path, capsys):
     assert f"wrote {output}" in shown.out
     assert "interrupted" in shown.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.parquet", "run.toml"]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no real-time priorities here")
+@pytest.mark.parametrize("clock", ["real", "simulated"])
+def test_only_a_loop_in_real_time_has_real_time_priority(schedule, clock):
+    kept = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(0, kept, os.sched_param(0))
+    except OSError:
+        pytest.skip("this user may not set real-time priorities")
+    during = set()
+
+    class Looks(VirtualRig):
+        def read_beside_truth(self):
+            during.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            return super().read_beside_truth()
+
+        def read(self):
+            during.add(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK)
+            return super().read()
+
+    run(schedule, Looks(0), minutes=0.5 / 60, clock=clock)
+    assert during == {os.SCHED_RR if clock == "real" else kept}
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == kept

@@ -1,6 +1,7 @@
 """Topics of MCAP files, written by the `mcap` packages themselves, become recordings."""
 
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -228,3 +229,37 @@ def test_a_torn_file_is_one_line(tmp_path, bag):
     text = MAP.replace("TOPICS", 'topic = "/tip"').replace("POSITIONS", positions("pose.position"))
     with pytest.raises(InputError, match=r"torn\.mcap: cannot be read as an MCAP file"):
         imported(tmp_path, torn, text)
+
+
+def test_lengths_that_a_file_claims_take_no_memory(tmp_path, bag):
+    """The length of a record of the summary, and what a chunk claims to unpack to."""
+    whole = bag.read_bytes()
+    spec_text = MAP.replace("TOPICS", 'topic = "/tip"').replace("POSITIONS", "[['x', 'y', 'z']]")
+    (tmp_path / "map.toml").write_text(spec_text)
+    (size,) = struct.unpack_from("<Q", whole, 9)
+    chunk = 8 + 9 + size
+    while whole[chunk] != 6:
+        chunk += 9 + struct.unpack_from("<Q", whole, chunk + 1)[0]
+    (summary,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
+    for at, said in ((summary + 1, "cannot be read"), (chunk + 9 + 16, "claims to unpack to")):
+        damaged = whole[:at] + struct.pack("<Q", 1 << 62) + whole[at + 8 :]
+        (tmp_path / "bag.mcap").write_bytes(damaged)
+        with pytest.raises(InputError, match=said) as caught:
+            import_files([tmp_path / "bag.mcap"], load_map(str(tmp_path / "map.toml")), "r")
+        assert not isinstance(caught.value.__cause__, MemoryError)
+
+
+def test_a_clock_that_jumps_by_years_takes_no_memory(tmp_path):
+    """The delay's search puts runs on an even clock: not over a gap of 3 billion samples."""
+    t_s = 0.05 * np.arange(400.0)
+    t_s[200:] += 1e8
+    waves = np.sin(np.outer(t_s % 1000.0, [1.0, 1.3, 0.7, 2.1, 1.7]))
+    rows = np.column_stack([t_s, 10 + 5 * waves[:, :2], 20 * waves[:, 2:]])
+    text = "".join(",".join(map(repr, row)) + "\n" for row in rows.tolist())
+    (tmp_path / "raw.csv").write_text("t,u1,u2,x,y,z\n" + text)
+    (tmp_path / "map.toml").write_text(
+        "[file.log]\n[time]\ncolumn = 't'\n[measured]\ncolumns = ['u1', 'u2']\nunit = 'kPa'\n"
+        "[key_points]\npositions = [['x', 'y', 'z']]\nunit = 'mm'\n"
+    )
+    (part,) = import_files([tmp_path / "raw.csv"], load_map(str(tmp_path / "map.toml")), "r")
+    assert part.recording.samples == 400

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks.fuzz.targets import make_c3d, make_matlab
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing import READERS, RawTable, Reader, import_files, load_map
@@ -263,3 +264,38 @@ def test_a_damaged_file_of_a_lab_is_one_line(tmp_path, ending):
     path.write_bytes(b"\1\0\2\0" * 300)
     with pytest.raises(InputError, match=f"raw.{ending}: "):
         import_files([path], load_map(write_map(tmp_path, "auto")), "r")
+
+
+@pytest.mark.parametrize(
+    ("make", "file", "changes"),
+    [
+        (make_c3d, "one/raw.c3d", {765: 255, 766: 255, 767: 255, 768: 255}),
+        (make_matlab, "plain/raw.mat", {66: 0, 175: 1, 176: 0}),
+    ],
+)
+def test_what_ends_a_library_is_one_line(tmp_path, make, file, changes):
+    """Bytes at which ezc3d 1.7 and SciPy 1.17 end in a segmentation fault."""
+    pytest.importorskip("ezc3d", reason="the extra 'lab' is not installed")
+    make(tmp_path)
+    path = tmp_path / file
+    content = bytearray(path.read_bytes())
+    for at, value in changes.items():
+        content[at] = value
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=f"{path.name}: cannot be read as a .* file"):
+        import_files([path], load_map(str(path.parent / "map.toml")), "r")
+
+
+def test_an_hdf5_file_cannot_claim_gigabytes_or_other_files(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="the extra 'lab' is not installed")
+    path, secret = tmp_path / "raw.h5", tmp_path / "secret.bin"
+    secret.write_bytes(np.arange(40.0).tobytes())
+    with h5py.File(path, "w") as file:
+        file.create_dataset("t", (10**9,), "f8", chunks=True)
+    with pytest.raises(InputError, match="'t' claims 8000000000 bytes, in a file of"):
+        import_files([path], load_map(write_map(tmp_path, "hdf5")), "r")
+    with h5py.File(path, "w") as file:
+        file.create_dataset("t", (40,), "f8", external=[(str(secret), 0, 320)])
+        file["u"] = np.arange(3.0)
+    with pytest.raises(InputError, match=r"expected one of u$"):  # the other file is left out
+        import_files([path], load_map(write_map(tmp_path, "hdf5")), "r")

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,3 +161,35 @@ def test_the_disk_is_told_to_write_while_the_recording_runs(tmp_path, monkeypatc
         during = len(told)
     assert during >= 2
     assert json.loads((tmp_path / "x.jsonl").read_text().splitlines()[1])["p"] == [0.0]
+
+
+def test_a_disk_that_is_busy_does_not_hold_up_the_loop_that_measures(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.4))
+    monkeypatch.setattr("surgisoft.measurement.recordings.log.SYNC_S", 0.01)
+    header = LogHeader("n", "continuous", "kPa", 1, 1, ArmInfo())
+    took = []
+    with recording_log(tmp_path / "x.jsonl", header) as log:
+        for row in range(40):
+            began = time.perf_counter()
+            log.sample(row, 0, 0.02 * row, np.zeros(1), np.zeros((1, 3)))
+            took.append(time.perf_counter() - began)
+            time.sleep(0.02)
+    assert np.median(took) < 0.01
+    assert max(took) < 0.2
+    assert len(read_log(tmp_path / "x.jsonl")[0].t_s) == 40
+
+
+def test_a_full_disk_is_reported_to_the_loop():
+    header = LogHeader("n", "continuous", "kPa", 1, 1, ArmInfo())
+    taken = []
+
+    def measure():
+        with recording_log(Path("/dev/full"), header, True) as log:
+            for row in range(100):
+                log.sample(row, 0, 0.02 * row, np.zeros(1), np.zeros((1, 3)))
+                taken.append(row)
+                time.sleep(0.01)
+
+    with pytest.raises(OSError, match="No space left"):
+        measure()
+    assert len(taken) < 100

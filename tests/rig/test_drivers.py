@@ -2,6 +2,7 @@
 
 import json
 import math
+import socket
 import struct
 
 import numpy as np
@@ -13,7 +14,14 @@ from surgisoft.errors import InputError
 from surgisoft.rig.drivers.bench_map import KeyPoints, load_bench_map, map_of
 from surgisoft.rig.drivers.clock import ClockMap
 from surgisoft.rig.drivers.line_protocol import Data, Info, crc16, line, words_of
-from surgisoft.rig.drivers.motion_capture import Body, Frame, decode_json, encode_json
+from surgisoft.rig.drivers.motion_capture import (
+    Body,
+    Frame,
+    FrameReceiver,
+    decode_json,
+    encode_json,
+    listen,
+)
 from surgisoft.rig.drivers.natnet import read_bodies, read_frame, read_server
 
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -266,3 +274,17 @@ def test_the_stream_is_documented_as_it_is_read():
     assert set(frame.points) == {"tip", "k3"}
     assert np.isnan(frame.points["k3"]).all()
     np.testing.assert_array_equal(frame.bodies["base"].position_mm, [1.0, 2.0, 3.0])
+
+
+def test_a_datagram_of_brackets_is_a_damaged_one():
+    """Nested too deeply for the parser: the receiver counts it and goes on."""
+    listening = listen("127.0.0.1", 0)
+    receiver = FrameReceiver(listening, decode_json, "cameras")
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"[" * 60_000, listening.getsockname())
+            sender.sendto(encode_json(Frame(1, 0.5, {}, {})), listening.getsockname())
+        assert receiver.next_from(0.0, 5.0).number == 1
+        assert receiver.damaged == 1
+    finally:
+        receiver.close()

@@ -1,6 +1,8 @@
 """Segmented images: surfaces of their labels in the patient's frame, whatever order voxels have."""
 
+import gzip
 import itertools
+import struct
 
 import numpy as np
 import pytest
@@ -235,3 +237,20 @@ def test_images_that_are_no_segmentation_are_one_line(tmp_path):
         with pytest.raises(InputError, match=says) as stopped:
             read_segmentation(path, LABELS)
         assert "\n" not in str(stopped.value)
+
+
+@pytest.mark.parametrize("name", ["image.nii", "image.nii.gz", "image.nrrd"])
+def test_a_header_that_claims_more_than_the_file_is_refused_at_once(tmp_path, name):
+    """1024 x 1024 x 1000 voxels in a file of a few hundred bytes."""
+    path, labels = tmp_path / name, np.ones((4, 4, 4), np.uint8)
+    if name.endswith("nrrd"):
+        nrrd.write(str(path), labels, {"encoding": "raw"})
+        path.write_bytes(path.read_bytes().replace(b"sizes: 4 4 4", b"sizes: 1024 1024 1000"))
+    else:
+        image = nibabel.Nifti1Image(labels, np.eye(4))
+        content = image.to_bytes().replace(
+            struct.pack("<4h", 3, 4, 4, 4), struct.pack("<4h", 3, 1024, 1024, 1000), 1
+        )
+        path.write_bytes(gzip.compress(content) if name.endswith("gz") else content)
+    with pytest.raises(InputError, match=r"its header claims 10485760+ bytes"):
+        read_segmentation(path, LABELS)

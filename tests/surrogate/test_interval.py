@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -70,6 +70,7 @@ def test_the_interval_widens_where_errors_grow_with_distance():
     missing=st.floats(0.0, 0.3),
     level=st.floats(0.05, 0.985),
 )
+@example(rows=304, seed=20973, missing=0.22364193257491147, level=0.5)
 @settings(max_examples=30, deadline=None)
 def test_calibration_rows_are_covered_and_levels_are_nested(rows, seed, missing, level):
     error = gaussian(3 * rows, seed)

@@ -14,9 +14,9 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 import surgisoft
 from surgisoft.environments import ONE_AGENT
 from surgisoft.errors import InputError
-from surgisoft.scene.batched import BatchedScene
+from surgisoft.scene.batched import BatchedScene, LoneScene
 from surgisoft.scene.capsules import ArmShape
-from surgisoft.scene.collision import CollisionChecker, ExactScene
+from surgisoft.scene.collision import CollisionChecker, ExactScene, LoneExact
 from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.parallel import SurgicalEnv, parallel_env
 from surgisoft.tasks.path_following import FollowConfig
@@ -76,16 +76,20 @@ def test_the_geometry_asked_for_decides(geometry, monkeypatch):
     around, asked = env.task.scene, []
     referee = CollisionChecker(around.geometry.bodies)
     assert isinstance(around.collision, ExactScene if geometry == "fcl" else BatchedScene)
-    for name in ("clearance", "cast"):
-        ask = getattr(around.collision, name)
-        monkeypatch.setattr(
-            around.collision,
-            name,
-            lambda *a, ask=ask, name=name, **k: asked.append(name) or ask(*a, **k),
-        )
+    ask = around.collision.clearance
+    monkeypatch.setattr(
+        around.collision, "clearance", lambda *a, **k: asked.append("clearance") or ask(*a, **k)
+    )
+    lone = LoneExact if geometry == "fcl" else LoneScene
+    monkeypatch.setattr(
+        lone,
+        "clearance",
+        lambda self, ask=lone.clearance: asked.append("clearance") or ask(self),
+    )
     env.reset(seed=3)
     env.step({agent: np.full(3, 2.0, np.float32) for agent in env.agents})
-    assert asked.count("clearance") == 2
+    # The task's reset, what the adapter takes over from it, and the step.
+    assert asked.count("clearance") == 3
     arms, scene = env._state.world.arms, env._state.world.scene
     shapes = {name: ArmShape(part.line_mm[0].numpy(), 7.5) for name, part in arms.items()}
     exact = referee.clearance(shapes).least_mm

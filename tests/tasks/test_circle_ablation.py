@@ -11,10 +11,8 @@ import torch
 import trimesh
 
 from surgisoft.errors import InputError
-from surgisoft.tasks import laser_work
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.circle_ablation import CircleAblation, CircleAblationConfig
-from surgisoft.tasks.laser_work import safety
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.pytree import rows
 from surgisoft.tasks.world.world import WorldConfig
@@ -141,7 +139,7 @@ def test_a_collision_ends_the_episode_and_is_no_success(quick):
     assert quick.ended(state).tolist() == [False, True]
     assert quick.measures(state)["success"].tolist() == [0.0, 0.0]
     whole = torch.tensor([True, True])
-    assert safety(state, whole)["success"].tolist() == [1.0, 0.0]
+    assert quick.safety(state, whole)["success"].tolist() == [1.0, 0.0]
     for terms in quick.rewards(state).values():
         assert terms["contact"].tolist() == [0.0, -1.0]
 
@@ -237,10 +235,10 @@ def test_the_gate_follows_what_is_measured_and_never_the_true_beam(quick, cut):
 
     arm = quick.world.arms["laser"]
     truly_off = with_laser(replace(arm.posed(laser, tilted), seen_mm=laser.points_mm))
-    assert (laser_work.beam_error_mm(quick, truly_off) > 2.0).all()
+    assert (quick.beam_error_mm(truly_off) > 2.0).all()
     assert quick.fires(truly_off).all()
     seen_off = with_laser(replace(laser, seen_mm=tilted))
-    assert (laser_work.beam_error_mm(quick, seen_off) < 0.5).all()
+    assert (quick.beam_error_mm(seen_off) < 0.5).all()
     assert not quick.fires(seen_off).any()
 
 
@@ -248,7 +246,7 @@ def test_the_pointing_error_is_measured_with_the_beam_off_too(quick, cut):
     """No gate truncates it; it leaves out the approach alone."""
     states, outcomes = cut
     measured = torch.stack([o.measures["pointing_error_mm"] for o in outcomes])
-    true = torch.stack([laser_work.beam_error_mm(quick, state) for state in states[1:]])
+    true = torch.stack([quick.beam_error_mm(state) for state in states[1:]])
     begins = round(quick.config.approach_s / quick.dt_s)
     assert measured[: begins - 1].isnan().all()
     torch.testing.assert_close(measured[begins + 1 :], true[begins + 1 :])
@@ -267,7 +265,7 @@ def test_each_reward_term_rises_with_what_it_rewards(quick, cut):
     reward = quick.rewards(replace(state, goal=replace(state.goal, fired=on)))
     for agent in quick.agents:
         assert reward[agent]["cut"].tolist() == [1.0, 0.0]
-    error = laser_work.beam_error_mm(quick, state)
+    error = quick.beam_error_mm(state)
     torch.testing.assert_close(reward["laser"]["far"], 10.0 / (10.0 + error))
     torch.testing.assert_close(reward["laser"]["aim"], torch.exp(-error))
     torch.testing.assert_close(reward["laser"]["fine"], torch.exp(-error / 0.1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.candidates import Candidate, candidates, with_effect
+from surgisoft.diagnosis.candidates import Candidate, model_candidates, with_effect
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.cross_validation import cross_validation_of
 from surgisoft.diagnosis.estimation.intervals import (
@@ -205,7 +205,7 @@ def starts(problem: Problem, name: str, number: int = 2) -> list[ArmModel]:
     The candidates are ranked by the error that each leaves on held-out blocks beside the model
     discrepancy; of two that leave nearly the same, the simpler one comes first.
     """
-    tried = candidates(problem, [name])
+    tried = model_candidates(problem, [name])
     if not tried:
         raise InputError(
             f"effect '{name}' changes nothing on these recordings, so nothing of it can be fitted; "

@@ -35,6 +35,9 @@ GAP_S = 0.2
 """Key points are on a line over gaps up to this, or up to five samples [s]."""
 RIDGE = 1e-4
 """Ridge of the regression, as a share of the features' mean square."""
+MOST_GAPS = 100
+"""Times that a run may last longer than its samples at the usual step: beyond it the run is mostly
+gaps, and an even clock would have as many samples as its longest time claims."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,8 @@ class Moves:
         actuation, body = [], []
         for run in recording.runs:
             t_s = recording.t_s[run]
+            if t_s[-1] - t_s[0] > MOST_GAPS * len(t_s) * step:
+                continue
             grid = np.arange(t_s[0], t_s[-1] + 1e-9, step)
             if len(grid) > 4 * BACK_S / step:
                 actuation.append(_on(grid, t_s, scaled[run]))

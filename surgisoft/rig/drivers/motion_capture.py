@@ -34,6 +34,8 @@ KEPT = 4096
 """Frames that wait to be read."""
 PACKET = 65536
 """Largest datagram [bytes]."""
+DAMAGED = (ValueError, IndexError, OverflowError, RecursionError)
+"""What decoders raise for a datagram that is no whole message; receivers pass over it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +203,7 @@ class FrameReceiver:
             now = self._clock()
             try:
                 frame = self._decode(packet)
-            except (ValueError, IndexError, OverflowError) as error:
+            except DAMAGED as error:
                 self.damaged += 1
                 self.why_damaged = str(error)
                 continue

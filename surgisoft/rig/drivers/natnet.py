@@ -25,7 +25,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from surgisoft.errors import InputError
-from surgisoft.rig.drivers.motion_capture import PACKET, Body, Frame, FrameReceiver, listen
+from surgisoft.rig.drivers.motion_capture import (
+    DAMAGED,
+    PACKET,
+    Body,
+    Frame,
+    FrameReceiver,
+    listen,
+)
 
 COMMAND_PORT = 1510
 """Port on which a server takes requests."""
@@ -233,7 +240,7 @@ class NatNetClient(FrameReceiver):
             data = self._command
             if self.server.group:
                 data = listen(host, self.server.data_port, self.server.group)
-        except (ValueError, IndexError) as error:
+        except DAMAGED as error:
             self._command.close()
             if isinstance(error, InputError):
                 raise

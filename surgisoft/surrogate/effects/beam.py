@@ -41,6 +41,9 @@ class Beam:
     """(n, K) the centreline itself less its clamp, r - r(0), mm."""
     length_mm: float
     """Length L of the chords at rest, mm."""
+    shares: tuple[float, ...]
+    """(n,) share of the body that is nearest to each key point; what is nearest to the clamp counts
+    for none."""
 
     @classmethod
     def through(cls, rest_mm: Tensor) -> "Beam":
@@ -87,7 +90,14 @@ class Beam:
             matrix((middle @ weighed).T),
             matrix((trapezoid @ (position - position[0])).T),
             float(knots[-1]),
+            _shares(knots)[below:],
         )
+
+
+def _shares(knots: np.ndarray) -> tuple[float, ...]:
+    """Share of a body that is nearest to each of its nodes at the lengths knots, base to tip."""
+    borders = np.concatenate([knots[:1], (knots[1:] + knots[:-1]) / 2, knots[-1:]])
+    return tuple(float(part) for part in np.diff(borders) / knots[-1])
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from surgisoft.surrogate.effects.base import ArmFacts, Memoryless, Quantity, amplitude, value_of
 from surgisoft.surrogate.effects.beam import Beam, cross, displaced
-from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 
 
 class Payload(Memoryless):
@@ -94,6 +94,7 @@ class Payload(Memoryless):
 
 HYPOTHESIS = Hypothesis(
     Payload,
+    combinations=no_combinations,
     absent_in="bare_tip",
     own_weight="body_sag",
     tip_mass="tip_sag",

@@ -44,7 +44,7 @@ def save_episode(log: EpisodeLog, path: str | Path) -> None:
     table = {"format": FORMAT, "log": _split(log, "", arrays)}
     arrays["table"] = np.frombuffer(json.dumps(table).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, buffer.getvalue())
 
@@ -103,8 +103,8 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             if len(content) < claimed:
                 raise ValueError(f"'{member.filename}' is cut off")
             flat = np.frombuffer(content, kind)
-            order = "F" if fortran else "C"
-            arrays[member.filename.removesuffix(".npy")] = flat.reshape(shape, order=order)
+            whole = flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+            arrays[member.filename.removesuffix(".npy")] = whole
     return arrays
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
@@ -23,7 +23,7 @@ from surgisoft.tasks.episodes.parts import (
     Event,
 )
 from surgisoft.tasks.world.respiration import MOVING
-from surgisoft.tasks.world.scene import SceneEngine
+from surgisoft.tasks.world.scene import ObstacleEngine, SceneEngine
 
 NO_DIAMETER_MM = 15.0
 """Outer diameter (mm) of an arm where neither scene nor model states it: the paper's arm."""
@@ -183,7 +183,7 @@ class EpisodeRecorder:
         Without `episode` they are the same.
         """
         self.task, self.done, self.environment = task, False, environment
-        self._about = {"driver": driver, "seed": int(seed), "on": on}
+        self._about: dict[str, Any] = {"driver": driver, "seed": int(seed), "on": on}
         self._about["episode"] = environment if episode is None else int(episode)
         self._rows: list[dict[str, np.ndarray]] = []
         self._dose: list[tuple[np.ndarray, np.ndarray]] = []
@@ -239,7 +239,7 @@ class EpisodeRecorder:
         )
         if near is not None:
             log = replace(log, **self._scene_fields(near, rows))
-        elif around is not None:
+        elif isinstance(around, ObstacleEngine):
             bodies = tuple(_body(body) for body in around.geometry.bodies)
             limits = {"clearance_mm": around.clearance_mm}
             log = replace(log, bodies=bodies, limits=limits, clearance_mm=rows["clearance"])
@@ -264,12 +264,14 @@ class EpisodeRecorder:
         for name, hit in near.hits.items():
             row |= {f"end/{name}": hit.point_mm, f"hits/{name}": hit.on_organ}
         row |= {f"view/{name}": view.fraction for name, view in near.views.items()}
-        if near.breaths is not None:
-            row["motion"] = self.task.world.scene.placement(near.breaths).map.float()
+        around = self.task.world.scene
+        if isinstance(around, SceneEngine):
+            placement = around.placement(near.breaths)
+            row |= {} if placement is None else {"motion": placement.map.float()}
         if near.dose is not None:
-            delivered = near.dose.delivered_j
-            delivered = delivered.reshape(len(delivered), -1).unbind(1)
-            row |= {f"delivered/{n}": j for n, j in zip(near.hits, delivered, strict=True)}
+            joules = near.dose.delivered_j
+            each = joules.reshape(len(joules), -1).unbind(1)
+            row |= {f"delivered/{n}": j for n, j in zip(near.hits, each, strict=True)}
             self._add_dose(self._of(near.dose.dose))
         self._rows.append({name: self._of(value) for name, value in row.items()})
 
@@ -310,7 +312,8 @@ class EpisodeRecorder:
 
     def _scene_fields(self, near: SceneEngine, rows: Mapping[str, np.ndarray]) -> dict:
         """The log's fields that only a scene has."""
-        camera = CameraLog(near.camera.fov_rad, tuple(map(float, near.camera.range_mm)))
+        nearest, farthest = map(float, near.camera.range_mm)
+        camera = CameraLog(near.camera.fov_rad, (nearest, farthest))
         return {
             "beams": {name: self._beam_log(name, rows) for name in near.lasers},
             "cameras": dict.fromkeys(near.endoscopes, camera),
@@ -330,7 +333,7 @@ class EpisodeRecorder:
         power = burnt / self.task.world.config.dt_s
         return BeamLog(power, rows[f"end/{name}"], rows[f"hits/{name}"])
 
-    def _paths(self, near: SceneEngine | None) -> dict[str, np.ndarray]:
+    def _paths(self, near: SceneEngine | None) -> dict[str, Any]:
         """The paths of this episode's lesion, as fields of the log."""
         if near is None:
             return {"path_mm": np.zeros((0, 3), np.float32)}

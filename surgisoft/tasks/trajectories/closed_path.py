@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -78,7 +79,7 @@ class RingCut:
         """
         return self.start + self.direction * (self.done + ahead) / steps
 
-    def after(self, fired: Tensor) -> RingCut:
+    def after(self, fired: Tensor) -> Self:
         """The cut one step later; the reference moves where the beam was on, fired (B,) bool."""
         return replace(self, done=self.done + fired, fired=fired)
 

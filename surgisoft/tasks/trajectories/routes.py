@@ -38,8 +38,12 @@ class RouteProgress:
         place = (self.done + ahead).remainder(self.steps)
         return self.route.gather(1, place[:, None])[:, 0]
 
-    def after(self, fired: Tensor, moved: Tensor) -> RouteProgress:
-        """The route one step later, where the beam was on, fired (B,), or the reference moved."""
+    def after(self, fired: Tensor, moved: Tensor | None = None) -> RouteProgress:
+        """The route one step later, in which the beam was on where fired (B,) bool is set.
+
+        moved: (B,) bool, where the reference moved; None: where the beam was on.
+        """
+        moved = fired if moved is None else moved
         return replace(self, done=self.done + moved, fired=fired)
 
 

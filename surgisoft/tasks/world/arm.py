@@ -265,7 +265,7 @@ class ModelArm:
         # A model of commanded pressure has the pumps' lag in it already.
         late = spec.actuation == "measured"
         self.pneumatics = pneumatics if late else replace(pneumatics, tau_s=0.0)
-        row = {"dtype": torch.float32, "device": device}
+        row: dict[str, Any] = {"dtype": torch.float32, "device": device}
         self.low, self.high = torch.tensor(spec.low, **row), torch.tensor(spec.high, **row)
         self.first = torch.tensor(start, **row)
         self.pose = mounted.pose.to(**row)
@@ -482,6 +482,17 @@ class ModelArm:
         )
         return line, direction
 
+    def alone(self, part: ArmPart, dt_s: float) -> LoneArm | None:
+        """Steps of one environment's arm in kept arrays; None where the reference has to step it.
+
+        It has to where the model cannot be compiled, where measurements have noise, and where an
+        observer estimates the key points.
+        """
+        vary = self.vary
+        plain = self.observer.raw and vary.noise_mm == vary.noise_kPa == 0.0
+        plain = plain and part.plant is None and part.belief is None and len(part.command) == 1
+        return LoneArm(self, self._compiled, part, dt_s) if plain and self._compiled else None
+
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
         """Lowest and highest pressures (B, m) kPa that the pumps can reach in dt_s seconds."""
         pump = self.pneumatics
@@ -554,6 +565,73 @@ class ModelArm:
         memory, now = self._learner.updated(belief.adaptation, off @ turn, pressure)
         offset = self._learner.expected(memory, pressure) @ turn.mT
         return now @ turn.mT, replace(belief, adaptation=memory, offset_mm=offset)
+
+
+class LoneArm:
+    """A `ModelArm` of one environment: it steps in arrays that are allocated once.
+
+    At a batch of one a tensor operation costs more than its arithmetic, so the compiled loops of
+    `ModelArm.step` are called here with arrays that are kept. The arrays have the batch in front.
+    """
+
+    def __init__(self, arm: ModelArm, step: CompiledStep, part: ArmPart, dt_s: float):
+        self._part, backbone = part, arm.backbone
+        self.command, self.pressure, queue, self.delay, self.gain, self.mount = (
+            _copied(t)
+            for t in (part.command, part.pressure, part.queue, part.delay, part.gain, part.mount)
+        )
+        self._queue = queue
+        self.action = np.zeros_like(self.command)
+        """(1, m) kPa: the action of the next step, written by the caller."""
+        self.beside = np.empty_like(self.command)
+        """(1, m) kPa: the model's actuation."""
+        self.model = step.alone(part.arm, self.beside)
+        self.points_mm, self.line_mm, self.tip_direction = (
+            _copied(t) for t in (part.points_mm, part.line_mm, part.tip_direction)
+        )
+        self.tip_mm = self.points_mm[:, -1]
+        """(1, 3) mm: the last key point."""
+        pump = arm.pneumatics
+        self._drive = (
+            *(self.command, self.pressure, queue, self.delay, self.gain, self.action),
+            *(arm.low.numpy(), arm.high.numpy()),
+            *(np.float32(pump.step_kPa), np.float32(pump.share(dt_s)), self.beside),
+            # The loop reads each entry before it writes it.
+            *(self.command, self.pressure, queue, self.beside),
+        )
+        self._body = (
+            *(self.points_mm, self.mount, arm.shaft.numpy(), backbone.position.numpy()),
+            *(backbone.derivative[-1].contiguous().numpy(), self.line_mm, self.tip_direction),
+        )
+
+    def step(self) -> None:
+        """Advance one step with the changes of pressure in `action`."""
+        drive(*self._drive)
+        self.model.step()
+        place(self.model.points_mm, self.mount, self.points_mm)
+        draw_body(*self._body)
+
+    @property
+    def part(self) -> ArmPart:
+        """A copy of the present state."""
+        held = {
+            "command": self.command,
+            "pressure": self.pressure,
+            "queue": self._queue,
+            "points_mm": self.points_mm,
+            "line_mm": self.line_mm,
+            "tip_direction": self.tip_direction,
+        }
+        copies: dict[str, Any] = {
+            name: torch.from_numpy(array.copy()) for name, array in held.items()
+        }
+        seen: dict[str, Any] = {"seen_mm": copies["points_mm"], "seen_kPa": copies["pressure"]}
+        return replace(self._part, arm=self.model.state, **copies, **seen)
+
+
+def _copied(tensor: Tensor) -> np.ndarray:
+    """A copy of a tensor as a contiguous array."""
+    return tensor.detach().contiguous().numpy().copy()
 
 
 def _placed(points: Tensor, mount: Tensor) -> Tensor:

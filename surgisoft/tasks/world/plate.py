@@ -104,6 +104,7 @@ def _along_routes(world: World, arm: Arm, pressure: Tensor) -> tuple[Tensor, Ten
     steps = arm.first + share * (pressure[:, None] - arm.first)
     bodies = arm.settled(steps.flatten(0, 1))
     lines = arm.backbone.centreline(bodies)
+    assert world.scene is not None, "the plate"
     clear = world.scene.geometry.clearance({"arm": lines}).least_mm
     return bodies[:, -1].unflatten(0, (-1, ROUTE_POINTS)), clear.unflatten(
         0, (-1, ROUTE_POINTS)

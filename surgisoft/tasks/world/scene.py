@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -12,16 +13,17 @@ from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.scene.ablation import AblationMap, AblationState, Tissue
+from surgisoft.scene.ablation import RingReport as RingReport
 from surgisoft.scene.batched import BatchedScene
-from surgisoft.scene.camera import View, seen_from
+from surgisoft.scene.camera import LIFT_MM, SHORT_MM, View, seen_from
 from surgisoft.scene.capsules import BatchClearance, segment_distance
 from surgisoft.scene.collision import ExactScene
 from surgisoft.scene.folder import Scene
 from surgisoft.scene.mesh import Body
 from surgisoft.scene.moving import Placement
-from surgisoft.scene.rays import RayHit
+from surgisoft.scene.rays import RayHit, Struck
 from surgisoft.scene.spec import PHANTOM as PHANTOM
-from surgisoft.tasks.world.arm import ArmPart, Randomisation
+from surgisoft.tasks.world.arm import ArmPart, LoneArm, Randomisation
 from surgisoft.tasks.world.pytree import overwritable
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.respiration import Breaths, OrganMotion, Respiration
@@ -65,6 +67,8 @@ class SceneState:
     task sets it where its target moves, and it begins with the lesion's number."""
     breaths: Breaths | None = None
     """Respiration of the organ; None: it does not move."""
+    measured: dict[str, Tensor] = field(default_factory=dict)
+    """Signals (B,) by name, where the scene is not simulated but measured; see `base.Signal`."""
     donated: bool = False
     """Whether the next step or reset may overwrite this state's dose map instead of copying it
     (buffer donation). Only the owner of the state sets it, see `base.Episodes`."""
@@ -86,13 +90,6 @@ def only(by_arm: Mapping[str, Item], tool: str) -> Item:
         names = ", ".join(by_arm) or "none"
         raise InputError(f"arms with the tool '{tool}': {names}; expected one, or an arm's name")
     return next(iter(by_arm.values()))
-
-
-def measured_view(fraction: Tensor, endoscope: str = ENDOSCOPE) -> SceneState:
-    """A scene of which only the share (B,) of the ring that an endoscope sees is known."""
-    unknown = torch.full_like(fraction, torch.nan)
-    points = unknown[:, None].isfinite()
-    return SceneState(views={endoscope: View(points, points, fraction, *3 * (unknown,))})
 
 
 def measured_clearance(least_mm: Tensor) -> SceneState:
@@ -194,7 +191,7 @@ class SceneEngine:
         scene = self._look(parts, lesion, lesion, breaths)
         if not self.lasers:
             return stream, scene
-        dose = self.ablation.start(*self._beams(scene, parts), lesion)
+        dose = self.ablation.start(*self._beams(scene, parts), ring=lesion)
         lit = {name: torch.zeros_like(lesion, dtype=torch.bool) for name in self.lasers}
         return stream, replace(scene, dose=dose, lit=lit)
 
@@ -207,14 +204,26 @@ class SceneEngine:
     ) -> SceneState:
         """The scene after the arms moved and the beams swept with `power_w` for dt_s."""
         breaths = None if scene.breaths is None else scene.breaths.after(dt_s)
-        after = self._look(parts, scene.lesion, scene.watched, breaths)
+        lesion, watched = scene.lesion, scene.watched
+        assert lesion is not None, "a state of `start` has a lesion"
+        assert watched is not None, "a state of `start` has what is watched"
+        after = self._look(parts, lesion, watched, breaths)
         if scene.dose is None:
             return replace(after, donated=scene.donated)
-        beams, power = self._beams(after, parts), self._power(power_w, scene.lesion)
+        beams, power = self._beams(after, parts), self._power(power_w, lesion)
         in_place = scene.donated and overwritable(scene.dose.dose)
-        dose = self.ablation.advance(scene.dose, *beams, power, dt_s, in_place)
-        lit = self._lit(power, scene.lesion)
+        dose = self.ablation.advance(
+            scene.dose, *beams, power_w=power, dt_s=dt_s, in_place=in_place
+        )
+        lit = self._lit(power, lesion)
         return replace(after, dose=dose, lit=lit, donated=scene.donated)
+
+    def alone(self, scene: SceneState, arms: Mapping[str, LoneArm]) -> LoneSceneEngine | None:
+        """The scene of a state's only environment; None where only `step` can advance it."""
+        still = self.motion is None and self.geometry.compiled and len(arms) > 1
+        if not still or len(self.lasers) != 1 or len(self.endoscopes) != 1 or scene.dose is None:
+            return None
+        return LoneSceneEngine(self, scene, arms)
 
     def fresh_dose(
         self,
@@ -226,7 +235,7 @@ class SceneEngine:
         """Replace the tissue by untouched tissue where mask (B,) is set, under the scene's beam."""
         beams = self._beams(scene, parts)
         in_place = scene.donated and overwritable(dose.dose)
-        return self.ablation.reset(dose, mask, *beams, in_place, scene.lesion)
+        return self.ablation.reset(dose, mask, *beams, in_place=in_place, ring=scene.lesion)
 
     def placement(self, breaths: Breaths | None, ahead_s: float = 0.0) -> Placement | None:
         """Where the moving bodies are, `ahead_s` seconds from now; None where nothing moves."""
@@ -292,7 +301,9 @@ class SceneEngine:
         moved = {} if poses is None else {"poses": poses}
         return seen_from(self.geometry, self.work_camera, *at, *ring, lines, own=name, **moved)
 
-    def _beams(self, scene: SceneState, parts: Mapping[str, ArmPart]) -> tuple[Tensor, ...]:
+    def _beams(
+        self, scene: SceneState, parts: Mapping[str, ArmPart]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Ends (B, 3), directions (B, 3) and whether it is on the organ (B,), of one laser's beam.
 
         With L lasers (B, L, 3), (B, L, 3) and (B, L), in the order of `lasers`.
@@ -308,7 +319,8 @@ class SceneEngine:
             each.append((point, aim, on))
         if len(each) == 1:
             return each[0]
-        return tuple(torch.stack(of, 1) for of in zip(*each, strict=True))
+        points, aims, on_organ = zip(*each, strict=True)
+        return torch.stack(points, 1), torch.stack(aims, 1), torch.stack(on_organ, 1)
 
     def _lit(self, power: float | Tensor, like: Tensor) -> dict[str, Tensor]:
         """Whether each laser burns with a power as `_power` gives it; `like` is (B,)."""
@@ -326,6 +338,101 @@ class SceneEngine:
             return each[0]
         held = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in each)
         return torch.stack([one.expand(len(like)) for one in held], 1)
+
+
+class LoneSceneEngine:
+    """The scene of one environment whose bodies do not move, in kept arrays.
+
+    Clearance and the beam's end come from the engine that the task's configuration names, lines of
+    sight from the batched one, as in `SceneEngine`. The arrays have a batch of one in front.
+    """
+
+    def __init__(self, engine: SceneEngine, scene: SceneState, arms: Mapping[str, LoneArm]):
+        assert scene.lesion is not None
+        assert scene.watched is not None
+        assert scene.dose is not None
+        self._engine, self._scene = engine, scene
+        laser, eye = engine.lasers[0], engine.endoscopes[0]
+        lines = {name: arm.line_mm for name, arm in arms.items()}
+        sight = engine.geometry.alone(lines)
+        own = engine.collision is engine.geometry
+        self.collision = sight if own else engine.collision.alone(lines)
+        self._aim = arms[laser].tip_direction
+        self.beam = self.collision.beam(arms[laser].tip_mm, self._aim, engine.beam_mm, laser)
+        camera, watched = engine.work_camera, int(scene.watched[0])
+        nearest, farthest = (float(far) for far in camera.range_mm)
+        picture = (LIFT_MM, 0.5 * camera.fov_rad, nearest, farthest)
+        points, normals = (
+            t[watched][None].contiguous().numpy() for t in (engine.looks_mm, engine.look_normals)
+        )
+        at = (arms[eye].tip_mm, arms[eye].tip_direction)
+        self._look = sight.look(*at, points, normals, picture, SHORT_MM, eye)
+        self.dose = engine.ablation.alone(scene.dose)
+        self._lit = bool(scene.lit[laser][0])
+        self._find()
+
+    def step(self, power_w: float, dt_s: float) -> None:
+        """The arms have moved, and the beam swept with power_w for dt_s."""
+        self._find()
+        on = self.on_organ and self.beam.body[0] == self._engine.organ
+        self.dose.advance(self.beam.point_mm, self._aim, on, power_w, dt_s)
+        self._lit = power_w > 0.0
+
+    def _find(self) -> None:
+        self.collision.clearance()
+        self.beam.cast()
+        self.view = self._look()
+
+    @property
+    def on_organ(self) -> bool:
+        """Whether the beam meets the organ."""
+        return bool(self.beam.struck[0] == Struck.ORGAN)
+
+    @property
+    def least_mm(self) -> float:
+        """Least clearance to bodies and between arms, mm."""
+        found = self.collision
+        return float(min(found.bodies_mm.min(), found.arms_mm.min()))
+
+    @property
+    def collides(self) -> bool:
+        """An arm touches a body, another arm or itself."""
+        found = self.collision
+        return bool(min(found.bodies_mm.min(), found.arms_mm.min(), found.self_mm.min()) < 0.0)
+
+    @property
+    def state(self) -> SceneState:
+        """A copy of the present state."""
+        found, beam, view = self.collision, self.beam, self.view
+        names = ("struck", "body", "face", "distance_mm", "point_mm", "normal", "incidence_rad")
+        hit = RayHit(**{name: _tensor(getattr(beam, name)) for name in names})
+        visible = _tensor(view.visible)
+        error, reach = _tensor(view.middle).unbind(1)
+        laser, eye = self._engine.lasers[0], self._engine.endoscopes[0]
+        return replace(
+            self._scene,
+            clearance=BatchClearance(
+                *map(_tensor, (found.bodies_mm, found.arms_mm, found.self_mm))
+            ),
+            hits={laser: hit},
+            dose=self.dose.state,
+            views={
+                eye: View(
+                    visible=visible,
+                    hidden=_tensor(view.wanted) & ~visible,
+                    fraction=visible.float().mean(-1),
+                    axis_error_rad=error,
+                    axis_error_mm=reach * error.clamp(0.0, 0.5 * math.pi).sin(),
+                    distance_mm=reach,
+                )
+            },
+            lit={laser: torch.tensor([self._lit])},
+        )
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    """A copy of an array as a tensor."""
+    return torch.from_numpy(array.copy())
 
 
 class ObstacleEngine:

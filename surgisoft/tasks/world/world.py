@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from surgisoft.surrogate.model import ArmModel
 from surgisoft.tasks.world.arm import (
     Arm,
     ArmPart,
+    LoneArm,
     ModelArm,
     Mounted,
     Pneumatics,
@@ -222,6 +224,60 @@ class World:
             scene = self.scene.step(scene, parts, power_w, dt_s)
         failed = state.failed | _not_finite(parts)
         return WorldState(stream, state.steps + 1, parts, scene, failed, out_mm)
+
+
+class LoneWorld:
+    """One environment of a world with a laser and an endoscope, stepped in kept arrays.
+
+    At a batch of one the cost of a step is that of its calls and not of its arithmetic. This world
+    calls the compiled loops of `World.step` with arrays that are allocated once, and makes tensors
+    only where a state is asked for.
+    """
+
+    def __init__(self, world: World, state: WorldState, arms: dict[str, LoneArm], scene):
+        self._state, self.dt_s = state, world.config.dt_s
+        self.arms, self.scene = arms, scene
+        self.steps = int(state.steps[0])
+        """Steps since the episode began."""
+        self.failed = bool(state.failed[0])
+        """An arm is not finite."""
+
+    @classmethod
+    def of(cls, world: World, state: WorldState) -> LoneWorld | None:
+        """The world of a state's only environment; None where only `World.step` can advance it."""
+        still = world.feed is None and not world.passive
+        if not still or len(state.steps) != 1 or world.device.type != "cpu":
+            return None
+        if not isinstance(world.scene, SceneEngine):
+            return None
+        arms: dict[str, LoneArm] = {}
+        for name, arm in world.arms.items():
+            lone = arm.alone(state.arms[name], world.config.dt_s) if type(arm) is ModelArm else None
+            if lone is None:
+                return None
+            arms[name] = lone
+        scene = world.scene.alone(state.scene, arms)
+        return None if scene is None else cls(world, state, arms, scene)
+
+    def step(self, actions: Mapping[str, np.ndarray], power_w: float) -> None:
+        """Advance by one step; actions: arm's name -> (m,) kPa."""
+        for name, arm in self.arms.items():
+            arm.action[0] = actions[name]
+            arm.step()
+            self.failed = self.failed or not math.isfinite(arm.points_mm.sum())
+        self.scene.step(power_w, self.dt_s)
+        self.steps += 1
+
+    @property
+    def state(self) -> WorldState:
+        """A copy of the present state."""
+        return replace(
+            self._state,
+            steps=torch.full_like(self._state.steps, self.steps),
+            arms={name: arm.part for name, arm in self.arms.items()},
+            scene=self.scene.state,
+            failed=torch.full_like(self._state.failed, self.failed),
+        )
 
 
 def fed(part: ArmPart, move_mm: Tensor) -> ArmPart:

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from surgisoft.apart import packed, read_apart, unpacked
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
+from surgisoft.measurement.tables import MOST_PACKED, MOST_UNPACKED
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
@@ -55,6 +57,13 @@ def _read_matlab(path: Path, role: FileRole) -> RawTable:
         head = file.read(USER_BLOCK + len(HDF5_MAGIC))
     if HDF5_MAGIC in (head[: len(HDF5_MAGIC)], head[USER_BLOCK:]):
         return _read_hdf5(path, role)
+    names, found = unpacked(read_apart(__name__, path, "a MATLAB file"))
+    return _table(path, role, dict(zip(names, found, strict=True)))
+
+
+def as_bytes(path: Path) -> bytes:
+    """Paths and arrays of a MATLAB file before version 7.3; SciPy may end the process on a bad
+    one."""
     from scipy.io import loadmat
 
     try:
@@ -64,7 +73,8 @@ def _read_matlab(path: Path, role: FileRole) -> RawTable:
             f"{path}: cannot be read as a MATLAB file ({type(error).__name__}: {error})"
         ) from None
     fields = {name: value for name, value in content.items() if not name.startswith("__")}
-    return _table(path, role, dict(_inside(fields, "")))
+    found = dict(_inside(fields, ""))
+    return packed(list(found), *found.values())
 
 
 def _hdf5(path: Path) -> Iterator[tuple[str, np.ndarray]]:
@@ -77,10 +87,21 @@ def _hdf5(path: Path) -> Iterator[tuple[str, np.ndarray]]:
             "pip install 'surgisoft[lab]'"
         ) from None
     found: list[tuple[str, np.ndarray]] = []
+    left = max(MOST_UNPACKED, MOST_PACKED * path.stat().st_size)
 
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.shape is not None:
-            found.extend(_inside(item[()], name.replace("/", ".")))
+        nonlocal left
+        if not isinstance(item, h5py.Dataset) or item.shape is None or item.dtype.hasobject:
+            return
+        if item.external or item.is_virtual:  # the numbers are in other files
+            return
+        left -= item.nbytes
+        if left < 0:
+            raise InputError(
+                f"{path}: '{name}' claims {item.nbytes} bytes, in a file of "
+                f"{path.stat().st_size}; expected an HDF5 file with measurements"
+            )
+        found.extend(_inside(item[()], name.replace("/", ".")))
 
     try:
         with h5py.File(path, "r") as file:

@@ -5,11 +5,13 @@ those that a frame lost (residual -1) are missing. Analog channels are columns b
 value for each frame: the mean of the samples in it. The column `t_s` counts from the first frame.
 """
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from surgisoft.apart import packed, read_apart, unpacked
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
 from surgisoft.measurement.importing.readers.arrays import Arrays
@@ -27,15 +29,24 @@ def _is_c3d(path: Path) -> bool:
 
 
 def _read(path: Path, _: FileRole) -> RawTable:
-    try:
-        import ezc3d
-    except ImportError:
+    if find_spec("ezc3d") is None:
         raise InputError(
             f"{path}: a C3D file needs the package ezc3d, which is not installed: "
             "pip install 'surgisoft[lab]'"
-        ) from None
+        )
     if not _is_c3d(path):
         raise InputError(f"{path}: its first bytes are not those of a C3D file")
+    facts, (values,) = unpacked(read_apart(__name__, path, "a C3D file"))
+    cells = Arrays(path, facts["names"], values)
+    return RawTable(
+        path, facts["names"], cells, unit=facts["unit"], markers=tuple(facts["markers"])
+    )
+
+
+def as_bytes(path: Path) -> bytes:
+    """Names, unit, markers and cells of a file; the library may end the process on a bad one."""
+    import ezc3d
+
     try:
         content = ezc3d.c3d(str(path))
     except Exception as error:  # the library raises what its parser meets
@@ -59,9 +70,8 @@ def _read(path: Path, _: FileRole) -> RawTable:
         names += _labels(analog, len(voltages), "analog")
         columns.append(voltages.reshape(len(voltages), frames, -1).mean(axis=2).T)
     units = [text.strip() for text in point.get("UNITS", {}).get("value", [])]
-    values = np.hstack(columns)
-    cells = Arrays(path, names, values)
-    return RawTable(path, names, cells, unit=units[0] if units else "mm", markers=tuple(markers))
+    facts = {"names": names, "markers": markers, "unit": units[0] if units else "mm"}
+    return packed(facts, np.hstack(columns))
 
 
 def _labels(group: Any, count: int, other: str) -> list[str]:

@@ -13,6 +13,8 @@ within half the usual step.
 
 import json
 import math
+import os
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
+from surgisoft.measurement.tables import MOST_PACKED, MOST_UNPACKED
 
 MAGIC = b"\x89MCAP0\r\n"
 """First bytes of an MCAP file."""
@@ -28,6 +31,12 @@ TIME = "t_s"
 """Column of the time."""
 NAMED_BY = ("child_frame_id", "rigid_body_name", "marker_name", "name")
 """Fields by which the items of a list are called, in order of preference."""
+RECORD, CHUNK, CHUNK_HEAD = struct.Struct("<BQ"), 6, struct.Struct("<QQQ")
+"""Begin of a record (kind, length), the kind of a chunk, and the begin of a chunk (first and last
+time, unpacked size): MCAP specification, https://mcap.dev/spec."""
+MOST_CELLS = 1 << 27
+"""Most cells, rows times columns, of a topic: 1 GiB. Messages whose fields have ever other names
+would have as many columns as messages."""
 LONGEST = 64
 """Items of a list of plain numbers that become columns; images and point clouds have more."""
 
@@ -91,11 +100,45 @@ def _matched(t_s: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _topics(path: Path) -> list[str]:
     """Names of the topics of a file."""
     with path.open("rb") as file:
-        summary = _reader(file).get_summary()
+        summary = _reader(path, file).get_summary()
     return sorted({c.topic for c in summary.channels.values()}) if summary else []
 
 
-def _reader(file) -> Any:
+class _Bounded:
+    """A file whose reads ask for no more than is left of it, whatever a length in it claims."""
+
+    def __init__(self, file: Any) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+
+    def read(self, size: int = -1) -> bytes:
+        """At most so many bytes; all that are left where the size is negative."""
+        left = max(0, self._size - self._file.tell())
+        return self._file.read(left if size < 0 else min(size, left))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def _check_chunks(path: Path, file: Any) -> None:
+    """Raise InputError for a chunk that claims to unpack to more than it can."""
+    file.seek(len(MAGIC))
+    while len(head := file.read(RECORD.size)) == RECORD.size:
+        kind, size = RECORD.unpack(head)
+        begin = file.tell()
+        if kind == CHUNK and len(about := file.read(CHUNK_HEAD.size)) == CHUNK_HEAD.size:
+            claimed = CHUNK_HEAD.unpack(about)[2]
+            if claimed > max(MOST_UNPACKED, MOST_PACKED * size):
+                raise InputError(
+                    f"{path}: a chunk of {size} bytes claims to unpack to {claimed}; expected an "
+                    "MCAP file that is whole"
+                )
+        if size > path.stat().st_size:
+            break
+        file.seek(begin + size)
+    file.seek(0)
+
+
+def _reader(path: Path, file: Any) -> Any:
     try:
         from mcap.reader import make_reader
     except ImportError:
@@ -103,7 +146,9 @@ def _reader(file) -> Any:
             "an MCAP file needs the packages mcap and mcap-ros2-support, which are not installed: "
             "pip install 'surgisoft[mcap]'"
         ) from None
-    return make_reader(file)
+    _check_chunks(path, file)
+    bounded: Any = _Bounded(file)
+    return make_reader(bounded)
 
 
 def _table(path: Path, topic: str) -> tuple[list[str], np.ndarray]:
@@ -120,6 +165,11 @@ def _table(path: Path, topic: str) -> tuple[list[str], np.ndarray]:
         known = ", ".join(_topics(path)) or "none"
         raise InputError(f"{path}: no message of the topic '{topic}'; the file has {known}")
     names = list(dict.fromkeys(name for row in rows for name in row))
+    if len(names) * len(rows) > MOST_CELLS:
+        raise InputError(
+            f"{path}: topic '{topic}' has {len(rows)} messages with {len(names)} fields of "
+            "different names; expected the same fields in each"
+        )
     values = np.array([[row.get(name, math.nan) for name in names] for row in rows], np.float64)
     return names, values
 
@@ -128,7 +178,7 @@ def _messages(path: Path, topic: str) -> Iterator[tuple[float, Any]]:
     """Time of the log [s] and content of each message of a topic, in the order of the log."""
     decoders: dict[int, Any] = {}
     with path.open("rb") as file:
-        for schema, channel, message in _reader(file).iter_messages(topics=[topic]):
+        for schema, channel, message in _reader(path, file).iter_messages(topics=[topic]):
             if channel.id not in decoders:
                 decoders[channel.id] = _decoder(path, channel, schema)
             yield 1e-9 * message.log_time, decoders[channel.id](message.data)

@@ -1,0 +1,61 @@
+"""Reading in a process of its own: whatever its end, it is one line here."""
+
+import signal
+
+import numpy as np
+import pytest
+
+from surgisoft.apart import read_apart, started, unpacked
+from surgisoft.errors import InputError
+from tests import aborting
+
+
+def read(path):
+    return read_apart(aborting.__name__, path, "a test's file")
+
+
+def test_what_is_read_comes_back(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("whole")
+    facts, (numbers, table) = unpacked(read(path))
+    assert facts == {"path": "a.txt"}
+    np.testing.assert_array_equal(numbers, [0.0, 1.0, 2.0])
+    assert table.tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        ("segmentation fault", "cannot be read as a test's file (its process ended with status -"),
+        ("exception", "cannot be read as a test's file (last line)"),
+        ("memory", "Unable to allocate 32.0 GiB"),
+        ("refused", "has no frame; expected one"),
+    ],
+)
+def test_every_end_is_one_line(tmp_path, way, said):
+    path = tmp_path / "a.txt"
+    path.write_text(way)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert said in str(caught.value)
+    assert str(caught.value).count(str(path)) == 1
+
+
+def test_a_reader_without_end_is_ended(tmp_path):
+    """Processor time is limited by the size of the file: 4 s for a small one."""
+    path = tmp_path / "a.txt"
+    path.write_text("endless")
+    with pytest.raises(InputError, match=f"status -{signal.SIGXCPU.value}"):
+        read(path)
+
+
+def test_nothing_that_a_process_writes_is_run(tmp_path):
+    """An array of Python objects, which would be unpickled, is refused."""
+    path = tmp_path / "a.txt"
+    path.write_text("whole")
+    out = started(aborting.__name__, path).out
+    assert unpacked(out)
+    np.savez(tmp_path / "b.npz", facts=np.array([object()]))
+    with pytest.raises(ValueError, match="allow_pickle"):
+        unpacked((tmp_path / "b.npz").read_bytes())

@@ -485,12 +485,13 @@ class ModelArm:
     def alone(self, part: ArmPart, dt_s: float) -> LoneArm | None:
         """Steps of one environment's arm in kept arrays; None where the reference has to step it.
 
-        It has to where the model cannot be compiled, where measurements have noise, and where an
-        observer estimates the key points.
+        It has to where the model cannot be compiled, where measurements have noise, where an
+        observer estimates the key points, and where the arm has random effects.
         """
         vary = self.vary
         plain = self.observer.raw and vary.noise_mm == vary.noise_kPa == 0.0
-        plain = plain and part.plant is None and part.belief is None and len(part.command) == 1
+        plain = plain and part.plant is None and part.belief is None and part.factors is None
+        plain = plain and len(part.command) == 1
         return LoneArm(self, self._compiled, part, dt_s) if plain and self._compiled else None
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:

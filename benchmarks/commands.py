@@ -1,16 +1,20 @@
 """The sub-commands of `surgisoft benchmark`: long studies whose results are committed."""
 
+import contextlib
 import datetime
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import JsonFile
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_atomically, write_json
+from surgisoft.progress import Progress
 
 app = typer.Typer(help="Long studies whose results are committed.", no_args_is_help=True)
 
@@ -21,6 +25,17 @@ Output = Annotated[
     typer.Option("-o", "--output", metavar="FILE", help="Write the results to this file."),
 ]
 """Option of all studies."""
+
+
+@contextlib.contextmanager
+def _kept(title: str, work: Path) -> Iterator[Progress]:
+    """Progress of a study that keeps what is complete in a folder, and says so after Ctrl-C."""
+    try:
+        with progress(title) as report:
+            yield report
+    except KeyboardInterrupt:
+        warn(f"the same command uses again what is complete in {work}")
+        raise
 
 
 def _numbers(option: str, text: str) -> list[int]:
@@ -98,7 +113,7 @@ def diagnosis(
 
     numbers = _numbers("--robots", robots)
     some = cases(numbers, count, seed)
-    with progress("diagnosis") as report:
+    with _kept("diagnosis", work) as report:
         outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
     command += f" --amend {amend}"
@@ -130,7 +145,7 @@ def intervals(
     from benchmarks.intervals import cases, markdown, run
 
     some = cases(count, clean, tuple(_numbers("--robots", robots)))
-    with progress("intervals") as report:
+    with _kept("intervals", work) as report:
         outcomes = run(some, work, processes, report)
     command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
     _show("Intervals of amend", command, markdown(outcomes), output)
@@ -180,7 +195,7 @@ def decision(
 
     check_folder(work)
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
-    with progress("decision") as report:
+    with _kept("decision", work) as report:
         some, aside, values = run(
             plan, count, seed, cases or [], work, processes, report, judge or []
         )
@@ -215,7 +230,7 @@ def setup_faults(
     from benchmarks.setup_faults import markdown, run
 
     numbers = _numbers("--robots", robots)
-    with progress("setup-faults") as report:
+    with _kept("setup-faults", work) as report:
         outcomes = run(numbers, folders or [], count, seed, work, processes, report)
     command = f"surgisoft benchmark setup-faults --robots {robots} --count {count} --seed {seed}"
     command += "".join(f" --source {folder.name}" for folder in folders or [])
@@ -252,7 +267,7 @@ def hidden_effect(
     check_folder(images)
     config = StudyConfig(robot_seed, strength, steps, seed, episodes)
     torch.set_num_threads(1)
-    with progress("hidden-effect") as report:
+    with _kept("hidden-effect", work) as report:
         outcomes = run(effects.split(","), config, work, report)
     command = (
         f"surgisoft benchmark hidden-effect --effects {effects} --robot-seed {robot_seed} "
@@ -293,7 +308,7 @@ def control(
     chosen = tuple(tasks.split(",")) if tasks else TASKS
     config = ControlConfig(chosen, numbers, episodes, rig_episodes)
     torch.set_num_threads(1)
-    with progress("control") as report:
+    with _kept("control", runs) as report:
         results = run(config, runs, report)
     command = f"surgisoft benchmark control --seeds {seeds}"
     command += f" --tasks {tasks}" if tasks else ""
@@ -408,7 +423,7 @@ def live(
     check_free(json_file, "clean")
     check_folder(models)
     numbers = _numbers("--robots", robots)
-    with progress("live") as report:
+    with _kept("live", models) as report:
         clean, changes = run(numbers, hours, models, processes, report)
     if json_file:
         both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
@@ -451,7 +466,7 @@ def real(
     check_folder(work)
     some = load_entries(entries or [], only)
     folder = data_folder(data)
-    with progress("real") as report:
+    with _kept("real", work) as report:
         outcomes = run(some, folder, work, report)
     command = " ".join(
         ["surgisoft benchmark real", *map(str, entries or []), "--data FOLDER"]
@@ -512,7 +527,7 @@ def cases(
     some = [case for case in found if only is None or only in str(case.place)]
     if not some:
         raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
-    with progress("cases") as report:
+    with _kept("cases", folder) as report:
         judged = run(some, processes, report)
     if json_file:
         write_json(json_file, to_json(judged))

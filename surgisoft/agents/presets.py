@@ -192,6 +192,22 @@ def steps_for(name: str, task: str) -> int:
     return PAPER_STEPS if steps is None else steps
 
 
+LEAST_ENVS = 64
+"""Fewest episodes side by side that a short training is given by itself."""
+
+
+def envs_for(name: str, task: str, steps: int) -> int:
+    """Episodes side by side of a training of so many steps, where none are named.
+
+    A training that is shorter than the task's own runs fewer of them, by powers of two: so it
+    keeps the number of updates, by which the noise falls and on which the final error depends.
+    """
+    envs = preset_for(name, task).envs
+    while envs > LEAST_ENVS and envs * steps_for(name, task) > preset_for(name, task).envs * steps:
+        envs //= 2
+    return envs
+
+
 @dataclass(frozen=True)
 class Plan:
     """One training run."""

@@ -317,6 +317,90 @@ def control(
 
 
 @app.command()
+def robust(
+    policies: Annotated[
+        str,
+        typer.Option(
+            help="Policies, with commas: runs' folders, names of packaged ones, or scripted; the "
+            "first is judged with hidden effects, too."
+        ),
+    ] = "ring,scripted",
+    robots: Annotated[
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 10 served for development.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    own: Annotated[
+        str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each robot.")] = 10,
+    hidden_robots: Annotated[
+        str, typer.Option(help="Robots with hidden effects, with commas; may be empty.")
+    ] = "21,26",
+    hidden_episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes of each hidden effect and robot.")
+    ] = 2,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact/--batched",
+            help="Contact by FCL, or by the engine of training, which is faster.",
+        ),
+    ] = True,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of models and of each case's result.")
+    ] = Path("runs/benchmark-robust"),
+    images: Images = None,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Rings cut on robots that no model knows: each policy with either observer."""
+    from dataclasses import asdict
+
+    import torch
+
+    from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
+
+    check_free(json_file, "cases")
+    check_folder(work)
+    check_folder(images)
+    names = {policy: Path(policy).name for policy in policies.split(",")}
+    methods = tuple(
+        Method(f"{name}, {observer}", policy, observer)
+        for policy, name in names.items()
+        for observer in (FILTER, LEARNS)
+    )
+    best = tuple(method.name for method in methods[:2] if method.observer == LEARNS)
+
+    def seeds(option: str, text: str) -> tuple[int, ...]:
+        return tuple(_numbers(option, text)) if text else ()
+
+    study = Study(
+        methods,
+        seeds("--robots", robots),
+        seeds("--own", own),
+        episodes,
+        best,
+        seeds("--hidden-robots", hidden_robots),
+        hidden_episodes,
+        exact,
+    )
+    torch.set_num_threads(1)
+    with progress("robust") as report:
+        rows, floors = run(study, work, report)
+    if json_file:
+        write_json(json_file, {"cases": [asdict(r) for r in rows]})
+    command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
+    command += f" --robots {robots} --own '{own}' --episodes {episodes}"
+    command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
+    command += "" if exact else " --batched"
+    shown = ""
+    if images:
+        shown = f"\n![robust](../images/{draw(rows, floors, study, images).name})\n"
+    _show(
+        "Rings on robots that took no part", command, markdown(rows, floors, study) + shown, output
+    )
+
+
+@app.command()
 def live(
     robots: Annotated[
         str, typer.Option(help="Seeds of the robots, with commas.")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import surgisoft
 from surgisoft.measurement.protocols import make_protocol

@@ -85,7 +85,8 @@ class Training:
         self.plan, self.task, self.processes = plan, task, processes
         preset, rank = plan.preset, processes.rank
         torch.manual_seed(plan.seed)
-        self.env = JointEnv(task, preset.envs, plan.seed, preset.action_kPa, rank * _FAR)
+        given = (plan.seed, preset.action_kPa, rank * _FAR, preset.privileged)
+        self.env = JointEnv(task, preset.envs, *given)
         self.agents = make_ppo(self.env, preset, processes)
         if processes.count > 1:
             torch.manual_seed(plan.seed + rank * _FAR)

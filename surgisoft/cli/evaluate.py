@@ -199,7 +199,9 @@ def _rig_config(
         rigs=rigs_in(rigs) if rigs else RigConfig().rigs,
         preflight=preflight,
     )
-    return found if observer_gain is None else replace(found, observer_gain=observer_gain)
+    if observer_gain is None:
+        return found
+    return replace(found, observer_gain=observer_gain, adapts=False)
 
 
 def _show(results) -> None:

@@ -434,6 +434,20 @@ def test_weights_of_a_new_training_follow_from_its_seed():
     assert not torch.equal(first(3), first(4))
 
 
+def test_privileged_observations_reach_critics_and_never_actors():
+    """Whatever the simulation knows besides changes the critic's value, and no action."""
+    task = make_task("track_circle", config_for("robust", config_of("track_circle")))
+    env = JointEnv(task, 4, 0, 1.0, privileged=True)
+    (ppo,) = make_ppo(env, replace(TINY, envs=4), Processes()).values()
+    seen = env.get_observations()
+    wide = seen["arm"].shape[1]
+    other = seen.clone()
+    assert other[STATE].shape[1] > wide
+    other[STATE][:, wide:] += 1.0
+    assert torch.equal(ppo.actor(seen), ppo.actor(other))
+    assert not torch.allclose(ppo.critic(seen), ppo.critic(other))
+
+
 @pytest.mark.parametrize(
     ("steps", "envs"),
     [(8_000_000, 1024), (4_000_000, 1024), (3_999_999, 512), (1_000_000, 256), (100, 64)],

@@ -206,13 +206,13 @@ def test_calibrated_probabilities_are_probabilities(missing, known, first, name,
 
 
 def test_no_model_is_off_where_a_paired_difference_is_explained():
-    """What is not in the list has changed otherwise, unless it is as large as what BEFORE does not
-    repeat."""
+    """Nothing has changed up to what BEFORE does not repeat; more than that is not "nothing"."""
     quiet = given_odds(missing=-9.0, network=9.0)
+    assert decide(STATIC, quiet).kind == "surrogate_undertrained"
     assert decide(replace(STATIC, paired=True), quiet).kind == "nothing_missing"
     large = replace(STATIC, paired=True, error_over_validated=3.0)
     assert probabilities(large, quiet).network == 0.0
-    assert decide(large, quiet).kind == "unknown_effect"
+    assert decide(large, quiet).kind == "cannot_tell"
 
 
 def test_a_name_is_given_where_it_is_more_probably_right_than_wrong():

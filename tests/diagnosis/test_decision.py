@@ -16,6 +16,8 @@ from surgisoft.diagnosis.decision import (
     Curve,
     DecisionModel,
     Logistic,
+    Probabilities,
+    chosen,
     claimable,
     content_hash,
     decide,
@@ -235,6 +237,14 @@ def test_a_statement_below_the_least_probability_is_not_made():
     assert decide(GOOD, vague, free).kind == "unknown_effect"
     free = replace(free, least_probability=0.7)
     assert decide(GOOD, vague, free).kind == "cannot_tell"
+
+
+def test_nothing_that_cannot_be_claimed_is_not_called_unknown():
+    """Of 0.4 for "unknown" and 0.55 or 0.35 for "nothing", where the error is too large for it."""
+    for quiet, kind in ((0.55, "cannot_tell"), (0.35, "unknown_effect")):
+        effects = {"creep": 0.6 - quiet}
+        found = chosen(GOOD, Probabilities(quiet, 0.0, 0.4, effects, 0.0, ()))
+        assert found.kind == kind
 
 
 def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():

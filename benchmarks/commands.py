@@ -1,16 +1,20 @@
 """The sub-commands of `surgisoft benchmark`: long studies whose results are committed."""
 
+import contextlib
 import datetime
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import JsonFile
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_atomically, write_json
+from surgisoft.progress import Progress
 
 app = typer.Typer(help="Long studies whose results are committed.", no_args_is_help=True)
 
@@ -21,6 +25,39 @@ Output = Annotated[
     typer.Option("-o", "--output", metavar="FILE", help="Write the results to this file."),
 ]
 """Option of all studies."""
+Processes = Annotated[
+    int, typer.Option(min=1, help="Number of processes that work at the same time.")
+]
+"""Option of the studies with independent cases."""
+Work = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of recordings, models and results in between; what is there is reused.",
+    ),
+]
+"""Option of the studies that can be interrupted."""
+Robots = Annotated[str, typer.Option(help="Seeds of the virtual robots, with commas.")]
+"""Option of the studies on virtual robots."""
+RealData = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
+    ),
+]
+"""Option of the studies on recordings of real robots."""
+
+
+@contextlib.contextmanager
+def _kept(title: str, work: Path) -> Iterator[Progress]:
+    """Progress of a study that keeps what is complete in a folder, and says so after Ctrl-C."""
+    try:
+        with progress(title) as report:
+            yield report
+    except KeyboardInterrupt:
+        warn(f"the same command uses again what is complete in {work}")
+        raise
 
 
 def _numbers(option: str, text: str) -> list[int]:
@@ -49,7 +86,7 @@ def modelling(
         int | None,
         typer.Option(min=64, help="Number of training points; default 13,824, as in the paper."),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Number of fits in parallel.")] = 2,
+    processes: Processes = 2,
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -77,11 +114,8 @@ def diagnosis(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the cases; 1 to 10 served for calibration.")
     ] = 11,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
-    ] = Path("runs/benchmark-diagnosis"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-diagnosis"),
     amend: Annotated[
         int,
         typer.Option(
@@ -98,7 +132,7 @@ def diagnosis(
 
     numbers = _numbers("--robots", robots)
     some = cases(numbers, count, seed)
-    with progress("diagnosis") as report:
+    with _kept("diagnosis", work) as report:
         outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
     command += f" --amend {amend}"
@@ -119,18 +153,15 @@ def intervals(
     clean: Annotated[
         int, typer.Option(min=0, help="Number of recordings of each setting without an effect.")
     ] = 32,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
-    ] = Path("runs/benchmark-intervals"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-intervals"),
     output: Output = None,
 ) -> None:
     """Coverage of the intervals of `amend`, and falls that it claims on clean arms."""
     from benchmarks.intervals import cases, markdown, run
 
     some = cases(count, clean, tuple(_numbers("--robots", robots)))
-    with progress("intervals") as report:
+    with _kept("intervals", work) as report:
         outcomes = run(some, work, processes, report)
     command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
     _show("Intervals of amend", command, markdown(outcomes), output)
@@ -152,21 +183,16 @@ def decision(
             help="Cases that take no part in any fit: judged by the fit to all others.",
         ),
     ] = None,
-    robots: Annotated[
-        str, typer.Option(help="Seeds of the own rig's robots, with commas.")
-    ] = "200,201,202,203,204,205",
+    robots: Robots = "200,201,202,203,204,205",
     undertrained: Annotated[
-        str, typer.Option(help="Those among them with an undertrained model too.")
+        str, typer.Option(help="Robots among them that also get an undertrained model.")
     ] = "200,201,203",
     count: Annotated[
         int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
     ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of models and of each case's evidence."),
-    ] = Path("runs/benchmark-decision"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-decision"),
     asset: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write the decision fitted to all cases to this file."),
@@ -180,7 +206,7 @@ def decision(
 
     check_folder(work)
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
-    with progress("decision") as report:
+    with _kept("decision", work) as report:
         some, aside, values = run(
             plan, count, seed, cases or [], work, processes, report, judge or []
         )
@@ -192,7 +218,7 @@ def decision(
 
 @app.command("setup-faults")
 def setup_faults(
-    robots: Annotated[str, typer.Option(help="Seeds of the robots, with commas.")] = "142,143",
+    robots: Robots = "142,143",
     folders: Annotated[
         list[Path] | None,
         typer.Option(
@@ -205,17 +231,15 @@ def setup_faults(
         int, typer.Option(min=1, help="Number of single faults, and of pairs, of each source.")
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the faults.")] = 1,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of base models and recordings.")
-    ] = Path("runs/benchmark-setup-faults"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-setup-faults"),
     output: Output = None,
 ) -> None:
     """Faults of the set-up in recordings: frames, units, orders, chambers, clocks."""
     from benchmarks.setup_faults import markdown, run
 
     numbers = _numbers("--robots", robots)
-    with progress("setup-faults") as report:
+    with _kept("setup-faults", work) as report:
         outcomes = run(numbers, folders or [], count, seed, work, processes, report)
     command = f"surgisoft benchmark setup-faults --robots {robots} --count {count} --seed {seed}"
     command += "".join(f" --source {folder.name}" for folder in folders or [])
@@ -232,13 +256,7 @@ def hidden_effect(
     steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 2_000_000,
     episodes: Annotated[int, typer.Option(min=2, help="Episodes of each policy.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of training and of episodes.")] = 0,
-    work: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of recordings, models and policies; existing ones are reused.",
-        ),
-    ] = Path("runs/benchmark-hidden-effect"),
+    work: Work = Path("runs/benchmark-hidden-effect"),
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -252,7 +270,7 @@ def hidden_effect(
     check_folder(images)
     config = StudyConfig(robot_seed, strength, steps, seed, episodes)
     torch.set_num_threads(1)
-    with progress("hidden-effect") as report:
+    with _kept("hidden-effect", work) as report:
         outcomes = run(effects.split(","), config, work, report)
     command = (
         f"surgisoft benchmark hidden-effect --effects {effects} --robot-seed {robot_seed} "
@@ -293,7 +311,7 @@ def control(
     chosen = tuple(tasks.split(",")) if tasks else TASKS
     config = ControlConfig(chosen, numbers, episodes, rig_episodes)
     torch.set_num_threads(1)
-    with progress("control") as report:
+    with _kept("control", runs) as report:
         results = run(config, runs, report)
     command = f"surgisoft benchmark control --seeds {seeds}"
     command += f" --tasks {tasks}" if tasks else ""
@@ -302,17 +320,97 @@ def control(
 
 
 @app.command()
-def live(
+def robust(
+    policies: Annotated[
+        str,
+        typer.Option(
+            help="Policies, with commas: runs' folders, names of packaged ones, or scripted; the "
+            "first is judged with hidden effects, too."
+        ),
+    ] = "ring,scripted",
     robots: Annotated[
-        str, typer.Option(help="Seeds of the robots, with commas.")
-    ] = "204,205,206,207",
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 10 served for development.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    own: Annotated[
+        str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each robot.")] = 10,
+    hidden_robots: Annotated[
+        str, typer.Option(help="Robots with hidden effects, with commas; may be empty.")
+    ] = "21,26",
+    hidden_episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes of each hidden effect and robot.")
+    ] = 2,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact/--batched",
+            help="Contact by FCL, or by the engine of training, which is faster.",
+        ),
+    ] = True,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of models and of each case's result.")
+    ] = Path("runs/benchmark-robust"),
+    images: Images = None,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Rings cut on robots that no model knows: each policy with either observer."""
+    from dataclasses import asdict
+
+    import torch
+
+    from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
+
+    check_free(json_file, "cases")
+    check_folder(work)
+    check_folder(images)
+    names = {policy: Path(policy).name for policy in policies.split(",")}
+    methods = tuple(
+        Method(f"{name}, {observer}", policy, observer)
+        for policy, name in names.items()
+        for observer in (FILTER, LEARNS)
+    )
+    best = tuple(method.name for method in methods[:2] if method.observer == LEARNS)
+
+    def seeds(option: str, text: str) -> tuple[int, ...]:
+        return tuple(_numbers(option, text)) if text else ()
+
+    study = Study(
+        methods,
+        seeds("--robots", robots),
+        seeds("--own", own),
+        episodes,
+        best,
+        seeds("--hidden-robots", hidden_robots),
+        hidden_episodes,
+        exact,
+    )
+    torch.set_num_threads(1)
+    with progress("robust") as report:
+        rows, floors = run(study, work, report)
+    if json_file:
+        write_json(json_file, {"cases": [asdict(r) for r in rows]})
+    command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
+    command += f" --robots {robots} --own '{own}' --episodes {episodes}"
+    command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
+    command += "" if exact else " --batched"
+    shown = ""
+    if images:
+        shown = f"\n![robust](../images/{draw(rows, floors, study, images).name})\n"
+    _show(
+        "Rings on robots that took no part", command, markdown(rows, floors, study) + shown, output
+    )
+
+
+@app.command()
+def live(
+    robots: Robots = "204,205,206,207",
     hours: Annotated[
         float, typer.Option(min=0.2, help="Hours of clean rig for each robot and motion.")
     ] = 5.0,
-    models: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
-    ] = Path("runs/benchmark-live"),
-    processes: Annotated[int, typer.Option(min=1, help="Number of recordings in parallel.")] = 2,
+    models: Work = Path("runs/benchmark-live"),
+    processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -324,7 +422,7 @@ def live(
     check_free(json_file, "clean")
     check_folder(models)
     numbers = _numbers("--robots", robots)
-    with progress("live") as report:
+    with _kept("live", models) as report:
         clean, changes = run(numbers, hours, models, processes, report)
     if json_file:
         both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
@@ -342,19 +440,11 @@ def real(
             help="Entries, or folders of them; default: those of the project.",
         ),
     ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
-        ),
-    ] = None,
+    data: RealData = None,
     only: Annotated[
         str | None, typer.Option(metavar="NAME", help="Run this one entry of them.")
     ] = None,
-    work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
-    ] = Path("runs/benchmark-real"),
+    work: Work = Path("runs/benchmark-real"),
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -367,7 +457,7 @@ def real(
     check_folder(work)
     some = load_entries(entries or [], only)
     folder = data_folder(data)
-    with progress("real") as report:
+    with _kept("real", work) as report:
         outcomes = run(some, folder, work, report)
     command = " ".join(
         ["surgisoft benchmark real", *map(str, entries or []), "--data FOLDER"]
@@ -383,13 +473,7 @@ def inject(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the cases.")
     ],
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
-        ),
-    ] = None,
+    data: RealData = None,
     robots: Annotated[
         str | None, typer.Option(help="Robots, with commas; default: all of them.")
     ] = None,
@@ -415,7 +499,7 @@ def cases(
     only: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -428,7 +512,7 @@ def cases(
     some = [case for case in found if only is None or only in str(case.place)]
     if not some:
         raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
-    with progress("cases") as report:
+    with _kept("cases", folder) as report:
         judged = run(some, processes, report)
     if json_file:
         write_json(json_file, to_json(judged))

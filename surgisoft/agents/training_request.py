@@ -11,7 +11,7 @@ from typing import Any
 
 from surgisoft.agents.distributed import processes
 from surgisoft.agents.loggers import TENSORBOARD, check_logger
-from surgisoft.agents.presets import Plan, Preset, config_for, preset_for, steps_for
+from surgisoft.agents.presets import Plan, Preset, config_for, envs_for, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
 from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
@@ -35,7 +35,7 @@ class TrainingRequest:
     minutes: float | None = None
     """Time to train in place of steps, minutes."""
     envs: int | None = None
-    """Episodes side by side; None: the preset's."""
+    """Episodes side by side; None: the preset's, and fewer in a short training."""
     seed: int = 0
     """Seed of weights, noise and episodes."""
     target_error: float | None = None
@@ -55,11 +55,14 @@ class TrainingRequest:
         """Resolve the request to a `Plan`; raises InputError for contradicting options."""
         if self.steps is not None and self.minutes is not None:
             raise InputError(
-                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
-                "training ends by one or the other"
+                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them; "
+                "either of them ends the training"
             )
         config = task_config(self.task, self.config, self.arm, self.scene)
-        numbers = preset_for(self.preset, self.task, envs=self.envs)
+        envs = self.envs
+        if envs is None and self.steps is not None:
+            envs = envs_for(self.preset, self.task, self.steps)
+        numbers = preset_for(self.preset, self.task, envs=envs)
         if self.ppo:
             changed = merged(to_table(numbers), self.ppo)
             numbers = from_table(Preset, changed, Where(COMMAND_LINE, keys=("ppo",)))
@@ -105,7 +108,12 @@ def train(
     logger: str = TENSORBOARD,
     **fields: Any,
 ) -> TrainedRun:
-    """Train the agents of a task with PPO; all of them learn at the same time.
+    """Train the agents of a task at the same time with PPO (Schulman et al. 2017).
+
+    Each agent has its own actor, which sees its own observation, and a critic, which sees those of
+    all agents (centralised training, decentralised execution). Returns the run's folder, which
+    opens without further code, and the result of its last evaluation. Raises InputError before any
+    step for options that do not fit each other.
 
     output: folder of the new run; default `runs/TASK-DATE-TIME`.
     resume_from: folder of an interrupted run that goes on, in place of a task and its fields.

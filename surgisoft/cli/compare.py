@@ -7,7 +7,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import (
     check_model,
     leading_models,
@@ -84,11 +84,11 @@ def compare(
     context = read_context(credibility)
 
     if scale is not None and not replay:
-        raise InputError("--error-scale is that of a replay; add --replay FILE.rrd")
+        raise InputError("--error-scale scales the colours of a replay; add --replay FILE.rrd")
     check_model(model, predictions)
     others, recordings = leading_models(recordings)
     if others and predictions:
-        raise InputError("--predictions: one model only; its predictions take the place of one")
+        raise InputError("--predictions is for one model; leave the other models out")
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
 
@@ -146,8 +146,7 @@ def compare(
         _table(compared)
     if context:
         print(f"credibility: {assessed.sentence}")
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
     if result.explainable:
         names = " ".join(map(str, recordings))
         since = f" --before {' '.join(map(str, before))}" if before else ""

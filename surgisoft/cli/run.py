@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_free, check_replay
+from surgisoft.cli.files import check_free, check_replay, show_written
 from surgisoft.cli.inputs import check_model, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -78,12 +78,16 @@ def run(
     reference: Annotated[
         float,
         typer.Option(
-            "--clean", metavar="S", help="Without --before: clean time at the begin of the run."
+            "--clean",
+            metavar="S",
+            help="Without --before: time at the start of the run in which the arm is unchanged.",
         ),
     ] = 120.0,
     false_alarm: Annotated[
         float,
-        typer.Option(metavar="H", help="Mean time between false alarms that is designed for, h."),
+        typer.Option(
+            metavar="H", help="Mean time between false alarms for which the detector is set, h."
+        ),
     ] = 10.0,
     stop_on_alarm: Annotated[
         bool, typer.Option("--stop-on-alarm", help="End the run with the first alarm.")
@@ -110,7 +114,7 @@ def run(
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
-    """Run a policy or a schedule on a rig at a fixed rate, and report when the model stops holding.
+    """Run a policy or a schedule on a rig at a fixed rate, and warn when the model no longer fits.
 
     Every sample is predicted by the model, recorded as it comes, and shown with --show or --web.
     Ctrl-C ends the run: the arm is vented and the recording is complete.
@@ -156,9 +160,7 @@ def run(
     if json_file:
         write_json(json_file, found.to_json())
     _show(found)
-    for path in (*found.written, replay, json_file):
-        if path is not None:
-            print(f"wrote {path}")
+    show_written(path for path in (*found.written, replay, json_file) if path is not None)
     if found.alarms:
         name = model or "default"
         past = f" --before {' '.join(map(str, before))}" if before else ""

@@ -462,3 +462,24 @@ def guard(
 
     if not run(against, repeats):
         raise typer.Exit(1)
+
+
+@app.command()
+def rows(
+    sizes: Annotated[
+        str, typer.Option("--rows", help="Rows of recordings, with commas.")
+    ] = "10000,100000,1000000",
+    diagnosed: Annotated[
+        str, typer.Option(help="Rows of recordings that are diagnosed, with commas.")
+    ] = "12000,200000,2000000",
+    faces: Annotated[str, typer.Option(help="Faces of organs, with commas.")] = "80000,500000",
+    output: Output = None,
+) -> None:
+    """Processor time and memory of commands on large files."""
+    from benchmarks.rows import markdown, run
+
+    numbers = _numbers("--rows", sizes), _numbers("--faces", faces)
+    with progress("rows") as report:
+        found = run(*numbers, _numbers("--diagnosed", diagnosed), report)
+    command = f"surgisoft benchmark rows --rows {sizes} --diagnosed {diagnosed} --faces {faces}"
+    _show("Cost of commands on large files", command, markdown(found), output)

@@ -25,8 +25,8 @@ from surgisoft.measurement.recordings import Recording, save_recording
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.checkpoint import default_arm
 
-RUNS = 200
-"""Runs of a large recording (a count); the arm is stepped once for all of them."""
+RUN_ROWS, SIMULATED, HOLD_ROWS = 3000, 30_000, 20
+"""Rows of a run, rows that are simulated, and rows between two pressures of the schedule."""
 DT_S, NOISE_MM, DRIFT_MM, DRIFT_S = 0.05, 0.05, 1.5, 90.0
 """Time between rows, s; standard deviation of the noise, mm; size of the slow drift, mm, and its
 time constant, s."""
@@ -63,15 +63,17 @@ class Cost:
 
 
 def recording(rows: int, seed: int = 0) -> Recording:
-    """A recording of the packaged arm with a drift that its model does not have."""
+    """A recording of the packaged arm with a drift that its model does not have.
+
+    Motions of more than `SIMULATED` rows are repeated run by run, each with noise of its own.
+    """
     arm, random = default_arm(), torch.Generator().manual_seed(seed)
-    runs = max(1, min(RUNS, rows // 3000))
-    steps = rows // runs
+    steps = min(rows, RUN_ROWS)
+    runs = min(max(1, rows // steps), SIMULATED // RUN_ROWS)
     low, high = torch.tensor(arm.spec.low), torch.tensor(arm.spec.high)
-    hold = 20
-    count = -(-steps // hold) + 1
+    count = -(-steps // HOLD_ROWS) + 1
     knots = torch.rand(runs, count, arm.spec.chambers, generator=random) * (high - low) + low
-    place = torch.arange(steps) / hold
+    place = torch.arange(steps) / HOLD_ROWS
     below = place.long()
     pressure = torch.lerp(knots[:, below], knots[:, below + 1], (place - below)[None, :, None])
     state, points = arm.initial_state(runs, pressure[:, 0]), []
@@ -82,14 +84,15 @@ def recording(rows: int, seed: int = 0) -> Recording:
             lag += DT_S / DRIFT_S * (pressure[:, step] - lag)
             share = torch.linspace(0.0, 1.0, now.shape[1])[None, :, None] ** 2
             points.append(now + DRIFT_MM * share * ((lag - low) / (high - low))[:, None, :3])
-    measured = torch.stack(points, 1)
+    number = torch.arange(max(1, rows // steps)) % runs
+    measured = torch.stack(points, 1)[number]
     measured += NOISE_MM * torch.randn(measured.shape, generator=random)
     return Recording(
         name=f"rows{rows}",
-        t_s=np.tile(DT_S * np.arange(steps), runs),
-        measured=pressure.flatten(0, 1).numpy(),
+        t_s=np.tile(DT_S * np.arange(steps), len(number)),
+        measured=pressure[number].flatten(0, 1).numpy(),
         key_points_mm=measured.flatten(0, 1).numpy(),
-        run=np.repeat(np.arange(runs), steps),
+        run=np.repeat(np.arange(len(number)), steps),
     )
 
 
@@ -129,19 +132,34 @@ def write_organ(faces: int, folder: Path) -> tuple[Path, int]:
     return file, len(mesh.faces)
 
 
+CHILD = """
+import atexit, pathlib, sys
+file = pathlib.Path(sys.argv.pop(1))
+status = pathlib.Path("/proc/self/status")
+atexit.register(lambda: status.is_file() and file.write_text(status.read_text()))
+from surgisoft.cli import main
+main()
+"""
+"""A process that runs a command and leaves its peak of memory behind. The system's accounts of a
+child begin with the memory of the process that started it."""
+
+
 def cost(words: list[str], label: str, size: int, limit: str = "") -> Cost:
     """Run `surgisoft WORDS...` in a process and measure it."""
-    with tempfile.TemporaryFile("w+") as log:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "surgisoft.cli", *words], stdout=log, stderr=log, text=True
-        )
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        log.seek(0)
-        lines = log.read().strip().splitlines()
+    with tempfile.TemporaryDirectory() as name:
+        status, log = Path(name) / "status", Path(name) / "log"
+        with log.open("w") as out:
+            child = subprocess.Popen(
+                [sys.executable, "-c", CHILD, str(status), *words], stdout=out, stderr=out
+            )
+            _, ended, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(ended)
+        lines = log.read_text().strip().splitlines()
+        peak = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
     failed = "" if child.returncode in (0, 1) else f"exit {child.returncode}: {lines[-1:]}"
     seconds = used.ru_utime + used.ru_stime
-    return Cost(label, size, seconds, used.ru_maxrss / 1e6, limit, failed)
+    memory = 1024e-9 * int(peak[0].split()[1]) if peak else float("nan")
+    return Cost(label, size, seconds, memory, limit, failed)
 
 
 def run(

@@ -483,3 +483,32 @@ def rows(
         found = run(*numbers, _numbers("--diagnosed", diagnosed), report)
     command = f"surgisoft benchmark rows --rows {sizes} --diagnosed {diagnosed} --faces {faces}"
     _show("Cost of commands on large files", command, markdown(found), output)
+
+
+@app.command()
+def peers(
+    turns: Annotated[int, typer.Option(min=2, help="Turns of each environment.")] = 5,
+    output: Output = None,
+) -> None:
+    """Speed of other projects' environments and of this one's, in one run."""
+    from benchmarks.peers import markdown, run
+
+    with progress("peers") as report:
+        found = run(turns, report)
+    command = f"surgisoft benchmark peers --turns {turns}"
+    _show("Environments of other projects", command, markdown(found), output)
+
+
+@app.command()
+def scaling(images: Images = None, output: Output = None) -> None:
+    """How cost grows with environments, faces, key points and rows."""
+    from benchmarks.scaling import draw, markdown, run
+
+    check_folder(images)
+    with progress("scaling") as report:
+        curves = run(report)
+    body = markdown(curves)
+    if images:
+        images.mkdir(parents=True, exist_ok=True)
+        body += f"\n![Cost against size](../images/{draw(curves, images).name})\n"
+    _show("How cost grows", "surgisoft benchmark scaling", body, output)

@@ -191,6 +191,12 @@ def draw(curves: list[Curve], folder: Path) -> Path:
             if curve.panel == panel:
                 plot.loglog(curve.sizes, 1e3 * np.array(curve.seconds), "o-", label=curve.name)
                 plot.set_ylabel(f"ms of one processor, {curve.per}")
+        sizes = next(curve.sizes for curve in curves if curve.panel == panel)
+        plot.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        plot.minorticks_off()
+        low, high = plot.get_ylim()
+        if high < 10.0 * low:  # a nearly constant cost shall look like one
+            plot.set_ylim(low / 3.0, high * 3.0)
         plot.set_xlabel(panel)
         plot.grid(which="both", alpha=0.3)
         plot.legend(fontsize=8)

@@ -1,16 +1,20 @@
 """The sub-commands of `surgisoft benchmark`: long studies whose results are committed."""
 
+import contextlib
 import datetime
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from surgisoft.cli.files import check_folder, check_free
+from surgisoft.cli.inputs import warn
 from surgisoft.cli.options import JsonFile
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_atomically, write_json
+from surgisoft.progress import Progress
 
 app = typer.Typer(help="Long studies whose results are committed.", no_args_is_help=True)
 
@@ -21,6 +25,17 @@ Output = Annotated[
     typer.Option("-o", "--output", metavar="FILE", help="Write the results to this file."),
 ]
 """Option of all studies."""
+
+
+@contextlib.contextmanager
+def _kept(title: str, work: Path) -> Iterator[Progress]:
+    """Progress of a study that keeps what is complete in a folder, and says so after Ctrl-C."""
+    try:
+        with progress(title) as report:
+            yield report
+    except KeyboardInterrupt:
+        warn(f"the same command uses again what is complete in {work}")
+        raise
 
 
 def _numbers(option: str, text: str) -> list[int]:
@@ -98,7 +113,7 @@ def diagnosis(
 
     numbers = _numbers("--robots", robots)
     some = cases(numbers, count, seed)
-    with progress("diagnosis") as report:
+    with _kept("diagnosis", work) as report:
         outcomes = run(some, work, processes, report, amend)
     command = f"surgisoft benchmark diagnosis --robots {robots} --count {count} --seed {seed}"
     command += f" --amend {amend}"
@@ -130,7 +145,7 @@ def intervals(
     from benchmarks.intervals import cases, markdown, run
 
     some = cases(count, clean, tuple(_numbers("--robots", robots)))
-    with progress("intervals") as report:
+    with _kept("intervals", work) as report:
         outcomes = run(some, work, processes, report)
     command = f"surgisoft benchmark intervals --robots {robots} --count {count} --clean {clean}"
     _show("Intervals of amend", command, markdown(outcomes), output)
@@ -143,6 +158,13 @@ def decision(
         typer.Option(
             metavar="SOURCE=FOLDER...",
             help="Further sources of cases: folders with recordings before and after a change.",
+        ),
+    ] = None,
+    judge: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FOLDER...",
+            help="Cases that take no part in any fit: judged by the fit to all others.",
         ),
     ] = None,
     robots: Annotated[
@@ -173,12 +195,14 @@ def decision(
 
     check_folder(work)
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
-    with progress("decision") as report:
-        some, values = run(plan, count, seed, cases or [], work, processes, report)
+    with _kept("decision", work) as report:
+        some, aside, values = run(
+            plan, count, seed, cases or [], work, processes, report, judge or []
+        )
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")
         print(f"wrote {asset}")
-    _show("Decision results", values["command"], markdown(some, values), output)
+    _show("Decision results", values["command"], markdown(some, values, aside), output)
 
 
 @app.command("setup-faults")
@@ -206,7 +230,7 @@ def setup_faults(
     from benchmarks.setup_faults import markdown, run
 
     numbers = _numbers("--robots", robots)
-    with progress("setup-faults") as report:
+    with _kept("setup-faults", work) as report:
         outcomes = run(numbers, folders or [], count, seed, work, processes, report)
     command = f"surgisoft benchmark setup-faults --robots {robots} --count {count} --seed {seed}"
     command += "".join(f" --source {folder.name}" for folder in folders or [])
@@ -243,7 +267,7 @@ def hidden_effect(
     check_folder(images)
     config = StudyConfig(robot_seed, strength, steps, seed, episodes)
     torch.set_num_threads(1)
-    with progress("hidden-effect") as report:
+    with _kept("hidden-effect", work) as report:
         outcomes = run(effects.split(","), config, work, report)
     command = (
         f"surgisoft benchmark hidden-effect --effects {effects} --robot-seed {robot_seed} "
@@ -284,12 +308,96 @@ def control(
     chosen = tuple(tasks.split(",")) if tasks else TASKS
     config = ControlConfig(chosen, numbers, episodes, rig_episodes)
     torch.set_num_threads(1)
-    with progress("control") as report:
+    with _kept("control", runs) as report:
         results = run(config, runs, report)
     command = f"surgisoft benchmark control --seeds {seeds}"
     command += f" --tasks {tasks}" if tasks else ""
     command += f" --episodes {episodes} --rig-episodes {rig_episodes}"
     _show("Control results", command, markdown(results, config), output)
+
+
+@app.command()
+def robust(
+    policies: Annotated[
+        str,
+        typer.Option(
+            help="Policies, with commas: runs' folders, names of packaged ones, or scripted; the "
+            "first is judged with hidden effects, too."
+        ),
+    ] = "ring,scripted",
+    robots: Annotated[
+        str, typer.Option(help="Seeds of the robots, with commas; 0 to 10 served for development.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    own: Annotated[
+        str, typer.Option(help="Those that a model is fitted to, too, with commas; may be empty.")
+    ] = "21,22,23,24,25,26,27,28,29,30",
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each robot.")] = 10,
+    hidden_robots: Annotated[
+        str, typer.Option(help="Robots with hidden effects, with commas; may be empty.")
+    ] = "21,26",
+    hidden_episodes: Annotated[
+        int, typer.Option(min=1, help="Episodes of each hidden effect and robot.")
+    ] = 2,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact/--batched",
+            help="Contact by FCL, or by the engine of training, which is faster.",
+        ),
+    ] = True,
+    work: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of models and of each case's result.")
+    ] = Path("runs/benchmark-robust"),
+    images: Images = None,
+    output: Output = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Rings cut on robots that no model knows: each policy with either observer."""
+    from dataclasses import asdict
+
+    import torch
+
+    from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
+
+    check_free(json_file, "cases")
+    check_folder(work)
+    check_folder(images)
+    names = {policy: Path(policy).name for policy in policies.split(",")}
+    methods = tuple(
+        Method(f"{name}, {observer}", policy, observer)
+        for policy, name in names.items()
+        for observer in (FILTER, LEARNS)
+    )
+    best = tuple(method.name for method in methods[:2] if method.observer == LEARNS)
+
+    def seeds(option: str, text: str) -> tuple[int, ...]:
+        return tuple(_numbers(option, text)) if text else ()
+
+    study = Study(
+        methods,
+        seeds("--robots", robots),
+        seeds("--own", own),
+        episodes,
+        best,
+        seeds("--hidden-robots", hidden_robots),
+        hidden_episodes,
+        exact,
+    )
+    torch.set_num_threads(1)
+    with progress("robust") as report:
+        rows, floors = run(study, work, report)
+    if json_file:
+        write_json(json_file, {"cases": [asdict(r) for r in rows]})
+    command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
+    command += f" --robots {robots} --own '{own}' --episodes {episodes}"
+    command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
+    command += "" if exact else " --batched"
+    shown = ""
+    if images:
+        shown = f"\n![robust](../images/{draw(rows, floors, study, images).name})\n"
+    _show(
+        "Rings on robots that took no part", command, markdown(rows, floors, study) + shown, output
+    )
 
 
 @app.command()
@@ -315,7 +423,7 @@ def live(
     check_free(json_file, "clean")
     check_folder(models)
     numbers = _numbers("--robots", robots)
-    with progress("live") as report:
+    with _kept("live", models) as report:
         clean, changes = run(numbers, hours, models, processes, report)
     if json_file:
         both = {"clean": [asdict(c) for c in clean], "changes": [asdict(c) for c in changes]}
@@ -358,7 +466,7 @@ def real(
     check_folder(work)
     some = load_entries(entries or [], only)
     folder = data_folder(data)
-    with progress("real") as report:
+    with _kept("real", work) as report:
         outcomes = run(some, folder, work, report)
     command = " ".join(
         ["surgisoft benchmark real", *map(str, entries or []), "--data FOLDER"]
@@ -419,7 +527,7 @@ def cases(
     some = [case for case in found if only is None or only in str(case.place)]
     if not some:
         raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
-    with progress("cases") as report:
+    with _kept("cases", folder) as report:
         judged = run(some, processes, report)
     if json_file:
         write_json(json_file, to_json(judged))

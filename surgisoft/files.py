@@ -2,7 +2,7 @@
 
 A reader never sees half a file: the content goes to a temporary name beside the target, which is
 renamed to the target at the end. What is written has the permissions that the user's umask gives
-to new files.
+to new files. `noted_writes` collects what was written, for a message after an interruption.
 """
 
 import contextlib
@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,36 @@ from surgisoft.errors import InputError
 LARGEST_JSON = 8_000_000
 """A larger JSON file is none that the package writes, bytes."""
 
+_noted: ContextVar[list[Path] | None] = ContextVar("noted writes", default=None)
+
 
 @contextlib.contextmanager
-def new_file(path: str | Path) -> Iterator[Path]:
+def noted_writes() -> Iterator[list[Path]]:
+    """Files and folders that are written inside the block, in order, each added when complete.
+
+    Those in a folder that is being filled are listed under its temporary name, which is gone
+    later. Work in other threads and processes is not noted.
+    """
+    written: list[Path] = []
+    token = _noted.set(written)
+    try:
+        yield written
+    finally:
+        _noted.reset(token)
+
+
+def _note(path: Path) -> None:
+    written = _noted.get()
+    if written is not None:
+        written.append(path)
+
+
+@contextlib.contextmanager
+def new_file(path: str | Path, noted: bool = True) -> Iterator[Path]:
     """A temporary path to write to; it becomes `path` when the block ends without an exception.
 
-    The temporary name keeps the suffix, and `path`'s folder is made where it is missing.
+    The temporary name keeps the suffix, and `path`'s folder is made where it is missing. noted:
+    whether `noted_writes` lists it, as all but caches should be.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -35,6 +60,8 @@ def new_file(path: str | Path) -> Iterator[Path]:
     try:
         yield fresh
         os.replace(fresh, path)
+        if noted:
+            _note(path)
     finally:
         fresh.unlink(missing_ok=True)
 
@@ -46,7 +73,7 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
     Where `folder` exists, the new one replaces it. Old files that the new folder does not have are
     copied to it, except those named in `own`, which belong to the old version.
     """
-    folder = Path(folder).resolve()
+    given, folder = Path(folder), Path(folder).resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _beside(folder)
     fresh.mkdir()
@@ -54,6 +81,7 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
         yield fresh
         if not folder.exists():
             os.replace(fresh, folder)
+            _note(given)
             return
         for kept in folder.iterdir():
             if kept.name not in own and not (fresh / kept.name).exists():
@@ -62,14 +90,15 @@ def new_folder(folder: str | Path, own: Sequence[str] = ()) -> Iterator[Path]:
         old = _beside(folder)
         os.replace(folder, old)
         os.replace(fresh, folder)
+        _note(given)
         shutil.rmtree(old)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
 
 
-def write_atomically(path: str | Path, content: bytes | str) -> None:
-    """Write a file whole or not at all; text is written as UTF-8."""
-    with new_file(path) as fresh:
+def write_atomically(path: str | Path, content: bytes | str, noted: bool = True) -> None:
+    """Write a file whole or not at all; text is written as UTF-8. noted: as for `new_file`."""
+    with new_file(path, noted) as fresh:
         fresh.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
 
 

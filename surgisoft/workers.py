@@ -89,6 +89,8 @@ def workers(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(processes, context, initializer=begin_worker, initargs=(prepare,))
     try:
+        with _held_interrupt():
+            pool.submit(os.getpid)  # starts the processes, which inherit what is held
         yield pool
     except BaseException:
         for process in list((pool._processes or {}).values()):
@@ -101,6 +103,23 @@ def workers(
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _held_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back inside the block; processes that start in it never see one.
+
+    A terminal sends it to them too, and one that comes before `begin_worker` would print the
+    traceback of an import that it ended.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

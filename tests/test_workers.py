@@ -72,3 +72,12 @@ def test_workers_compute_on_one_thread(monkeypatch):
         assert [pool.submit(os.getenv, name).result() for name in ONE_THREAD] == ["1"] * 3
     assert os.environ[ONE_THREAD[0]] == "7"
     assert ONE_THREAD[1] not in os.environ
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="no signal masks here")
+def test_ctrl_c_does_not_reach_a_worker_that_starts():
+    """It is held back before `begin_worker` runs: the process is born with it blocked."""
+    with workers(1) as pool:
+        held = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
+    assert signal.SIGINT in held
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])

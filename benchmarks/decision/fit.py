@@ -3,33 +3,47 @@
 Each model is fitted by penalised maximum likelihood (ridge: le Cessie & van Houwelingen 1992;
 sign constraints by bounded L-BFGS: Byrd et al. 1995). Every source counts alike, but for one of few
 cases; pairs have a stated share of every source (PRIORS). The penalty of each model is chosen by
-leaving out one group of robots after another within the cases that it is fitted to, so nothing of a
-source that is judged enters.
+leaving out one source after another, and one group of robots after another, within the cases that
+it is fitted to. Robots left out inside the same cases also give the curves that calibrate the first
+effect and the set of two (Platt 1999), and the cost of a wrong "unknown". So nothing of a source
+that is judged enters any choice.
 """
 
 import datetime
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import optimize
 
 from benchmarks.decision.evidence_log import Labelled
+from surgisoft.diagnosis.criteria import WORTH
 from surgisoft.diagnosis.decision import (
+    CALIBRATED,
     FEATURES,
+    LEAST_CHANCE,
     SCHEMA,
+    Curve,
     DecisionModel,
     Logistic,
+    Probabilities,
+    calibrated,
+    chosen,
     content_hash,
+    decision_of,
     features_of,
+    probabilities,
 )
 
-PENALTIES = (0.1, 0.3, 1.0, 3.0, 10.0)
+PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 """Ridge penalties on the weights that are tried: inverse variances of a normal prior around 0, for
 features of order 1."""
 CONSTANT_PENALTY = 0.01
 """Ridge penalty on the constant."""
+OFF = ("network", "other_robot")
+"""Labels of cases whose model is off."""
 WEAK = 0.5
 """Change by what is missing, over the validated error, below which "nothing" is right too: such
 cases take no part in the fit of `missing`."""
@@ -39,10 +53,14 @@ PRIORS = {"two": 0.3}
 """Shares of cases of which a statement is true, for which its probability is calibrated. Stated:
 how many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in
 one source and a quarter in another. The other models take the sources' shares."""
-WHOLE_TRUTH = ("missing", "known", "network")
-"""Models that are fitted only to cases whose truth is all that the model lacks."""
 ROBOT_FOLDS = 5
-"""Groups of robots that are left out in turn for the choice of a penalty."""
+"""Groups of robots that are left out in turn inside the cases of a fit."""
+CURVE_PENALTY = 1.0
+"""Ridge penalty on constant and log slope of a calibration, in cases: a weak pull to no change."""
+UNKNOWN_COSTS = (0.25, 0.5, 1.0, 2.0)
+"""Costs of a wrong "unknown" that are tried, in units of what a right one is worth."""
+MOST_CALLED_UNKNOWN = 0.05
+"""Most known effects and unchanged arms, as a share of each source, that may be called unknown."""
 
 
 def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.ndarray, Labelled]]:
@@ -55,8 +73,6 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
         if case.label == "setup" or not case.evidence.effects:
             continue
         missing = case.label in ("known", "unknown")
-        if not case.complete and name in WHOLE_TRUTH:
-            continue
         if name == "missing":
             if (missing and case.size < WEAK) or case.label == "other_robot":
                 continue
@@ -67,9 +83,9 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
                 continue
             right = np.array(float(case.label == "known"))
         elif name == "network":
-            if case.label == "known":
+            if case.label == "known" or case.evidence.paired:
                 continue
-            right = np.array(float(case.label in ("network", "other_robot")))
+            right = np.array(float(case.label in OFF))
         elif name == "two":
             pair = [one.effects for one in case.evidence.proposals if len(one.effects) == 2]
             if case.label != "known" or not pair or case.size < WEAK:
@@ -173,53 +189,137 @@ def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
     return Logistic(tuple(float(w) for w in found.x[:-1]), float(found.x[-1]))
 
 
-def _folds(some: Sequence) -> np.ndarray:
-    """(N,) fold of each case: whole robots together."""
-    names = [f"{case.source}/{case.robot}" for _, _, case in some]
+def _robot_folds(cases: Sequence[Labelled]) -> list[np.ndarray]:
+    """(N,) masks of the cases that are left out together: groups of whole robots."""
+    names = [f"{case.source}/{case.robot}" for case in cases]
     robots = sorted(set(names))
-    return np.array([robots.index(name) % ROBOT_FOLDS for name in names])
+    fold = np.array([robots.index(name) % ROBOT_FOLDS for name in names])
+    return [fold == number for number in np.unique(fold)] if len(robots) > 1 else []
+
+
+def _source_folds(cases: Sequence[Labelled]) -> list[np.ndarray]:
+    """(N,) masks of the cases that are left out together: whole sources."""
+    names = np.array([case.source for case in cases])
+    sources = sorted(set(names))
+    return [names == source for source in sources] if len(sources) > 1 else []
+
+
+def _split(some: Sequence, left_out: np.ndarray) -> tuple[list, list]:
+    """(kept, left out)."""
+    both = list(zip(some, left_out, strict=True))
+    return [one for one, out in both if not out], [one for one, out in both if out]
 
 
 def penalty_of(name: str, some: Sequence) -> float:
-    """The penalty with the least held-out loss, one group of robots left out in turn."""
-    fold = _folds(some) if some else np.zeros(0)
-    if len(np.unique(fold)) < 2:
+    """The penalty with the least held-out loss, one source or group of robots left out in turn.
+
+    A source is left out too since the decision is asked of robots that are like none of its cases.
+    """
+    cases = [case for _, _, case in some]
+    folds = [*_source_folds(cases), *_robot_folds(cases)]
+    if not folds:
         return PENALTIES[-1]
     weights = case_weights(name, some)
     totals = []
     for penalty in PENALTIES:
         total = 0.0
-        for number in np.unique(fold):
-            train = [one for one, f in zip(some, fold, strict=True) if f != number]
-            left = [one for one, f in zip(some, fold, strict=True) if f == number]
+        for fold in folds:
+            train, left = _split(some, fold)
             model = fit_one(name, train, penalty)
-            total += float(weights[fold == number] @ log_losses(name, model, left))
+            total += float(weights[fold] @ log_losses(name, model, left))
         totals.append(total)
     return PENALTIES[int(np.argmin(totals))]
 
 
+def _models(cases: Sequence[Labelled], penalties: dict[str, float]) -> dict[str, Logistic]:
+    """The five models of given penalties."""
+    return {name: fit_one(name, sample(name, cases), penalties[name]) for name in FEATURES}
+
+
+Predicted = list[tuple[Labelled, Probabilities]]
+
+
+def held_out(cases: Sequence[Labelled], penalties: dict[str, float]) -> Predicted:
+    """What models that were fitted without a robot say of its cases, before calibration."""
+    answer = []
+    for fold in _robot_folds(cases):
+        train, left = _split(cases, fold)
+        model = DecisionModel(_models(train, penalties), {})
+        answer += [(case, probabilities(case.evidence, model)) for case in left]
+    return answer
+
+
+def curve_of(count: int, predicted: Predicted) -> Curve:
+    """The calibration of "one of the `count` most probable effects is missing"."""
+    some = [(case, chances) for case, chances in predicted if len(chances.effects) >= count]
+    if not some:
+        return Curve()
+    given, right = [], []
+    for case, chances in some:
+        names = list(chances.effects)[:count]
+        given.append(sum(chances.effects[name] for name in names))
+        right.append(case.label == "known" and bool(set(names) & set(case.truth)))
+    chance = np.clip(np.array(given), LEAST_CHANCE, 1.0 - LEAST_CHANCE)
+    odds, hit = np.log(chance / (1.0 - chance)), np.array(right, float)
+    weights = case_weights("", [((), 0.0, case) for case, _ in some])
+
+    def loss(values: np.ndarray) -> float:
+        line = values[0] + np.exp(values[1]) * odds
+        return float(
+            weights @ (np.logaddexp(0.0, line) - hit * line) + 0.5 * CURVE_PENALTY * values @ values
+        )
+
+    found = optimize.minimize(loss, np.zeros(2), method="L-BFGS-B")
+    return Curve(float(found.x[0]), float(np.exp(found.x[1])))
+
+
+def wrong_unknown_of(predicted: Predicted, curves: dict[str, Curve]) -> float:
+    """The worth of a wrong "unknown": the least cost that calls few known effects or arms so.
+
+    The mean over sources of the share of known effects and unchanged arms that are called unknown
+    is at most `MOST_CALLED_UNKNOWN`.
+    """
+    some = [(c, calibrated(p, curves)) for c, p in predicted if c.label in ("known", "clean")]
+    sources = sorted({case.source for case, _ in some})
+    for cost in UNKNOWN_COSTS:
+        worth = replace(WORTH, wrong_unknown=-cost)
+        shares = []
+        for source in sources:
+            own = [(case.evidence, p) for case, p in some if case.source == source]
+            shares.append(np.mean([chosen(e, p, worth).kind == "unknown_effect" for e, p in own]))
+        if not shares or np.mean(shares) <= MOST_CALLED_UNKNOWN:
+            return -cost
+    return -UNKNOWN_COSTS[-1]
+
+
 def fit(cases: Sequence[Labelled], command: str = "") -> dict:
     """The asset's values: a decision fitted to cases."""
+    samples = {name: sample(name, cases) for name in FEATURES}
+    penalties = {name: penalty_of(name, some) for name, some in samples.items()}
     models = {}
-    for name, features in FEATURES.items():
-        some = sample(name, cases)
-        penalty = penalty_of(name, some)
-        model = fit_one(name, some, penalty)
+    for name, model in _models(cases, penalties).items():
         models[name] = {
             "constant": round(model.constant, 6),
             "weights": {
                 feature.name: round(weight, 6)
-                for feature, weight in zip(features, model.weights, strict=True)
+                for feature, weight in zip(FEATURES[name], model.weights, strict=True)
             },
-            "penalty": penalty,
-            "cases": len(some),
+            "penalty": penalties[name],
+            "cases": len(samples[name]),
         }
+    predicted = held_out(cases, penalties)
+    curves = {name: curve_of(count, predicted) for count, name in enumerate(CALIBRATED, 1)}
     values = {
         "schema": SCHEMA,
         "date": datetime.date.today().isoformat(),
         "command": command,
         "sources": {name: _about(name, cases) for name in sorted({c.source for c in cases})},
         "models": models,
+        "calibration": {
+            name: {"constant": round(one.constant, 6), "slope": round(one.slope, 6)}
+            for name, one in curves.items()
+        },
+        "wrong_unknown": wrong_unknown_of(predicted, curves),
     }
     return values | {"sha256": content_hash(values)}
 
@@ -238,4 +338,4 @@ def model_of(values: dict) -> DecisionModel:
         name: Logistic(tuple(one["weights"].values()), one["constant"])
         for name, one in values["models"].items()
     }
-    return DecisionModel(models, {key: v for key, v in values.items() if key != "models"})
+    return decision_of(models, values)

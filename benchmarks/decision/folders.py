@@ -7,11 +7,16 @@ alone), and for each robot `before/*.parquet` and optionally `model/`, in `ROBOT
 `robots/ROBOT`. One model is fitted for each robot to its recordings before the change, unless it is
 there already. The question is what has changed since: the recordings before the change are given to
 the diagnosis too.
+
+Where the truth is all that a model lacks, each robot gives two cases more, of a model that is off:
+its first unchanged recording is asked of a model that was fitted for a few epochs, and of the model
+of another robot of the same build. There the recordings before the change are not given.
 """
 
 import json
 import time
 from concurrent.futures import as_completed
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -34,6 +39,8 @@ from surgisoft.workers import workers
 FIT_EFFECTS = ("hysteresis",)
 """Effects that a model of a source without models of its own is fitted with, as the robots of the
 benchmark `diagnosis` are."""
+FEW_EPOCHS = 10
+"""Epochs of a model that is undertrained, as those of the own rig are."""
 OTHER = "unknown"
 """Name in `truth` of an effect that a diagnosis has no name for."""
 
@@ -46,14 +53,15 @@ def robot_folder(folder: Path, robot: str) -> Path:
     raise InputError(f"{folder}: no recordings before the change of robot '{robot}'")
 
 
-def model_folder(folder: Path, robot: str, work: Path) -> Path:
+def model_folder(folder: Path, robot: str, work: Path, undertrained: bool = False) -> Path:
     """The fitted model of a robot; it is fitted at the first call."""
     place = robot_folder(folder, robot)
-    if (place / "model" / "config.json").is_file():
+    if (place / "model" / "config.json").is_file() and not undertrained:
         return place / "model"
-    own = work / f"{folder.name}-{robot}"
+    own = work / f"{folder.name}-{robot}{'-undertrained' if undertrained else ''}"
     if not (own / "config.json").is_file():
-        result = fit(place / "before", effects=FIT_EFFECTS)
+        epochs = {"epochs": FEW_EPOCHS} if undertrained else {}
+        result = fit(place / "before", effects=FIT_EFFECTS, **epochs)
         own.parent.mkdir(parents=True, exist_ok=True)
         save_model(result.model, own, result.report(), force=True, known=result.known)
     return own
@@ -92,10 +100,60 @@ def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelle
     )
 
 
+def run_off(source: str, folder: Path, clean: Labelled, asked: str | None, work: Path) -> Labelled:
+    """The evidence of an unchanged recording and a model that is off.
+
+    asked: the robot whose model is asked; None: the recorded one's, undertrained.
+    """
+    torch.set_num_threads(1)
+    robot = asked or clean.robot
+    model = load_model(model_folder(folder, robot, work, undertrained=asked is None))
+    recordings = load_recordings(folder / clean.case / "after")
+    begin = time.process_time()
+    evidence = evidence_on(model, recordings)
+    return replace(
+        clean,
+        source=source,
+        case=f"{clean.case}/{'undertrained' if asked is None else f'model-{asked}'}",
+        label="network" if asked is None else "other_robot",
+        validated_mm=model.validation.rmse_mm,
+        evidence=evidence,
+        seconds=time.process_time() - begin,
+    )
+
+
+def models_that_are_off(folder: Path, done: list[Labelled], work: Path) -> list[tuple]:
+    """(unchanged case, robot whose model is asked or None) of each robot of a source."""
+    clean = [one for one in done if one.label == "clean" and one.complete]
+    robots = sorted({one.robot for one in done})
+    answer: list[tuple] = []
+    for robot in robots:
+        first = min((o for o in clean if o.robot == robot), key=lambda o: o.case, default=None)
+        if first is None:
+            continue
+        answer.append((first, None))
+        own = load_model(model_folder(folder, robot, work)).spec
+        for other in [one for one in robots if one != robot]:
+            spec = load_model(model_folder(folder, other, work)).spec
+            if (spec.chambers, spec.key_points) == (own.chambers, own.key_points):
+                answer.append((first, other))
+                break
+    return answer
+
+
 def run(
-    source: str, folder: Path, work: Path, log: Path, processes: int, report: Progress
+    source: str,
+    folder: Path,
+    work: Path,
+    log: Path,
+    processes: int,
+    report: Progress,
+    off: bool = True,
 ) -> list[Labelled]:
-    """Collect the evidence of all cases of a folder; those that the log has are not repeated."""
+    """Collect the evidence of all cases of a folder; those that the log has are not repeated.
+
+    off: whether models that are off give cases too.
+    """
     done = {one.case: one for one in read(log)}
     files = sorted(folder.glob("**/truth.json"))
     names = {path: str(path.parent.relative_to(folder)) for path in files}
@@ -110,4 +168,11 @@ def run(
             append(log, one)
             done[one.case] = one
             report(number + 1, len(missing), f"{source}: {len(done)} cases")
-    return [done[names[path]] for path in files]
+    answer = [done[names[path]] for path in files]
+    for clean, asked in models_that_are_off(folder, answer, work) if off else []:
+        name = f"{clean.case}/{'undertrained' if asked is None else f'model-{asked}'}"
+        if name not in done:
+            done[name] = run_off(source, folder, clean, asked, work)
+            append(log, done[name])
+        answer.append(done[name])
+    return answer

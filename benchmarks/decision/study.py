@@ -1,5 +1,6 @@
 """Collect the evidence of all sources and fit the decision to it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.decision import folders, own_rig
@@ -17,10 +18,12 @@ def run(
     work: Path,
     processes: int,
     report: Progress,
-) -> tuple[list[Labelled], dict]:
-    """(all cases, the values of the asset that is fitted to them).
+    judged: Sequence[str] = (),
+) -> tuple[list[Labelled], list[Labelled], dict]:
+    """(all cases of the fit, those that are judged only, the values of the asset that is fitted).
 
-    sources: `NAME=FOLDER`; the evidence of each is stored in `work/evidence/NAME.jsonl`.
+    sources: `NAME=FOLDER`; the evidence of each is stored in `work/evidence/NAME.jsonl`. judged:
+    the same, of cases that take no part in any fit.
     """
     logs = work / "evidence"
     command = "surgisoft benchmark decision"
@@ -32,12 +35,24 @@ def run(
     else:
         some = read(own)
     for given in sources:
-        name, _, folder = given.partition("=")
-        if not folder or not Path(folder).is_dir():
-            raise InputError(f"--cases {given}: expected NAME=FOLDER with an existing folder")
+        name, folder = _source("--cases", given)
         log = logs / f"{name}.jsonl"
-        some += folders.run(name, Path(folder), work / "models", log, processes, report)
-        command += f" --cases {name}={Path(folder).name}"
+        some += folders.run(name, folder, work / "models", log, processes, report)
+        command += f" --cases {name}={folder.name}"
+    aside: list[Labelled] = []
+    for given in judged:
+        name, folder = _source("--judge", given)
+        log = logs / f"{name}.jsonl"
+        aside += folders.run(name, folder, work / "models", log, processes, report, off=False)
+        command += f" --judge {name}={folder.name}"
     if not some:
         raise InputError(f"{logs}: no stored cases; give --count or --cases")
-    return some, fit(some, command)
+    return some, aside, fit(some, command)
+
+
+def _source(option: str, given: str) -> tuple[str, Path]:
+    """(name, folder) of `NAME=FOLDER`."""
+    name, _, folder = given.partition("=")
+    if not folder or not Path(folder).is_dir():
+        raise InputError(f"{option} {given}: expected NAME=FOLDER with an existing folder")
+    return name, Path(folder)

@@ -3,13 +3,13 @@
 import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from benchmarks.decision.evidence_log import Labelled
-from benchmarks.decision.fit import WEAK, fit, model_of
+from benchmarks.decision.fit import OFF, WEAK, fit, model_of
 from surgisoft.diagnosis.criteria import WORTH, Worth
 from surgisoft.diagnosis.decision import Decision, DecisionModel, decide
 
@@ -17,6 +17,8 @@ BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Bins of the reliability table."""
 SURE = 0.95
 """Least confidence of a statement that counts as sure."""
+COSTS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0)
+"""Costs of a wrong name of the trade-off, in units of what a right one gains."""
 SERIOUS = 0.8
 """Least confidence from which a wrong name is serious."""
 NAMING = ("identified", "several", "ambiguous")
@@ -55,20 +57,32 @@ class Judged:
         return bool(set(self.decision.effects) & set(self.case.truth))
 
 
-def judged(cases: Sequence[Labelled], model: DecisionModel, worth: Worth = WORTH) -> list[Judged]:
+def judged(
+    cases: Sequence[Labelled], model: DecisionModel, worth: Worth | None = None
+) -> list[Judged]:
     """What a fitted decision says of cases."""
     return [Judged(case, decide(case.evidence, model, worth)) for case in cases]
 
 
-def left_out(cases: Sequence[Labelled]) -> dict[str, list[Judged]]:
-    """For each source what a decision that was fitted to the others says of it."""
+def fits_without(cases: Sequence[Labelled]) -> dict[str, DecisionModel]:
+    """For each source the decision that is fitted to the others."""
     answer = {}
     for source in sorted({case.source for case in cases}):
         others = [case for case in cases if case.source != source]
         if others:
-            own = [case for case in cases if case.source == source]
-            answer[source] = judged(own, model_of(fit(others)))
+            answer[source] = model_of(fit(others))
     return answer
+
+
+def left_out(
+    cases: Sequence[Labelled], models: dict[str, DecisionModel] | None = None
+) -> dict[str, list[Judged]]:
+    """For each source what a decision that was fitted to the others says of it."""
+    models = fits_without(cases) if models is None else models
+    return {
+        source: judged([case for case in cases if case.source == source], model)
+        for source, model in models.items()
+    }
 
 
 def robots_left_out(cases: Sequence[Labelled]) -> list[Judged]:
@@ -165,7 +179,7 @@ ROWS: tuple[tuple[str, str, Test, Test], ...] = (
     (
         "an effect named where the network is off",
         "",
-        lambda j: j.case.label in ("network", "other_robot"),
+        lambda j: j.case.label in OFF,
         lambda j: j.decision.kind in NAMING,
     ),
     (
@@ -265,18 +279,86 @@ def sources(cases: Sequence[Labelled]) -> str:
     return "\n".join(lines)
 
 
-def markdown(cases: Sequence[Labelled], values: dict) -> str:
-    """The whole report."""
-    by_source = left_out(cases)
+def trade_off(cases: Sequence[Labelled], models: dict[str, DecisionModel]) -> str:
+    """What more caution costs: each source left out, names at several costs of a wrong one."""
+    lines = [
+        "| cost of a wrong name | least probability | one effect named | a wrong name | with "
+        "confidence >= 0.8 | on a clean robot | where the network is off | unknown named | "
+        "`cannot_tell` |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for cost in COSTS:
+        some = []
+        for source, model in models.items():
+            own = [case for case in cases if case.source == source]
+            worth = replace(model.worth, wrong_name=-cost, needless_name=-cost)
+            some += judged(own, model, worth)
+        wrong = [one for one in some if one.decision.kind in NAMING and not one.right]
+        named = {id(one) for one in some if one.decision.kind in NAMING}
+
+        def share(of: Test, hit: Test, some: list[Judged] = some) -> str:
+            rows = [hit(one) for one in some if of(one)]
+            return f"{100 * np.mean(rows):.0f} % ({sum(rows)} of {len(rows)})" if rows else "-"
+
+        def says(one: Judged, named: set = named) -> bool:
+            return id(one) in named
+
+        cells = [
+            f"{cost:g}" + (" (in force)" if cost == -WORTH.wrong_name else ""),
+            f"{cost / (1.0 + cost):.2f}",
+            share(_single, lambda one: one.names_truth),
+            f"{len(wrong)} of {len(some)}",
+            f"{sum(one.decision.confidence >= SERIOUS for one in wrong)} of {len(some)}",
+            share(lambda one: one.case.label == "clean", says),
+            share(lambda one: one.case.label in OFF, says),
+            share(lambda one: one.case.label == "unknown", says),
+            share(lambda one: True, lambda one: one.decision.kind == "cannot_tell"),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def curves(values: dict) -> str:
+    """The fitted calibrations and the chosen cost of an asset's values."""
+    texts = [
+        f"`{name}` {one['constant']:+.2f} {one['slope']:+.2f} x log odds"
+        for name, one in values["calibration"].items()
+    ]
+    cost = values["wrong_unknown"]
+    return f"Calibration: {'; '.join(texts)}. Worth of a wrong `unknown_effect`: {cost:g}."
+
+
+def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] = ()) -> str:
+    """The whole report. aside: cases that took no part in any fit."""
+    models = fits_without(cases)
+    by_source = left_out(cases, models)
     together = [one for some in by_source.values() for one in some]
     columns = by_source | ({"together": together} if len(by_source) > 1 else {})
-    parts = ["## Cases", sources(cases)]
+    parts = ["## Cases", sources([*cases, *aside])]
     if columns:
         parts += ["## Each source left out of the fit", goals(columns)]
         parts += ["### What was said", kinds(together)]
         parts += ["### Reliability", reliability(together)]
+        parts += ["### More or fewer names", trade_off(cases, models)]
+    if aside:
+        new = {f"{name}, fitted to all": some for name, some in _asides(aside, values).items()}
+        for name in sorted({case.source for case in aside}):
+            kin = next((source for source in models if name.startswith(source)), None)
+            own = [case for case in aside if case.source == name]
+            if kin:
+                new[f"{name}, fitted without {kin}"] = judged(own, models[kin])
+        parts += ["## Robots that took no part in anything", goals(new)]
+        for name, some in new.items():
+            parts += [f"### What was said, {name}", kinds(some)]
     inside = robots_left_out(cases)
     parts += ["## Each robot left out of the fit", goals({"all sources": inside})]
     parts += ["### What was said, robots left out", kinds(inside)]
-    parts += ["## The fitted weights", weights(values)]
+    parts += ["## The fitted weights", weights(values), curves(values)]
     return "\n\n".join(parts) + "\n"
+
+
+def _asides(aside: Sequence[Labelled], values: dict) -> dict[str, list[Judged]]:
+    """Cases that took no part in any fit, judged by the fit to all others, by source."""
+    model = model_of(values)
+    names = sorted({case.source for case in aside})
+    return {name: judged([c for c in aside if c.source == name], model) for name in names}

@@ -20,6 +20,7 @@ from surgisoft.agents.observer import Observer, ObserverGains, Order
 from surgisoft.errors import InputError
 from surgisoft.tasks.base import FEED_SIGNAL, Episodes, MeasuredTask, Signal, Task, TaskState
 from surgisoft.tasks.describe import field_docs
+from surgisoft.tasks.world.adaptation import Adaptation
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import Stream
@@ -46,6 +47,8 @@ class MeasuredPlant:
     """(1, m) kPa: lowest pressure that is commanded."""
     highest_kPa: Tensor
     """(1, m) kPa: highest pressure that is commanded."""
+    adaptation: Adaptation | None = None
+    """What was learned of the output disturbance; None where it is filtered."""
     arrived: ArmPart | None = None
     """The part at the end of the step, while the task advances."""
 
@@ -73,7 +76,13 @@ class MeasuredArm:
         pressure = model.pressure
         zero = torch.zeros_like(part.points_mm)
         plant = MeasuredPlant(
-            pressure, zero, torch.zeros_like(pressure), pressure, self.low[None], self.high[None]
+            pressure,
+            zero,
+            torch.zeros_like(pressure),
+            pressure,
+            self.low[None],
+            self.high[None],
+            self.observer.memory(1),
         )
         part = replace(
             part,
@@ -87,6 +96,7 @@ class MeasuredArm:
             offset_mm=zero,
             plant=plant,
             belief=None,
+            factors=None,
         )
         points = self.observer.followed(part, pressure, 0.0).points_mm
         return replace(self.simulated.posed(part, points), seen_mm=points)
@@ -161,10 +171,11 @@ class ControllerGraph(nn.Module):
       base frame, NaN where one is lost, and the pressures (1, m) kPa that are commanded now;
     - each signal of the task (1,).
 
-    Before the episode begins, the models follow the samples and the commands stay as they are. Then
-    the policy decides at its first sample and every control period. Returned are the state, and for
-    each arm the pressures (1, m) kPa to command, the estimated and the model's key points (1, n, 3)
-    mm in the world frame, and the agent's last observation (1, D).
+    Before the episode begins, the models follow the samples, what they get wrong is learned once in
+    a control period, and the commands stay as they are. Then the policy decides at its first sample
+    and every control period. Returned are the state, and for each arm the pressures (1, m) kPa to
+    command, the estimated and the model's key points (1, n, 3) mm in the world frame, and the
+    agent's last observation (1, D).
     """
 
     initial: Tensor
@@ -257,8 +268,9 @@ class ControllerGraph(nn.Module):
         memory = self._fed(memory, signals)
         begins = begin > 0.5
         elapsed = memory.elapsed_s + dt_s
-        due = memory.running & (elapsed >= (1.0 - EARLY) * self.control_s)
-        parts, begun, arrived = {}, {}, {}
+        over = elapsed >= (1.0 - EARLY) * self.control_s
+        due = memory.running & over
+        parts, begun, arrived, taught = {}, {}, {}, {}
         for (name, arm), (pressure, points, commanded) in zip(
             self.arms.items(), readings, strict=True
         ):
@@ -267,6 +279,7 @@ class ControllerGraph(nn.Module):
             part = arm.observer.followed(replace(part, plant=plant), pressure, dt_s)
             order = Order(commanded, plant.shift_kPa, plant.expected_kPa)
             parts[name] = part
+            taught[name] = arm.observer.learned(part, pressure, points)
             begun[name] = self._posed(arm, arm.observer.begun(part, pressure, points))
             arrived[name] = self._posed(arm, arm.observer.stepped(part, order, pressure, points))
         followed = replace(memory, arms=parts)
@@ -285,11 +298,13 @@ class ControllerGraph(nn.Module):
             )
             chosen[name] = replace(part, plant=plant)
         decides = begins | due
+        learns = over & ~memory.running
+        followed = _where(learns, replace(followed, arms=taught), followed)
         after = _where(decides, replace(now, arms=chosen), followed)
         after = replace(
             after,
             running=memory.running | begins,
-            elapsed_s=torch.where(decides, 0.0 * elapsed, elapsed),
+            elapsed_s=torch.where(decides | over, 0.0 * elapsed, elapsed),
         )
         fresh = torch.cat([observed[name] for name in self.task.agents], 1)
         fresh = torch.where(decides[:, None], fresh, seen)

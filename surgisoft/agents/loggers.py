@@ -32,20 +32,38 @@ def check_logger(name: str) -> None:
         )
 
 
+class LoggerFailed(InputError):
+    """A logger whose service could not be opened."""
+
+
 def open_writer(name: str, folder: Path, plan: Plan, purge_step: int) -> Any:
     """The writer of a logger, with `add_scalar(tag, value, step)` and `close()`.
 
-    folder: of the run. purge_step: TensorBoard drops what it has from this step on.
+    folder: of the run. purge_step: TensorBoard drops what it has from this step on. Raises
+    LoggerFailed, with what the service's library says, where it cannot be opened.
     """
     if name == TENSORBOARD:
         return _board(folder, purge_step)
-    if name == "mlflow":
-        return MlflowWriter(folder, plan, purge_step)
+    try:
+        if name == "mlflow":
+            return MlflowWriter(folder, plan, purge_step)
+        return _of_rsl_rl(name, folder, plan)
+    except Exception as error:  # each library has exceptions of its own
+        raise LoggerFailed(f"--logger {name}: cannot be opened: {error}") from error
+
+
+def _of_rsl_rl(name: str, folder: Path, plan: Plan) -> _Stopped:
+    """One of rsl-rl's writers; it names its run at the service after the last part of a path."""
     if name == "wandb":
-        from rsl_rl.utils.wandb_log_writer import WandbLogWriter as Writer
+        from rsl_rl.utils import wandb_log_writer as of_wandb
+
+        writer = of_wandb.WandbLogWriter(str(folder / "tensorboard"), project_name=PROJECT)
+        if (run := getattr(of_wandb.wandb, "run", None)) is not None:
+            run.name = folder.name
     else:
         from rsl_rl.utils.neptune_log_writer import NeptuneLogWriter as Writer
-    writer = Writer(str(folder), project_name=PROJECT)
+
+        writer = Writer(str(folder), project_name=PROJECT)
     writer.store_config(_Config(plan), {"preset": plan.preset_name, **asdict(plan.preset)})
     return _Stopped(writer)
 
@@ -90,11 +108,11 @@ class MlflowWriter:
         import mlflow
 
         self._mlflow = mlflow
-        self._board = _board(folder, purge_step)
         mlflow.set_experiment(PROJECT)
         mlflow.start_run(run_name=folder.name)
         mlflow.log_params({"task": plan.task, "seed": plan.seed, "preset": plan.preset_name})
         mlflow.log_dict(_Config(plan).to_dict(), "task_config.json")
+        self._board = _board(folder, purge_step)
 
     def add_scalar(self, tag: str, value: float, step: int) -> None:
         """Write one value."""

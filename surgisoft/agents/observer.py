@@ -1,8 +1,9 @@
 """The observer: an estimate of an arm's body and of its pumps from what a rig measures.
 
 The arm's model runs beside the rig, driven by the measured pressures, and its output is corrected
-by a filtered output disturbance, as in offset-free model predictive control (Pannocchia & Rawlings
-2003). Tasks on a rig and exported controllers use the same observer.
+by an output disturbance, as in offset-free model predictive control (Pannocchia & Rawlings 2003).
+The disturbance is learned while the arm moves (`tasks.world.adaptation`), or filtered with one gain
+for all key points. Tasks on a rig and exported controllers use the same observer.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.scene import frames
+from surgisoft.tasks.world.adaptation import Adaptation, DisturbanceEstimator
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.observer import AlphaBetaFilter
 
@@ -27,12 +29,23 @@ class ObserverGains:
     """Whether cameras measure the key points; else the model alone estimates them."""
     observer_gain: float = 0.3
     """Share of the innovation (cameras minus estimate) that the estimate adopts in a step, 0..1:
-    the alpha of an alpha-beta filter."""
+    the alpha of an alpha-beta filter. A value other than the default asks for that filter."""
     drift_gain: float = 0.01
     """Share of the innovation that is added to the disturbance's rate, 0..1: the filter's beta."""
     pump_gain: float = 0.3
     """Share of the difference between measured and expected pressure that the estimated offset of
     the pumps adopts in a step, 0..1."""
+    adapts: bool | None = None
+    """Whether the disturbance is learned online instead of filtered with one gain; None: unless the
+    gain or the drift gain differs from its default."""
+
+    @property
+    def adapting(self) -> bool:
+        """Whether the disturbance is learned online."""
+        if self.adapts is not None:
+            return self.cameras and self.adapts
+        usual = type(self).observer_gain, type(self).drift_gain
+        return self.cameras and (self.observer_gain, self.drift_gain) == usual
 
     def __post_init__(self):
         for name in ("observer_gain", "drift_gain", "pump_gain"):
@@ -55,9 +68,10 @@ class Observer:
     """Estimates one arm from measurements; a function of its arguments, batched, differentiable.
 
     `ArmPart.plant` has to be a dataclass with `target_kPa` (B, m) kPa, the pressures that were
-    commanded last, and `drift_mm` (B, n, 3) mm, world frame, by how much the output disturbance
-    grows in a step. `part.command` is the command after which a pump of the simulated arm would
-    give what the rig's pump gives: the two differ by an offset, which is estimated here.
+    commanded last, `drift_mm` (B, n, 3) mm, world frame, by how much the output disturbance grows
+    in a step, and `adaptation`, what was learned of it, as from `memory`. `part.command` is the
+    command after which a pump of the simulated arm would give what the rig's pump gives: the two
+    differ by an offset, which is estimated here.
     """
 
     def __init__(
@@ -67,6 +81,13 @@ class Observer:
         self.arm, self.gains, self.dt_s = arm, gains, dt_s
         self.lowest, self.highest = lowest, highest
         self.filter = AlphaBetaFilter(gains.observer_gain, gains.drift_gain)
+        self.learner = None
+        if gains.adapting:
+            self.learner = DisturbanceEstimator(arm.model, dt_s, device=arm.device)
+
+    def memory(self, count: int) -> Adaptation | None:
+        """What is known of the disturbance of `count` arms before the first measurement."""
+        return None if self.learner is None else self.learner.start(count)
 
     def followed(self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float) -> ArmPart:
         """The model after pressures (B, m) kPa were measured dt_s after the sample before."""
@@ -108,19 +129,45 @@ class Observer:
         shift = order.shift_kPa + self.gains.pump_gain * surprise
         return self._seen(replace(part, command=order.target_kPa + shift), pressure, points_mm)
 
+    def learned(self, part: ArmPart, pressure: Tensor, points_mm: Tensor) -> ArmPart:
+        """The part before the episode, after a sample; the arguments are those of `begun`.
+
+        Call it once in each step of a task while the arm is brought to its start, so that the
+        disturbance is known when the episode begins. A filter has nothing to learn from that.
+        """
+        if self.learner is None:
+            return part
+        return self._adapted(part, frames.apply(part.mount, points_mm), pressure)[1]
+
     def _seen(
         self, part: ArmPart, pressure: Tensor, points_mm: Tensor, begins: bool = False
     ) -> ArmPart:
         """The part as estimated; its key points so far are the model's.
 
-        An alpha-beta filter (Kalata 1984) estimates by how much the body lies off the model: it
-        follows a steady drift without lag.
+        By how much the body lies off the model is learned, or estimated by an alpha-beta filter
+        (Kalata 1984), which follows a steady drift without lag.
         """
         seen, offset, plant = part.points_mm, part.offset_mm, part.plant
-        if self.gains.cameras:
+        if self.learner is not None:
+            now, part = self._adapted(part, frames.apply(part.mount, points_mm), pressure)
+            seen, offset, plant = seen + now, part.offset_mm, part.plant
+        elif self.gains.cameras:
             measured = frames.apply(part.mount, points_mm)
             surprise = torch.where(measured.isfinite(), measured - seen - offset, 0.0)
             filtered = AlphaBetaFilter() if begins else self.filter
             now, offset, drift = filtered.adopted(surprise, offset, plant.drift_mm)
             seen, plant = seen + now, replace(plant, drift_mm=drift)
         return replace(part, seen_mm=seen, seen_kPa=pressure, offset_mm=offset, plant=plant)
+
+    def _adapted(self, part: ArmPart, measured: Tensor, pressure: Tensor) -> tuple[Tensor, ArmPart]:
+        """Disturbance (B, n, 3) mm, world frame, and the part that has learned from a sample.
+
+        measured: (B, n, 3) mm, world frame, nan where a key point was lost.
+        """
+        assert self.learner is not None
+        turn = part.mount[:, :3, :3]
+        off = (measured - part.points_mm) @ turn
+        memory, now = self.learner.updated(part.plant.adaptation, off, pressure)
+        offset = self.learner.expected(memory, pressure) @ turn.mT
+        plant = replace(part.plant, adaptation=memory)
+        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset)

@@ -37,6 +37,7 @@ from surgisoft.rig.safety import SafeRig
 from surgisoft.scene import frames
 from surgisoft.surrogate.reach import steady_key_points
 from surgisoft.tasks.base import Task
+from surgisoft.tasks.world.adaptation import Adaptation
 from surgisoft.tasks.world.arm import ArmPart, ModelArm
 from surgisoft.tasks.world.pytree import ObjectBatch
 from surgisoft.tasks.world.random_streams import Stream
@@ -60,6 +61,8 @@ class RigConfig:
     """The field of `ObserverGains`."""
     pump_gain: float = ObserverGains.pump_gain
     """The field of `ObserverGains`."""
+    adapts: bool | None = ObserverGains.adapts
+    """The field of `ObserverGains`."""
     settle_s: float = 4.0
     """Time at each pressure of the random history before an episode, s."""
     rigs: tuple[str, ...] = ("virtual",)
@@ -76,7 +79,8 @@ class RigConfig:
     @property
     def gains(self) -> ObserverGains:
         """The gains of the observer."""
-        return ObserverGains(self.cameras, self.observer_gain, self.drift_gain, self.pump_gain)
+        gains = self.observer_gain, self.drift_gain, self.pump_gain
+        return ObserverGains(self.cameras, *gains, self.adapts)
 
 
 FOREIGN_RATIO = 5.0
@@ -148,6 +152,8 @@ class RigPlant:
     """(B, m) kPa: pressures that were commanded last."""
     drift_mm: Tensor
     """(B, n, 3) mm, world frame: by how much the output disturbance grows in a step."""
+    adaptation: Adaptation | None = None
+    """What was learned of the output disturbance; None where it is filtered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,12 +255,23 @@ class RigArm:
             gain=torch.ones_like(part.gain),
             arm=self.model.initial_state(len(rigs.items)),
             belief=None,
-            plant=RigPlant(rigs, first, torch.zeros_like(part.offset_mm)),
+            factors=None,
+            plant=RigPlant(
+                rigs,
+                first,
+                torch.zeros_like(part.offset_mm),
+                self.observer.memory(len(rigs.items)),
+            ),
         )
-        off_mm = []
+        off_mm, number = [], 0
+        held = max(1, round(self.config.settle_s / self.period_s))
+        last = held * (len(passed) + 1)
         for target in (*passed, first):
-            for _ in range(max(1, round(self.config.settle_s / self.period_s))):
+            for _ in range(held):
                 part, reading = self._read(part, target)
+                number += 1
+                if number % self.reads == 0 and number < last:
+                    part = self.observer.learned(part, reading.pressure, reading.points_mm)
             off_mm.append(frames.apply(part.mount, reading.points_mm) - part.points_mm)
         self._compare(torch.stack(off_mm))
         part = self.observer.begun(part, reading.pressure, reading.points_mm)

@@ -59,9 +59,12 @@ def algorithm_config(agent: str, preset: Preset, processes: Processes, critic: s
     }
 
 
-def groups_of(agent: str, agents: Collection[str]) -> tuple[str, ...]:
-    """Groups that an agent's actor and, the last, its critic see; one where the agent is alone."""
-    return (agent, STATE) if len(agents) > 1 else (agent,)
+def groups_of(agent: str, agents: Collection[str], privileged: bool = False) -> tuple[str, ...]:
+    """Groups that an agent's actor (the first) and its critic (the last) see.
+
+    One where the agent is alone and the critic not privileged.
+    """
+    return (agent, STATE) if len(agents) > 1 or privileged else (agent,)
 
 
 def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, PPO]:
@@ -71,7 +74,7 @@ def make_ppo(env: JointEnv, preset: Preset, processes: Processes) -> dict[str, P
         view = SimpleNamespace(
             num_envs=env.num_envs, num_actions=env.task.world.arms[agent].chambers
         )
-        groups = groups_of(agent, env.task.agents)
+        groups = groups_of(agent, env.task.agents, env.privileged)
         config = algorithm_config(agent, preset, processes, groups[-1])
         with contextlib.redirect_stdout(io.StringIO()):
             ppo = PPO.construct_algorithm(seen.select(*groups), view, config, str(device))
@@ -133,7 +136,7 @@ def collect_rollout(env: JointEnv, agents: dict[str, PPO], seen: TensorDict, ste
     def note(name: str, value: Tensor) -> None:
         notes.setdefault(name, []).append(value)
 
-    groups = {agent: groups_of(agent, agents) for agent in agents}
+    groups = {agent: groups_of(agent, agents, env.privileged) for agent in agents}
     for _ in range(steps):
         actions = {agent: ppo.act(seen.select(*groups[agent])) for agent, ppo in agents.items()}
         seen, rewards, dones, extras = env.step(actions)

@@ -17,6 +17,8 @@ WORDS = {
     "clearance_mm": "least clearance [mm]",
 }
 """Numbers that are drawn for every episode, in words."""
+UNITS = {"_mm": "mm", "_mm2": "mm²", "_s": "s"}
+"""Unit of a number by the end of its name."""
 HOW = (
     "Means are over episodes, with 95 % intervals in brackets: Wilson's for rates, by bootstrap "
     "for all else. The beam's error is the distance of its axis from its target while it is on. "
@@ -25,12 +27,18 @@ HOW = (
 
 
 def evaluation_page(
-    task: str, on: str, results: Sequence[Evaluation], logs: Mapping[str, EpisodeLog], about: str
+    task: str,
+    on: str,
+    results: Sequence[Evaluation],
+    logs: Mapping[str, EpisodeLog],
+    about: str,
+    films: Mapping[str, Picture] | None = None,
 ) -> Page:
-    """HTML page of an evaluation; logs: policy -> its first episode."""
+    """HTML page of an evaluation; logs: policy -> its first episode, films: its endoscope's."""
+    films = films or {}
     names = list(dict.fromkeys(name for result in results for name in result.overall))
     rows = [
-        (name, *(cell(result.overall.get(name), name in RATES) for result in results))
+        (in_words(name), *(cell(result.overall.get(name), name in RATES) for result in results))
         for name in names
     ]
     header = ["mean [95 % interval]", *(Path(result.policy).name for result in results)]
@@ -45,7 +53,10 @@ def evaluation_page(
             Section("All numbers", [Table(header, rows)]),
             Section("Every episode", [Gallery(_spreads(results))]),
             *(
-                Section(f"First episode of {Path(name).name}", episode_parts(log))
+                Section(
+                    f"First episode of {Path(name).name}",
+                    [*([films[name]] if name in films else []), *episode_parts(log)],
+                )
                 for name, log in logs.items()
             ),
             Section("How to read this", [Text(HOW)]),
@@ -77,13 +88,23 @@ def _scrolling(picture: Picture) -> Picture:
     return Picture(picture.data, picture.alt, picture.caption, picture.kind, 620)
 
 
+def in_words(name: str) -> str:
+    """A number's name as people read it: `beam_error_max_mm` is `beam error max [mm]`."""
+    if name in WORDS:
+        return WORDS[name]
+    end = next((end for end in UNITS if name.endswith(end)), "")
+    unit = f" [{UNITS[end]}]" if end else ""
+    return name.removesuffix(end).replace("_", " ") + unit
+
+
 def verdict(task: str, results: Sequence[Evaluation]) -> str:
     """One sentence with each policy's success and error."""
     parts = []
     for result in results:
         success, error = result.overall.get("success"), _error(result)
         words = [] if success is None else [f"{success.mean:.0%} success"]
-        words += [] if error is None else [f"mean error {error.mean:.3g} mm"]
+        measured = error is not None and error.episodes
+        words += [f"mean error {error.mean:.3g} mm"] if measured else []
         parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
     episodes = len(next(iter(results[0].per_episode.values())))
     plural = "s" if episodes > 1 else ""
@@ -119,7 +140,7 @@ def _facts(result: Evaluation) -> list[tuple[str, str]]:
         value = result.overall.get(name)
         if value is not None and value.episodes:
             text = f"{value.mean:.0%}" if name in (*RATES, "completion") else f"{value.mean:.3g}"
-            items.append((name, text))
+            items.append((in_words(name), text))
     error = _error(result)
     if error is not None and error.episodes:
         items.append(("mean error", f"{error.mean:.3g} mm"))
@@ -135,7 +156,7 @@ def _spreads(results: Sequence[Evaluation]) -> list[Picture]:
             for result in results
             if name in result.per_episode
         ]
-        words = WORDS.get(name, name)
+        words = in_words(name)
         picture = spread_chart(words, groups, words)
         drawn += [] if picture is None else [picture]
     return drawn

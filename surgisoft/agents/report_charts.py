@@ -237,7 +237,7 @@ def spread_chart(
         figure, axis = plt.subplots(figsize=(CHART[0], max(1.6, 0.42 * len(known) + 1.0)))
         for place, (_, values) in enumerate(known):
             off = place + rng.uniform(-0.16, 0.16, len(values))
-            axis.scatter(values, off, s=14, c=BLUE, alpha=0.6, lw=0)
+            axis.scatter(values, off, s=36, c=BLUE, alpha=0.8, lw=0, zorder=3)
             if len(values):
                 axis.plot([values.mean()] * 2, [place - 0.3, place + 0.3], c=RED, lw=2)
         axis.set_yticks(range(len(known)), [name for name, _ in known])

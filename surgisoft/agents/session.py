@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import to_table
 from surgisoft.errors import InputError
 from surgisoft.progress import Progress, silent
+from surgisoft.scene.folder import Scene, open_scene
 from surgisoft.tasks.base import Episodes, Task
 from surgisoft.tasks.episodes.log import EpisodeLog
 from surgisoft.tasks.registry import (
@@ -97,7 +98,33 @@ class EvaluationRequest:
         if config is None and brought:
             config = brought[0].plan().task_config
         config = task_config(task, config, self.arm, self.scene)
+        if self.scene is not None or self.config is not None:
+            self._warn_of_scenes(brought, config, on_warning)
         return make_task(task, config), config
+
+    def _warn_of_scenes(
+        self, runs: list[RunFolder], config: Any, on_warning: Callable[[str], None]
+    ) -> None:
+        """Warn of runs that were trained in another scene than that of a configuration."""
+        place = getattr(config, "scene", None)
+        trained = [run for run in runs if run.config["scene"]]
+        if place is None or not trained:
+            return
+        here = _geometry(open_scene(place))
+        for run in trained:
+            if _geometry(open_scene(run.path / "scene")) != here:
+                there = Path(run.config["scene"]["from"]).name
+                on_warning(
+                    f"{run.path} was trained in another scene ({there}) than "
+                    f"{Path(place).name}; its result here says nothing about the scene: train there"
+                )
+
+
+def _geometry(scene: Scene) -> str:
+    """Digest of a scene's bodies, lesion, mounts and tools, whatever its names and arm models."""
+    mounts = tuple(replace(mount, arm="default", name="") for mount in scene.spec.mounts)
+    plain = replace(scene.spec, name="", note="", contours=(), mounts=mounts)
+    return replace(scene, spec=plain).content_hash
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import signal
 import threading
 import time
@@ -22,7 +23,7 @@ from torch import Tensor
 
 from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import ActorPolicy, agent_sizes, check_weights
-from surgisoft.agents.loggers import TENSORBOARD, open_writer
+from surgisoft.agents.loggers import TENSORBOARD, LoggerFailed, open_writer
 from surgisoft.agents.policy_network import ScaledActor
 from surgisoft.agents.ppo import RolloutMeans, collect_rollout, make_ppo, set_noise
 from surgisoft.agents.presets import Plan
@@ -84,7 +85,8 @@ class Training:
         self.plan, self.task, self.processes = plan, task, processes
         preset, rank = plan.preset, processes.rank
         torch.manual_seed(plan.seed)
-        self.env = JointEnv(task, preset.envs, plan.seed, preset.action_kPa, rank * _FAR)
+        given = (plan.seed, preset.action_kPa, rank * _FAR, preset.privileged)
+        self.env = JointEnv(task, preset.envs, *given)
         self.agents = make_ppo(self.env, preset, processes)
         if processes.count > 1:
             torch.manual_seed(plan.seed + rank * _FAR)
@@ -262,7 +264,11 @@ def train_new(
         create_run(folder, plan, task, agent_sizes(task), processes.count)
     processes.wait()
     # Everything is read back from the folder, so that resuming finds the same.
-    return _continue(RunFolder(folder), processes, device, report, logger)
+    try:
+        return _continue(RunFolder(folder), processes, device, report, logger)
+    except LoggerFailed:  # before the first step: nothing is lost with the folder
+        shutil.rmtree(folder)
+        raise
 
 
 def resume(
@@ -391,6 +397,7 @@ class _Log:
 
     def __init__(self, run: RunFolder, iteration: int, logger: str):
         """Lines after `iteration` are dropped: those iterations are computed again."""
+        self._board = open_writer(logger, run.path, run.plan(), iteration + 1)
         file = run.path / "metrics.jsonl"
         kept = []
         if file.is_file():
@@ -400,7 +407,6 @@ class _Log:
                         kept.append(line + "\n")
         file.write_text("".join(kept))
         self._file = file.open("a")
-        self._board = open_writer(logger, run.path, run.plan(), iteration + 1)
 
     def add(self, training: Training, turn: Iteration, found: dict, seconds: float) -> None:
         """Write one iteration, and the evaluation after it."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from surgisoft.agents.distributed import processes
 from surgisoft.agents.loggers import TENSORBOARD, check_logger
-from surgisoft.agents.presets import Plan, Preset, config_for, preset_for, steps_for
+from surgisoft.agents.presets import Plan, Preset, config_for, envs_for, preset_for, steps_for
 from surgisoft.agents.run_folder import RunFolder, check_free, default_folder
 from surgisoft.agents.session import task_config
 from surgisoft.agents.training import Result, TrainingProgress, resume, train_new
@@ -35,7 +35,7 @@ class TrainingRequest:
     minutes: float | None = None
     """Time to train in place of steps, minutes."""
     envs: int | None = None
-    """Episodes side by side; None: the preset's."""
+    """Episodes side by side; None: the preset's, and fewer in a short training."""
     seed: int = 0
     """Seed of weights, noise and episodes."""
     target_error: float | None = None
@@ -59,7 +59,10 @@ class TrainingRequest:
                 "training ends by one or the other"
             )
         config = task_config(self.task, self.config, self.arm, self.scene)
-        numbers = preset_for(self.preset, self.task, envs=self.envs)
+        envs = self.envs
+        if envs is None and self.steps is not None:
+            envs = envs_for(self.preset, self.task, self.steps)
+        numbers = preset_for(self.preset, self.task, envs=envs)
         if self.ppo:
             changed = merged(to_table(numbers), self.ppo)
             numbers = from_table(Preset, changed, Where(COMMAND_LINE, keys=("ppo",)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import cast
 
 import torch
 from rsl_rl.env import VecEnv
@@ -17,9 +18,25 @@ from torch import Tensor
 from surgisoft.errors import InputError
 from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task
+from surgisoft.tasks.world.arm import ArmPart, ModelArm
 
 STATE = "state"
-"""Observation group of the critics, privileged in training (CTDE): all agents' observations."""
+"""Observation group of the critics, privileged in training (CTDE): all agents' observations, and on
+request what only the simulation knows (`privileged_state`)."""
+
+
+def privileged_state(arm: ModelArm, part: ArmPart) -> Tensor:
+    """(B, P): what a simulation knows of an arm's episode and no policy may observe.
+
+    True key points less the observed ones, mm; gains less 1, in tenths; shift of the mount, mm, and
+    its rotation, as a rotation matrix less the nominal one, in hundredths; factors of random
+    effects, mm.
+    """
+    off = part.points_mm - part.seen_mm
+    shift = part.mount[:, :3, 3] - arm.pose[:3, 3]
+    turn = 100.0 * (part.mount[:, :3, :3] - arm.pose[:3, :3])
+    known = [off.flatten(1), 10.0 * (part.gain - 1.0), shift, turn.flatten(1)]
+    return torch.cat(known if part.factors is None else [*known, part.factors], 1)
 
 
 class JointEnv:
@@ -28,8 +45,19 @@ class JointEnv:
     Actions are in shares of `action_kPa`, so that a policy's output is of the order of 1.
     """
 
-    def __init__(self, task: Task, count: int, seed: int, action_kPa: float, first: int = 0):
-        """Episodes `first` to `first + count - 1` of a seed, each at another point of its time."""
+    def __init__(
+        self,
+        task: Task,
+        count: int,
+        seed: int,
+        action_kPa: float,
+        first: int = 0,
+        privileged: bool = False,
+    ):
+        """Episodes `first` to `first + count - 1` of a seed, each at another point of its time.
+
+        privileged: `STATE` also has the `privileged_state` of every arm.
+        """
         images = task.world.config.endoscope_images
         if images.kinds:
             raise InputError(
@@ -38,6 +66,7 @@ class JointEnv:
             )
         keep_freed_memory()
         self.task, self.num_envs, self.action_kPa = task, count, action_kPa
+        self.privileged = privileged
         self.episodes = Episodes(task, donate=True)
         with torch.inference_mode():
             state = self.episodes.seeded(seed, count, first)
@@ -47,10 +76,17 @@ class JointEnv:
 
     @torch.inference_mode()
     def get_observations(self) -> TensorDict:
-        """Agent -> (B, D), and `STATE` -> (B, sum of D); new tensors each time."""
+        """Agent -> (B, D), and `STATE` -> (B, sum of D, or more where it is privileged); new
+        tensors each time."""
         seen = self.episodes.observe(self.state)
-        joint = torch.cat([seen[agent] for agent in self.task.agents], 1)
-        return TensorDict({**seen, STATE: joint}, batch_size=[self.num_envs])
+        joint = [seen[agent] for agent in self.task.agents]
+        if self.privileged:
+            arms = self.task.world.arms
+            joint += [
+                privileged_state(cast(ModelArm, arms[name]), part)
+                for name, part in self.state.world.arms.items()
+            ]
+        return TensorDict({**seen, STATE: torch.cat(joint, 1)}, batch_size=[self.num_envs])
 
     @torch.inference_mode()
     def step(

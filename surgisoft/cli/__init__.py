@@ -2,13 +2,16 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 import typer
 from typer.exceptions import TyperException
 
 from surgisoft.errors import InputError
 from surgisoft.extras import missing_library
+from surgisoft.files import noted_writes
 
 app = typer.Typer(
     name="surgisoft",
@@ -66,6 +69,8 @@ OLD_NAMES = {
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+NAMED_FILES = 4
+"""Most files that the message after Ctrl-C names (a count)."""
 
 
 def _version(value: bool) -> None:
@@ -130,8 +135,24 @@ def with_commands() -> typer.Typer:
     return app
 
 
+def left_behind(written: Sequence[Path]) -> str:
+    """What an interrupted command leaves, in words: each file is complete or absent."""
+    there = [path for path in dict.fromkeys(written) if path.exists()]
+    outer = [path for path in there if not any(other in path.parents for other in there)]
+    if not outer:
+        return "no output was written"
+    names = ", ".join(map(str, outer[:NAMED_FILES]))
+    more = f" and {len(outer) - NAMED_FILES} more" if len(outer) > NAMED_FILES else ""
+    return f"written before and complete: {names}{more}; nothing else"
+
+
 def run(arguments: list[str] | None = None) -> int:
     """Run one command and return the exit code: 0, 2 for bad input, 130 after Ctrl-C."""
+    with noted_writes() as written:
+        return _run(arguments, written)
+
+
+def _run(arguments: list[str] | None, written: list[Path]) -> int:
     arguments = spread(sys.argv[1:] if arguments is None else arguments)
     try:
         code = with_commands()(args=arguments, standalone_mode=False, prog_name="surgisoft")
@@ -140,8 +161,7 @@ def run(arguments: list[str] | None = None) -> int:
     except TyperException as error:
         return _usage(error, sorted(MANY.intersection(arguments)))
     except (KeyboardInterrupt, typer.Abort):
-        print("surgisoft: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        code = INTERRUPTED
     except ModuleNotFoundError as error:
         advice = missing_library(error, arguments[0] if arguments else "")
         if advice is None:
@@ -157,8 +177,8 @@ def run(arguments: list[str] | None = None) -> int:
         return 0
     except OSError as error:
         return _fail(f"{error.filename or 'file system'}: {error.strerror or error}")
-    if code == INTERRUPTED:
-        print("surgisoft: interrupted", file=sys.stderr)
+    if code == INTERRUPTED:  # typer turns a KeyboardInterrupt into this code
+        print(f"surgisoft: interrupted; {left_behind(written)}", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 

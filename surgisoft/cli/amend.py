@@ -13,7 +13,7 @@ from surgisoft.cli.amended import (
     show_parameters,
     write_before_and_after,
 )
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -134,8 +134,7 @@ def amend(
         print("the network's last layer was fitted again, which lowers the error on held-out data")
     if result.refit is not None:
         print(f"{result.refit.sentence}, with parts of the training data left out")
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
     print(result.sentence)
     if saved:
         print(f"wrote {output}: {result.model.summary()}")

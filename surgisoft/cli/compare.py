@@ -7,7 +7,7 @@ from typing import Annotated
 from typer import Argument, Option
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import (
     check_model,
     leading_models,
@@ -146,8 +146,7 @@ def compare(
         _table(compared)
     if context:
         print(f"credibility: {assessed.sentence}")
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
     if result.explainable:
         names = " ".join(map(str, recordings))
         since = f" --before {' '.join(map(str, before))}" if before else ""

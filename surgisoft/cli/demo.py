@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.files import show_written
 from surgisoft.cli.progress import progress
 
 
@@ -27,5 +28,4 @@ def demo(
         print(f"{number}. {name}: {text}")
     if result.no_picture:
         print(f"no picture of the replay: {result.no_picture}")
-    print(f"wrote {result.page}: open it in a browser")
-    print(f"look around: surgisoft replay {output / 'cut.rrd'}")
+    show_written([result.page, output / "cut.rrd"])

@@ -7,7 +7,13 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_new_folder, check_replay
+from surgisoft.cli.files import (
+    check_folder,
+    check_free,
+    check_new_folder,
+    check_replay,
+    show_written,
+)
 from surgisoft.cli.inputs import check_model, read_before, read_recordings, warn, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -132,8 +138,7 @@ def diagnose(
         save_recordings(found.setup.mended(measured), apply)
         written.append(apply)
     _show(found)
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
     data = " ".join(map(str, recordings))
     if found.setup:
         _next_after_setup(found.setup, model, data, apply)

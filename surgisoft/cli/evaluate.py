@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import counted, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -134,9 +134,11 @@ def evaluate(
             written.append(write_replay(found.logs[policies[0]], replay, report=report_progress))
     if report:
         from surgisoft.agents.report import evaluation_page
+        from surgisoft.experiments.pictures import film
         from surgisoft.report import write_page
 
-        page = evaluation_page(found.task, on, list(found.results), found.logs, about)
+        films = {name: film(log) for name, log in found.logs.items() if log.camera is not None}
+        page = evaluation_page(found.task, on, list(found.results), found.logs, about, films)
         written.append(write_page(page, report / "report.html"))
     print(f"{found.task}, {on}: {about}; mean [95 % interval]")
     _show(found.results)
@@ -147,8 +149,7 @@ def evaluate(
             f"{', '.join(found.measured_arms)}: on a real bench, whose true body is not known; "
             "errors are those of the measured key points, camera noise included"
         )
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
 
 
 def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str, object]:
@@ -198,7 +199,9 @@ def _rig_config(
         rigs=rigs_in(rigs) if rigs else RigConfig().rigs,
         preflight=preflight,
     )
-    return found if observer_gain is None else replace(found, observer_gain=observer_gain)
+    if observer_gain is None:
+        return found
+    return replace(found, observer_gain=observer_gain, adapts=False)
 
 
 def _show(results) -> None:

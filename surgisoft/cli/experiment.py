@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import INTERRUPTED, app
-from surgisoft.cli.files import check_folder
+from surgisoft.cli.files import check_folder, show_written
 from surgisoft.cli.inputs import counted, read_context
 from surgisoft.cli.options import (
     Cluster,
@@ -103,8 +103,7 @@ def run(
     print(markdown(results))
     if context is not None:
         print(f"credibility: {assessed.sentence}")
-    for path in files:
-        print(f"wrote {path}")
+    show_written(files)
 
 
 @commands.command("check")

@@ -1,6 +1,7 @@
-"""Checks of output paths, before a command spends its time."""
+"""Output paths: checks before a command spends its time, and lines about what was written."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from surgisoft.errors import InputError
@@ -53,3 +54,22 @@ def check_replay(path: Path | None) -> None:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected a file to write")
     check_folder(path.absolute().parent)
+
+
+def show_written(paths: Iterable[object]) -> None:
+    """Print each file that was written, and how to look at it where that is not plain.
+
+    Of several pages only the first one is to be opened; the others belong to it.
+    """
+    shown = False
+    for path in paths:
+        file = Path(getattr(path, "path", str(path)))
+        pages_follow = file.suffix == ".html" and shown
+        shown = shown or file.suffix == ".html"
+        print(f"wrote {path}{'' if pages_follow else _how_to_look(file)}")
+
+
+def _how_to_look(path: Path) -> str:
+    if path.suffix == ".html":
+        return ": open it in a browser"
+    return f": look at it with 'surgisoft replay {path}'" if path.suffix == ".rrd" else ""

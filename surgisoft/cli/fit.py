@@ -7,7 +7,14 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import read_recordings
-from surgisoft.cli.options import SEED_MAX, EffectFiles, Force, Recordings, Threads
+from surgisoft.cli.options import (
+    SEED_MAX,
+    EffectFiles,
+    Force,
+    Recordings,
+    Threads,
+    with_effect_files,
+)
 from surgisoft.cli.progress import progress
 
 
@@ -114,3 +121,5 @@ def fit(
     for line in result.lines():
         print(line)
     print(f"wrote {output}: {result.model.summary()}")
+    following = with_effect_files(f"surgisoft compare {output} TEST.parquet --report PAGE")
+    print(f"next, its error on a recording that took no part: {following}")

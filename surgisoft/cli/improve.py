@@ -12,7 +12,7 @@ from surgisoft.cli.amended import (
     show_parameters,
     write_before_and_after,
 )
-from surgisoft.cli.files import check_folder, check_free, check_replay
+from surgisoft.cli.files import check_folder, check_free, check_replay, show_written
 from surgisoft.cli.inputs import check_model, read_recordings, warn_all
 from surgisoft.cli.options import (
     REFIT_PROCESSES,
@@ -26,6 +26,7 @@ from surgisoft.cli.options import (
     Refit,
     Replay,
     Report,
+    with_effect_files,
 )
 from surgisoft.cli.progress import progress
 from surgisoft.files import write_json
@@ -98,13 +99,14 @@ def improve(
     if replay:
         written.append(write_before_and_after(result, tables, model.name, replay))
     _show(result)
-    for path in written:
-        print(f"wrote {path}")
+    show_written(written)
     print(result.sentence)
     if not result.claimed:
         print(f"{output} was not written")
         raise typer.Exit(NOT_CLAIMED)
     print(f"wrote {output}: {result.model.summary()}")
+    following = with_effect_files(f"surgisoft compare {model} {output} TEST.parquet --report PAGE")
+    print(f"next, both on a recording that took no part: {following}")
 
 
 def _show(result) -> None:

@@ -19,6 +19,7 @@ from surgisoft.cli.options import (
     model_options,
 )
 from surgisoft.cli.options import Rig as RigOption
+from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import write_atomically, write_json
 
@@ -86,15 +87,17 @@ def next_experiment(
 
     competing = [name for item in between or [] for name in item.split(",") if name] or None
     settings = (AS_IT_STANDS,) if as_it_stands else tuple(SETUPS)
-    result = find_experiment(
-        model,
-        measured,
-        competing,
-        minutes,
-        settings,
-        predictions=predictions,
-        error_mm=model_error,
-    )
+    with progress("next-experiment") as report:
+        result = find_experiment(
+            model,
+            measured,
+            competing,
+            minutes,
+            settings,
+            predictions=predictions,
+            error_mm=model_error,
+            progress=report,
+        )
     warn_all(result.notes)
     write_atomically(output, schedule_text(result.protocol))
     if json_file:

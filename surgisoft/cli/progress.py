@@ -4,6 +4,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
+from datetime import datetime, timedelta
 
 from surgisoft.progress import Progress
 
@@ -13,14 +14,10 @@ LINE_EVERY_S = 30.0
 
 @contextlib.contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Show a progress bar with the time left; yields a function of (done, total, note)."""
+    """Show a bar with the rate, the time left and the end; yields a function of
+    (done, total, note)."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as RichProgress
 
     console = Console(stderr=True)
@@ -29,45 +26,55 @@ def progress(title: str) -> Iterator[Progress]:
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[pace]}"),
         TextColumn("{task.fields[note]}"),
     )
     with RichProgress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as bar:
-        task = bar.add_task(title, total=None, note="")
-        last, left = time.monotonic(), TimeLeft()
+        task = bar.add_task(title, total=None, note="", pace="")
+        last, paced = time.monotonic(), Pace()
 
         def report(done: float, total: float, note: str = "") -> None:
             nonlocal last
-            bar.update(task, completed=done, total=total, note=note)
-            remaining = left(done, total)
+            pace = paced(done, total)
+            bar.update(task, completed=done, total=total, note=note, pace=pace)
             if not console.is_terminal and time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
-                parts = ", ".join(part for part in (share, note, remaining) if part)
+                parts = ", ".join(part for part in (share, note, pace) if part)
                 print(f"surgisoft: {title}: {parts}", file=sys.stderr, flush=True)
 
         yield report
 
 
-class TimeLeft:
-    """Estimate of the remaining time of work, from its mean pace so far.
+class Pace:
+    """Rate, remaining time and end of work, from its mean rate so far.
 
     Starts again where less is done than before, because another part of the work has begun.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic):
-        self._clock = clock
+    def __init__(
+        self,
+        clock: Callable[[], float] = time.monotonic,
+        now: Callable[[], datetime] = datetime.now,
+    ):
+        self._clock, self._now = clock, now
         self._began, self._first, self._last = 0.0, 0.0, float("inf")
 
     def __call__(self, done: float, total: float) -> str:
-        """Text such as `3 min left`; empty where no estimate is possible yet."""
+        """Text such as `12 %/min, 3 min left, ends 14:32`; empty where no estimate is possible."""
         if done < self._last:
             self._began, self._first = self._clock(), done
         self._last = done
-        if not self._first < done < total:
+        passed = self._clock() - self._began
+        if not self._first < done < total or passed <= 0.0:
             return ""
-        seconds = (self._clock() - self._began) / (done - self._first) * (total - done)
-        return f"{seconds / 60.0:.0f} min left" if seconds > 90.0 else f"{seconds:.0f} s left"
+        rate = (done - self._first) / passed  # of the work, per second
+        seconds = (total - done) / rate
+        per_minute = 6000.0 * rate / total
+        pace = f"{per_minute / 60.0:.2g} %/s" if per_minute >= 60.0 else f"{per_minute:.2g} %/min"
+        left = f"{seconds / 60.0:.0f} min left" if seconds > 90.0 else f"{seconds:.0f} s left"
+        end = self._now() + timedelta(seconds=seconds)
+        day = f"{end:%Y-%m-%d} " if end.date() != self._now().date() else ""
+        return f"{pace}, {left}, ends {day}{end:%H:%M}"

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from surgisoft.cli import app
-from surgisoft.cli.files import check_free, check_replay
+from surgisoft.cli.files import check_free, check_replay, show_written
 from surgisoft.cli.inputs import check_model, warn
 from surgisoft.cli.options import (
     SEED_MAX,
@@ -156,9 +156,7 @@ def run(
     if json_file:
         write_json(json_file, found.to_json())
     _show(found)
-    for path in (*found.written, replay, json_file):
-        if path is not None:
-            print(f"wrote {path}")
+    show_written(path for path in (*found.written, replay, json_file) if path is not None)
     if found.alarms:
         name = model or "default"
         past = f" --before {' '.join(map(str, before))}" if before else ""

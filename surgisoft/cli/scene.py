@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from surgisoft.cli import app
+from surgisoft.cli.files import show_written
 from surgisoft.cli.options import EffectFiles, Force, Port, SaveReplay, Screenshot, Web
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -211,7 +212,7 @@ def show(
     reaches = reaches_of(scene)
     if save is not None:
         save_scene_view(scene, reaches, save)
-        print(f"wrote {save}")
+        show_written([save])
         return
     with temporary_recording() as recording:
         save_scene_view(scene, reaches, recording)

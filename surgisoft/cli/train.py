@@ -112,7 +112,12 @@ def train(
         typer.Option(metavar="MIN", help="Duration of the training, minutes, instead of --steps."),
     ] = None,
     envs: Annotated[
-        int | None, typer.Option(min=1, help="Number of episodes that are simulated in parallel.")
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of episodes that are simulated in parallel; default: by the task, fewer "
+            "in a short training, which so keeps its number of updates.",
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=SEED_MAX, help="Seed of weights, noise and episodes.")
@@ -192,6 +197,7 @@ def train(
     if why := shortfall(run):
         warn(why)
     print(f"next: {with_effect_files(f'surgisoft evaluate {run.folder}')}")
+    print(f"an episode of its last evaluation: surgisoft replay {run.folder}")
 
 
 def _measures(found: dict | None) -> str:

@@ -6,7 +6,7 @@ is amended. Every step is the command that it prints; one page shows them all.
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surgisoft.agents.report import episode_parts
@@ -19,6 +19,7 @@ from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
 from surgisoft.errors import InputError
+from surgisoft.files import new_folder
 from surgisoft.measurement.recordings import save_recording
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
@@ -74,12 +75,19 @@ def demo(
 ) -> Demonstration:
     """Run the demonstration into a new folder, whose `index.html` shows it.
 
-    policy: the training run of `circle_ablation` that cuts the ring; by default the one of the
-    package. Raises InputError where the folder is not empty or cannot be written.
+    The folder appears when all five are done. policy: the training run of `circle_ablation` that
+    cuts the ring; by default the one of the package. Raises InputError where the folder is not
+    empty or cannot be written.
     """
     folder = Path(folder)
     _claim(folder)
+    with new_folder(folder) as fresh:
+        result = _five_steps(fresh, policy, progress)
+    return replace(result, page=folder / result.page.name)
 
+
+def _five_steps(folder: Path, policy: str | Path, progress: Progress) -> Demonstration:
+    """Run the steps into a folder that is there."""
     progress(0, 100, "step 1 of 5: two arms cut a ring")
     cut = evaluate(policy, "circle_ablation", episodes=1, log=(str(policy),))
     log = cut.logs[str(policy)]
@@ -119,13 +127,14 @@ def demo(
 
 
 def _claim(folder: Path) -> None:
-    """Make the folder; raise unless it is new or empty."""
+    """Raise InputError unless the folder can be made, or is empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: already there; choose another folder with -o")
+    if folder.resolve() == Path.cwd():
+        raise InputError(f"{folder}: is the present folder, expected a new one; name it with -o")
     above = next(place for place in folder.absolute().parents if place.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written, {above} is not a writable folder")
-    folder.mkdir(parents=True, exist_ok=True)
 
 
 def _replay_picture(replay: Path, file: Path) -> tuple[Path | None, str]:

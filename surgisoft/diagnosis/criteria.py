@@ -3,7 +3,8 @@
 What a diagnosis names is decided by a fitted model (`decision`); its numbers stand in
 `assets/decision/decision.json` with the cases that they were fitted to. Here stand the settings of
 the search that proposes effects, generously, to that model, and the costs that its probabilities
-are weighed with. None of them was fitted to cases whose results are reported.
+are weighed with. None of them was fitted to cases whose results are reported, but for the cost of
+a wrong "unknown", which every fit chooses inside its own cases.
 
 Gains are shares of what can be explained of the held-out squared error (what lies above the noise
 floor). Sizes are errors above the noise floor in units of the model discrepancy, which is the
@@ -60,28 +61,33 @@ class Search:
 class Worth:
     """What a result is worth to its reader: 1 right, 0 "cannot tell".
 
-    Stated, not fitted. A name where no effect of the list is missing costs four times what a right
-    one gains, since its reader goes on to change what was right; a wrong name for what is missing
-    costs half of that, as `amend` shows on held-out data that it does less than promised.
+    Stated, not fitted, but for the cost of a wrong "unknown". A wrong name costs what a right one
+    gains, so a name is given where it is more probably right than wrong, and says with its
+    confidence how probably; `amend` shows on held-out data whether it does what was promised.
     """
 
-    needless_name: float = -4.0
+    needless_name: float = -1.0
     """An effect is named, alone or in a set, and none of the list is missing."""
-    wrong_name: float = -2.0
+    wrong_name: float = -1.0
     """An effect is named, alone or in a set, and another one of the list is missing."""
     right_set: float = 0.7
-    """The missing effect is one of two that are named as a set."""
+    """The missing effect is one of two that are named as a set. A wrong set costs this share of a
+    wrong name: its reader makes an experiment, and does not change the model."""
     half_pair: float = 0.0
     """One of two effects that are named together is missing, the other not: what is right of it and
     what is wrong cancel, since `amend` shows that the other one does nothing."""
     first_of_pair: float = 0.5
     """One effect is named, alone or in a set, and another one is missing too."""
-    wrong_unknown: float = -1.0
-    """An effect of the list, or none, is called unknown: no model is changed for it."""
+    wrong_unknown: float = -0.5
+    """An effect of the list, or none, is called unknown: no model is changed for it. The fit
+    chooses it (`UNKNOWN_COSTS` in `benchmarks/decision/fit.py`): the least cost with which no more
+    than one in twenty known effects or unchanged arms is called unknown."""
     wrong_nothing: float = -2.0
     """Something is missing and the result is that nothing is."""
     wrong_network: float = -1.0
-    """The network is called off, and something else is missing."""
+    """The model is called off, and something else is missing."""
+    least_probability: float = 1.0 / 3.0
+    """A statement that is less probable is not made."""
 
 
 @dataclass(frozen=True)

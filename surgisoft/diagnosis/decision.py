@@ -8,20 +8,24 @@ probabilities:
 - `first`: which effect of the list it is, given that it is in the list: a conditional logit over
   all effects (McFadden 1974), P(e) proportional to exp(w . x_e);
 - `two`: the two proposed effects are both missing, given that what is missing is in the list;
-- `network`: the network is off, undertrained or that of another arm, given that no effect of the
-  list is missing.
+- `network`: the model is off, undertrained or that of another arm, given that no effect of the list
+  is missing; not asked of a paired difference, which has no error of a model in it.
 
 So P(e) = P(missing) P(known) P(e | known). Every weight has a fixed sign: more evidence for a
-statement never makes it less probable. The result is the one whose worth to its reader, weighed
-with these probabilities, is largest (`criteria.Worth`; Savage 1954); "cannot tell" is worth 0.
-Weights, sources and hashes stand in `assets/decision/decision.json`.
+statement never makes it less probable. The probabilities of the most probable effect and of the
+two most probable ones are products of three fits; two curves calibrate them (Platt 1999), and what
+remains to 1 is shared by the others as before. Each statement that could be made has one
+probability (`Statement`), and the result is the one whose worth to its reader, weighed with it, is
+largest (`criteria.Worth`; Savage 1954). "Cannot tell" is worth 0 (Chow 1970: a statement that is
+not made), so it is the result only where no statement is probable enough. Weights, curves, sources
+and hashes stand in `assets/decision/decision.json`.
 """
 
 import hashlib
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -44,11 +48,12 @@ Kind = Literal[
     "setup",
 ]
 Reason = Literal["network", "learned", "few_data", "schedule"]
-"""Why a diagnosis cannot tell: the network is not that of this arm; the network has learned part of
+"""Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; there are too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 1
-"""Version of the asset's format and of the features."""
+SCHEMA = 2
+"""Version of the asset's format and of the features. An asset of schema 1 still opens: it has no
+calibration, and the features that are newer have no weight."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
 """The fitted decision that is in force."""
 FEW_MOTIONS = 24
@@ -58,17 +63,20 @@ FEW_PAIRED_MOTIONS = 12
 network that an effect has to be told apart from."""
 LEARNED = 0.1
 """Share of what can be explained that memory must explain beyond any static function before the
-network is said to have learned part of what is missing."""
+model is said to have learned part of what is missing."""
 LEAST_LEFT = 0.02
 """Share of what can be explained that no proposal is taken to fall below: a fiftieth is within what
 the noise floor is known."""
+LEAST_EXPLAINED = 0.05
+"""Share of what can be explained below which a black box is taken to explain nothing."""
 FORM_SHARE = 0.02
 """Share of what an effect explains that its formula gets wrong on a real arm: two effects whose
 changes differ by less are not told apart by how sure the blocks are, and a second one that explains
 less besides is not told from the first one's form."""
 MOSTLY_STATIC = 0.8
-"""Share of what a black box with memory explains that a static function must explain before the
-network alone is said to be off."""
+"""Share of what a black box with memory explains that a static function must explain before an
+error that is too large for "nothing is missing" is put down to the model where no effect is
+probable."""
 
 
 # Features -----------------------------------------------------------------------------------
@@ -86,6 +94,8 @@ class Feature:
     """Computes it from the evidence; for `first` from an effect's evidence and all of it."""
     meaning: str
     """What it is."""
+    since: int = 1
+    """Schema of the asset that had it first."""
 
 
 def _between(value: float, low: float, high: float) -> float:
@@ -139,6 +149,17 @@ def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
     if gain is None or log_gain is None:
         return 0.0
     return math.sqrt(_between(gain, 0.0, 1.0) * _between(log_gain, 0.0, 1.0))
+
+
+def _of_box(evidence: Evidence) -> float:
+    """What the best proposal explains over what a black box with memory explains, at most 1."""
+    explained = _explained(evidence)
+    return explained / max(evidence.free_box, explained, LEAST_EXPLAINED)
+
+
+def _stays(evidence: Evidence) -> float:
+    """Log of the error above the floor that the best proposal leaves over the whole of it."""
+    return _log(_left_size(evidence) / max(evidence.size, 1e-3), -3.0, 0.0)
 
 
 def _most_lack_of_fit(evidence: Evidence) -> float:
@@ -281,6 +302,34 @@ MISSING = (
         +1,
         lambda e: _between(e.free_box - e.free_static, 0.0, 1.0),
         "share that a black box with memory explains beyond any static function",
+    ),
+    Feature(
+        "over_validated",
+        +1,
+        lambda e: _log(e.error_over_validated, -1.0, 2.0),
+        "log of the error over the validated error",
+        since=2,
+    ),
+    Feature(
+        "size",
+        +1,
+        lambda e: _log(e.size, -1.0, 2.0),
+        "log of the error above the floor over the validated one",
+        since=2,
+    ),
+    Feature(
+        "of_box",
+        +1,
+        _of_box,
+        "what the best proposal explains, as a share of what a black box with memory explains",
+        since=2,
+    ),
+    Feature(
+        "stays",
+        -1,
+        _stays,
+        "log of the share of the error above the floor that the best proposal leaves",
+        since=2,
     ),
 )
 KNOWN = (
@@ -476,13 +525,38 @@ class Logistic:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """A calibration of probabilities (Platt 1999): log odds' = constant + slope x log odds."""
+
+    constant: float = 0.0
+    """Log odds where the probability was 0.5."""
+    slope: float = 1.0
+    """Above 1 where probabilities were too near to 0.5."""
+
+    def __call__(self, chance: float) -> float:
+        """The calibrated probability."""
+        chance = _between(chance, LEAST_CHANCE, 1.0 - LEAST_CHANCE)
+        return _sigmoid(self.constant + self.slope * math.log(chance / (1.0 - chance)))
+
+
+CALIBRATED = ("name", "set")
+"""Probabilities that have a curve: that of the most probable effect, of the two most probable."""
+LEAST_CHANCE = 1e-6
+"""Least probability whose log odds are taken."""
+
+
+@dataclass(frozen=True)
 class DecisionModel:
-    """The fitted decision: a logistic model for each of `FEATURES`."""
+    """The fitted decision: a logistic model for each of `FEATURES`, and curves of `CALIBRATED`."""
 
     models: dict[str, Logistic]
     """The fitted models by name."""
     about: dict[str, Any]
     """Sources, hashes, command and date of the fit."""
+    curves: dict[str, Curve] = field(default_factory=dict)
+    """The calibrations by name; one that is not there changes nothing."""
+    worth: Worth = WORTH
+    """What results are worth; the cost of a wrong "unknown" is chosen with the fit."""
 
 
 def content_hash(values: dict[str, Any]) -> str:
@@ -502,8 +576,8 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         values = read_json(path)
     except (OSError, InputError) as reason:
         raise InputError(f"{path.name}: no fitted decision ({reason}); install again") from None
-    if not isinstance(values, dict) or values.get("schema") != SCHEMA:
-        found = values.get("schema") if isinstance(values, dict) else None
+    found = values.get("schema") if isinstance(values, dict) else None
+    if type(found) is not int or not 1 <= found <= SCHEMA:
         raise InputError(
             f"{path.name}: a fitted decision of schema {found}, expected {SCHEMA}; fit it again"
         )
@@ -513,20 +587,44 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
     for name, features in FEATURES.items():
         one = _table(_table(values.get("models")).get(name))
         weights = _table(one.get("weights"))
-        expected = [feature.name for feature in features]
+        expected = [feature.name for feature in features if feature.since <= found]
         if list(weights) != expected:
             raise InputError(
                 f"{path.name}: model '{name}' has the features {', '.join(weights)},"
                 f" expected {', '.join(expected)}; fit it again"
             )
         numbers = (*weights.values(), one.get("constant"))
-        if not all(type(v) in (int, float) and abs(v) < math.inf for v in numbers):
+        if not all(_finite(v) for v in numbers):
             raise InputError(
                 f"{path.name}: model '{name}' has a weight that is no finite number; fit it again"
             )
-        models[name] = Logistic(numbers[:-1], numbers[-1])
-    about = {key: value for key, value in values.items() if key != "models"}
-    return DecisionModel(models, about)
+        each = tuple(float(weights.get(feature.name, 0.0)) for feature in features)
+        models[name] = Logistic(each, numbers[-1])
+    curves = _table(values.get("calibration"))
+    for name, one in curves.items():
+        given = _table(one)
+        if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
+            raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
+    cost = values.get("wrong_unknown", WORTH.wrong_unknown)
+    if not _finite(cost):
+        raise InputError(f"{path.name}: wrong_unknown is no finite number; fit it again")
+    return decision_of(models, values)
+
+
+def _finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) < math.inf
+
+
+def decision_of(models: dict[str, Logistic], values: dict[str, Any]) -> DecisionModel:
+    """The fitted decision of its models and the other values of an asset."""
+    fitted = ("models", "calibration")
+    curves = {
+        name: Curve(one["constant"], one["slope"])
+        for name, one in values.get("calibration", {}).items()
+    }
+    worth = replace(WORTH, wrong_unknown=values.get("wrong_unknown", WORTH.wrong_unknown))
+    about = {key: value for key, value in values.items() if key not in fitted}
+    return DecisionModel(models, about, curves, worth)
 
 
 @lru_cache(maxsize=1)
@@ -554,7 +652,7 @@ class Probabilities:
     nothing: float
     """Nothing is missing."""
     network: float
-    """The network is off, undertrained or of another arm, and no effect of the list is missing."""
+    """The model is off, undertrained or of another arm, and no effect of the list is missing."""
     unknown: float
     """Something outside the list is missing."""
     effects: dict[str, float]
@@ -583,7 +681,7 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
 
     missing = chance("missing")
     known = chance("known") if evidence.effects else 0.0
-    network = chance("network")
+    network = 0.0 if evidence.paired else chance("network")
     share = np.zeros(0)
     if evidence.effects:
         odds = model.models["first"].log_odds(features_of("first", evidence))
@@ -593,7 +691,7 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
     pair = [one.effects for one in evidence.proposals if len(one.effects) == 2]
     both = chance("two") if pair else 0.0
     ordered = sorted(each.items(), key=lambda item: -item[1])
-    return Probabilities(
+    found = Probabilities(
         nothing=(1.0 - missing) * (1.0 - network),
         network=(1.0 - missing * known) * network,
         unknown=missing * (1.0 - known) * (1.0 - network),
@@ -601,6 +699,49 @@ def probabilities(evidence: Evidence, model: DecisionModel | None = None) -> Pro
         pair=missing * known * both,
         two=pair[0] if pair else (),
     )
+    return calibrated(found, model.curves)
+
+
+def calibrated(raw: Probabilities, curves: dict[str, Curve]) -> Probabilities:
+    """The probabilities with those of the most probable effect and of the first two calibrated.
+
+    What remains to 1 is shared by all others as before. Where the curves make the second of two
+    effects more probable than the first, both have half of the set.
+    """
+    names = list(raw.effects)
+    if not names or not curves:
+        return raw
+    given = [raw.effects[name] for name in names[:2]]
+    name, both = (curves.get(each, Curve()) for each in CALIBRATED)
+    first, whole = name(given[0]), both(sum(given)) if len(given) > 1 else name(given[0])
+    whole = max(whole, first)
+    first = max(first, 0.5 * whole) if len(given) > 1 else first
+    others = (1.0 - whole) / max(1.0 - sum(given), LEAST_CHANCE)
+    effects = {name: chance * others for name, chance in raw.effects.items()}
+    effects |= dict(zip(names, (first, whole - first), strict=False))
+    known = sum(effects.values())
+    return replace(
+        raw,
+        nothing=raw.nothing * others,
+        network=raw.network * others,
+        unknown=raw.unknown * others,
+        effects=dict(sorted(effects.items(), key=lambda item: -item[1])),
+        pair=min(raw.pair * known / max(raw.known, LEAST_CHANCE), known),
+    )
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A statement that the diagnosis could make."""
+
+    kind: Kind
+    """Kind of the result."""
+    effects: tuple[str, ...]
+    """The effects that it names."""
+    probability: float
+    """Calibrated probability that it is right."""
+    worth: float
+    """What it is worth to its reader, weighed with the probabilities; "cannot tell" is worth 0."""
 
 
 @dataclass(frozen=True)
@@ -612,68 +753,110 @@ class Decision:
     effects: tuple[str, ...]
     """The effects that are named; the competing ones where they cannot be told apart."""
     confidence: float
-    """Calibrated probability that the statement is right, 0 to 1."""
+    """Calibrated probability that the statement is right, 0 to 1; where it cannot be told that of
+    the most probable statement."""
     probabilities: Probabilities
     """All probabilities."""
     reason: Reason | None = None
-    """Why it cannot be told; None for another kind."""
+    """Why it cannot be told, or why the model is called off where its validated error does not say
+    so; None for another kind."""
+    statements: tuple[Statement, ...] = ()
+    """All statements that could be made, worth most first."""
 
 
 def claimable(evidence: Evidence, claim: Claim = CLAIM) -> bool:
     """Whether "nothing is missing" may be claimed at all.
 
     The error must be near the noise floor or near what a black box with memory reaches, and must
-    not exceed the validated error by much.
+    not exceed the validated error by much. A paired difference must not exceed by much what the
+    recordings from before do not repeat.
     """
+    announced = evidence.error_over_validated <= claim.most_over_validated
     near = (
         evidence.error_over_floor <= claim.near_floor or evidence.error_over_box <= claim.near_box
     )
-    return near and evidence.error_over_validated <= claim.most_over_validated
+    return announced and (near or evidence.paired)
+
+
+def statements(
+    evidence: Evidence, chances: Probabilities, worth: Worth = WORTH, claim: Claim = CLAIM
+) -> tuple[Statement, ...]:
+    """All statements that could be made, each with its probability, worth most first."""
+    found: list[Statement] = []
+
+    def add(kind: Kind, effects: tuple[str, ...], chance: float, value: float) -> None:
+        found.append(Statement(kind, effects, chance, value))
+
+    names, known, pair = list(chances.effects), chances.known, chances.pair
+    both = pair / known if known and names[0] in chances.two else 0.0
+    whole = 1.0 - both * (1.0 - worth.first_of_pair)
+
+    def named(chance: float, right: float, wrong: float) -> float:
+        """Worth of a name or set: another effect, or none of the list, may be what is missing."""
+        none = min(1.0 - known, 1.0 - chance)
+        other = 1.0 - chance - none
+        return right * chance * whole + wrong * (
+            other * worth.wrong_name + none * worth.needless_name
+        )
+
+    if names:
+        chance = chances.effects[names[0]]
+        add("identified", (names[0],), chance, named(chance, 1.0, 1.0))
+    if len(names) > 1:
+        chance += chances.effects[names[1]]
+        value = named(chance, worth.right_set, worth.right_set)
+        add("ambiguous", (names[0], names[1]), chance, value)
+    if chances.two:
+        half = max(known - pair, 0.0) * worth.half_pair
+        add("several", chances.two, pair, pair + half + (1.0 - known) * worth.needless_name)
+    quiet, unknown = chances.nothing + chances.network, chances.unknown
+    if claimable(evidence, claim):
+        add("nothing_missing", (), quiet, quiet + (1.0 - quiet) * worth.wrong_nothing)
+    elif evidence.paired:
+        # More has changed than what does not repeat: what is not in the list is outside it.
+        unknown += quiet
+    add("unknown_effect", (), unknown, unknown + (1.0 - unknown) * worth.wrong_unknown)
+    if not evidence.paired:
+        # An error too large for "nothing" that is static is the model's, and no effect's.
+        static = _mostly_static(evidence) and not claimable(evidence, claim)
+        off = quiet if static else chances.network
+        add("surrogate_undertrained", (), off, off + (1.0 - off) * worth.wrong_network)
+    return tuple(sorted(found, key=lambda each: -each.worth))
 
 
 def decide(
     evidence: Evidence,
     model: DecisionModel | None = None,
-    worth: Worth = WORTH,
+    worth: Worth | None = None,
     claim: Claim = CLAIM,
 ) -> Decision:
-    """The result that is worth most to its reader, weighed with the fitted probabilities."""
-    chances = probabilities(evidence, model)
-    names = list(chances.effects)
-    known, pair = chances.known, chances.pair
-    needless = (1.0 - known) * worth.needless_name
-    tried: list[tuple[float, Kind, tuple[str, ...], float]] = []
-    both = pair / known if known and names[0] in chances.two else 0.0
-    whole = 1.0 - both * (1.0 - worth.first_of_pair)
-    if names:
-        first = chances.effects[names[0]]
-        value = first * whole + (known - first) * worth.wrong_name + needless
-        tried.append((value, "identified", (names[0],), first))
-    if len(names) > 1:
-        either = chances.effects[names[0]] + chances.effects[names[1]]
-        value = either * whole * worth.right_set + (known - either) * worth.wrong_name + needless
-        tried.append((value, "ambiguous", (names[0], names[1]), either))
-    if chances.two:
-        half = max(known - pair, 0.0)
-        value = pair + half * worth.half_pair + needless
-        tried.append((value, "several", chances.two, pair))
-    unknown = chances.unknown + (1.0 - chances.unknown) * worth.wrong_unknown
-    tried.append((unknown, "unknown_effect", (), chances.unknown))
-    quiet = chances.nothing + chances.network
-    if claimable(evidence, claim):
-        value = quiet + (1.0 - quiet) * worth.wrong_nothing
-        tried.append((value, "nothing_missing", (), quiet))
-    off = chances.network if claimable(evidence, claim) else quiet
-    if _mostly_static(evidence):
-        value = off + (1.0 - off) * worth.wrong_network
-        tried.append((value, "surrogate_undertrained", (), off))
-    value, kind, effects, sure = max(tried, key=lambda each: each[0])
-    if value <= 0.0:
-        return Decision("cannot_tell", (), max(sure, 0.0), chances, reason_of(evidence, chances))
-    beyond = evidence.error_over_validated > claim.most_over_validated
-    if kind == "surrogate_undertrained" and beyond:
-        return Decision("cannot_tell", (), sure, chances, "network")
-    return Decision(kind, effects, sure, chances)
+    """The statement that is worth most to its reader, weighed with the fitted probabilities.
+
+    worth: what statements are worth; default that of the fitted decision.
+    """
+    model = model or fitted_decision()
+    return chosen(evidence, probabilities(evidence, model), worth or model.worth, claim)
+
+
+def chosen(
+    evidence: Evidence, chances: Probabilities, worth: Worth = WORTH, claim: Claim = CLAIM
+) -> Decision:
+    """The statement that is worth most with given probabilities; none where none is worth it."""
+    tried = statements(evidence, chances, worth, claim)
+    best = next((one for one in tried if one.probability >= worth.least_probability), None)
+    if best is None or best.worth <= 0.0:
+        most = max(one.probability for one in tried)
+        return Decision("cannot_tell", (), most, chances, reason_of(evidence, chances), tried)
+    reason = _why_off(evidence, claim) if best.kind == "surrogate_undertrained" else None
+    return Decision(best.kind, best.effects, best.probability, chances, reason, tried)
+
+
+def _why_off(evidence: Evidence, claim: Claim) -> Reason | None:
+    """Why the model is called off; None where its validated error announced it."""
+    if evidence.error_over_validated > claim.most_over_validated:
+        return "network"
+    memory = evidence.free_box - evidence.free_static
+    return "learned" if memory >= LEARNED and not _mostly_static(evidence) else None
 
 
 def _mostly_static(evidence: Evidence) -> bool:

@@ -21,13 +21,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from surgisoft.diagnosis.candidates import candidates
-from surgisoft.diagnosis.criteria import CLAIM, SEARCH
+from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.data_quality import data_quality_warnings
 from surgisoft.diagnosis.decision import (
     Decision,
     Kind,
     Probabilities,
     Reason,
+    Statement,
     claimable,
     decide,
 )
@@ -78,14 +79,24 @@ MOST_FITTED = 3
 """Most effects that a fit is recommended with; `fit` takes those that lower its held-out error."""
 REASONS = {
     "network": "a function of the actuation alone explains most of the error, more than the "
-    "model's validated error allows: the model does not describe this arm as it is, fit it anew",
+    "model's validated error allows: the model does not describe this arm as it is, fit one to "
+    "these recordings",
     "learned": "the error is no larger than the model's validated error, and a black box with "
     "memory explains part of it that no static function does: the model was fitted to what is "
-    "missing and has learned part of it, fit it together with effects",
+    "missing and has learned part of it, fit one together with effects",
     "few_data": "the recordings show too few different motions",
     "schedule": "several causes explain these recordings about as well, and none well enough",
 }
 """Why a diagnosis cannot tell, in words."""
+
+MENTIONED = {
+    "identified": "{} is missing",
+    "several": "{} are missing",
+    "nothing_missing": "nothing is missing",
+    "unknown_effect": "an effect outside the list",
+    "surrogate_undertrained": "the model is off",
+}
+"""Statements that the sentence of "cannot tell" mentions, in words."""
 
 Progress = Callable[[str], None]
 """Called with what is being done."""
@@ -105,7 +116,8 @@ class Verdict:
     """Calibrated probability that the statement is right: that the named effect is missing, one of
     the set, both of two, nothing, or something unknown."""
     reason: Reason | None = None
-    """Why it cannot be told; None for another kind."""
+    """Why it cannot be told, or why the model is called off where its validated error does not say
+    so; None for another kind."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +194,8 @@ class Diagnosis:
     track: ChangeTrack | None = None
     """Key points before and after and what the named effects explain, for pictures; None without
     pairs."""
+    statements: tuple[Statement, ...] = ()
+    """All statements that could be made with these probabilities, worth most first."""
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
 
@@ -289,28 +303,15 @@ def findings_of(
 def since(result: Diagnosis, both: BeforeAfter, found: Findings) -> Diagnosis:
     """The diagnosis of a change: since when, how large it is, and what of it is explained.
 
-    The network's own error is not in a paired difference: what no effect explains there is no
-    network that was fitted too little, but something that has changed.
+    The model's own error is not in a paired difference, so the decision does not call the model off
+    there (`decision.statements`).
     """
-    verdict, change = result.verdict, both.change
-    chances = result.probabilities
-    if both.used and verdict.kind == "surrogate_undertrained" and chances is not None:
-        known = result.statistics is not None and within_repeatability(result.statistics)
-        sure = 1.0 - chances.known
-        kind: Kind = "nothing_missing" if known else "unknown_effect"
-        words = sentence_of(Decision(kind, (), sure, chances), result.error_mm, 0.0)
-        verdict = replace(verdict, kind=kind, sentence=words)
-        result = replace(result, next_command="")
-    text = f"since {both.names}: {verdict.sentence}; {change.sentence}"
+    verdict = result.verdict
+    text = f"since {both.names}: {verdict.sentence}; {both.change.sentence}"
     track = None
     if both.used:
         track = both.track(found.problem, found.explained_mm(verdict.effects))
-    return replace(result, change=change, track=track, verdict=replace(verdict, sentence=text))
-
-
-def within_repeatability(evidence: Evidence) -> bool:
-    """Whether a paired difference is about as large as what BEFORE does not repeat."""
-    return evidence.error_over_validated <= CLAIM.most_over_validated
+    return replace(result, change=both.change, track=track, verdict=replace(verdict, sentence=text))
 
 
 def with_less(result: Diagnosis, found: Findings) -> Diagnosis:
@@ -424,6 +425,7 @@ def result_of(found: Findings, decision: Decision | None = None) -> Diagnosis:
         checks=(*data_quality_warnings(problem), *would_explain(found, decision)),
         statistics=evidence,
         probabilities=decision.probabilities,
+        statements=decision.statements,
         next_command=next_command(decision),
     )
 
@@ -533,14 +535,27 @@ def sentence_of(decision: Decision, levels: ErrorLevels, reached: float) -> str:
             f"{f'{near} is nearest' if near else 'none is near'}); {error}"
         )
     if kind == "surrogate_undertrained":
-        return (
-            f"the model itself is off (its validated error says so too): fit it longer or to "
-            f"more data before looking for effects; {error}"
-        )
+        why = "its validated error says so too: it needs a longer fit, more data or a better form"
+        if decision.reason:
+            why = REASONS[decision.reason]
+        head = f"the model itself is off (confidence {sure:.2f}), look for no effects yet"
+        return f"{head}: {why}; {error}"
     if kind == "cannot_tell":
-        why = REASONS[decision.reason or "schedule"]
-        return f"cannot tell what is missing, if anything: {why}; {error}"
+        why, most = REASONS[decision.reason or "schedule"], _most_probable(decision)
+        most = f" (most probable: {most})" if most else ""
+        return f"cannot tell what is missing, if anything: {why}{most}; {error}"
     return f"nothing is missing that these recordings could show; {error}"
+
+
+def _most_probable(decision: Decision) -> str:
+    """The two most probable statements in words, those about one effect or none first."""
+    single = [one for one in decision.statements if one.kind in MENTIONED]
+    single.sort(key=lambda one: -one.probability)
+    texts = [
+        f"{MENTIONED[one.kind].format(' and '.join(one.effects))} {one.probability:.2f}"
+        for one in single[:2]
+    ]
+    return ", ".join(texts)
 
 
 def next_command(decision: Decision) -> str:
@@ -555,7 +570,7 @@ def next_command(decision: Decision) -> str:
     plan = f"{plan} -o SCHEDULE.csv"
     if kind == "ambiguous":
         return plan
-    if kind == "surrogate_undertrained" or decision.reason == "network":
+    if decision.reason == "network" or (kind == "surrogate_undertrained" and not decision.reason):
         return "surgisoft fit {data} -o NEW"
     if decision.reason == "learned":
         known = known_effects()

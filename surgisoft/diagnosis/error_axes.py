@@ -81,7 +81,7 @@ def polynomial(x: np.ndarray, degree: int = 3) -> np.ndarray:
 
 
 def lag(table: ResidualTable, time_s: float = LAG_S) -> np.ndarray:
-    """(S, m) actuation less its low pass of one of `TIMES_S`, arm's unit."""
+    """(S, m) actuation minus its low pass of one of `TIMES_S`, arm's unit."""
     return table.pressure - table.memory.low_pass[..., TIMES_S.index(time_s)]
 
 
@@ -152,7 +152,7 @@ AXES: dict[str, Axis] = {
         lambda table: _with(table, table.memory.direction),
     ),
     "since reversal": Axis(
-        "way of a chamber since it last reversed",
+        "travel of a chamber since its last reversal",
         "{unit}",
         lambda table: table.memory.since_reversal,
         lambda table: _with(table, _since_reversal(table)),
@@ -165,14 +165,14 @@ AXES: dict[str, Axis] = {
         timed=True,
     ),
     "lag": Axis(
-        f"actuation less its low pass of {LAG_S:g} s",
+        f"actuation minus its low pass of {LAG_S:g} s",
         "{unit}",
         lag,
         lambda table: _lags(table, [time for time in TIMES_S if time <= LAG_S]),
         timed=True,
     ),
     "past actuation": Axis(
-        f"actuation less its mean over the past, {PAST_S:g} s and longer",
+        f"actuation minus its mean over the past {PAST_S:g} s and longer",
         "{unit}",
         lambda table: lag(table, PAST_S),
         lambda table: _lags(table, [time for time in TIMES_S if time >= PAST_S]),

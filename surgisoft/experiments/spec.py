@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from surgisoft.agents.run_folder import PACKAGED
 from surgisoft.config import (
     Rule,
     Where,
@@ -22,7 +23,7 @@ from surgisoft.config import (
     write_toml,
 )
 from surgisoft.errors import InputError
-from surgisoft.scene.spec import Length, Point
+from surgisoft.scene.spec import SCENES, Length, Point
 from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
 
@@ -300,11 +301,22 @@ def _without_none(value: Any) -> Any:
     return [_without_none(part) for part in value] if isinstance(value, list) else value
 
 
+def _packaged(name: str) -> Path | None:
+    """The scene or the training run that the package brings along under a name."""
+    files = [*PACKAGED.glob("*/config.json"), *SCENES.glob("*/scene.toml")]
+    return {file.parent.name: file.parent for file in files}.get(name)
+
+
 def _absolute(spec: Experiment, where: Where) -> Experiment:
     """The experiment with absolute paths; raises an InputError for one that does not exist."""
 
     def there(text: str, place: Where, what: str) -> str:
-        return str(path_beside(place, text, what))
+        try:
+            return str(path_beside(place, text, what))
+        except InputError:
+            if (packaged := _packaged(text)) is None:
+                raise
+            return str(packaged)
 
     def of_case(i: int, case: Case) -> Case:
         place = where / "cases" / i

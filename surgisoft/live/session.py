@@ -567,7 +567,7 @@ class _Session:
         request = self.request
         config = RigConfig(cameras=request.cameras)
         if request.observer_gain is not None:
-            config = replace(config, observer_gain=request.observer_gain)
+            config = replace(config, observer_gain=request.observer_gain, adapts=False)
         task = on_rig(place, config, lambda config, trial: bench)
         policy = open_policy(request.policy, task)
         _rehearse(place, policy)

@@ -30,7 +30,7 @@ from surgisoft.replay.colours import (
     paler,
     series_colour,
 )
-from surgisoft.replay.plots import Corner
+from surgisoft.replay.plots import Corner, last_seconds, time_axis
 from surgisoft.replay.recording import SUFFIX, TIME
 from surgisoft.replay.shapes import finer
 from surgisoft.replay.viewer import (
@@ -56,7 +56,7 @@ LEGEND = "/legend"
 LEGEND_TEXT = f"""- **white**: measured body
 - **red**: body that the model predicts
 - **points**: measured key points, {" to ".join(ERROR_NAMES)} from 0 to {LARGE_MM:g} mm of residual
-- **arrows**: residual (measured less predicted), {STRETCH:g} times as long
+- **arrows**: error, from the measured to the predicted point, {STRETCH:g} times as long
 """
 
 
@@ -83,6 +83,7 @@ class LiveView:
 
     def __init__(self, recording: rr.RecordingStream, bench: LiveBench):
         self.recording, self.bench = recording, bench
+        self.end_s = 0.0
         recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for entity, colour, radius in (
             ("measured", MEASURED_COLOUR, 0.5),
@@ -95,7 +96,7 @@ class LiveView:
         chambers, points = range(bench.chambers), range(bench.key_points)
         colours = [series_colour(i) for i in chambers]
         names = [f"command {i + 1}" for i in chambers]
-        self._lines("pressure/command", names, [paler(colour) for colour in colours], 1.0)
+        self._lines("pressure/sent", names, [paler(colour) for colour in colours], 1.0)
         self._lines("pressure/measured", [f"chamber {i + 1}" for i in chambers], colours)
         colours = [series_colour(i) for i in points]
         self._lines("residual/key_points", [f"k{i}" for i in points], colours)
@@ -119,6 +120,7 @@ class LiveView:
         statistic: the detector's largest chart over its threshold, nan where there is none.
         """
         log = self.recording.log
+        self.end_s = t_s
         self.recording.set_time(TIME, duration=t_s)
         residual = measured_mm - predicted_mm
         known = np.isfinite(residual).all(axis=1)
@@ -129,11 +131,11 @@ class LiveView:
         if known.any():
             colours = error_colours(size[known], LARGE_MM)
             log("/body/points", rr.Points3D(measured_mm[known], colors=colours))
-            arrows = STRETCH * residual[known]
+            arrows = -STRETCH * residual[known]
             drawn = rr.Arrows3D(origins=measured_mm[known], vectors=arrows, colors=colours)
             log("/body/residual", drawn)
         log("/plots/pressure/measured", rr.Scalars(pressure))
-        log("/plots/pressure/command", rr.Scalars(command))
+        log("/plots/pressure/sent", rr.Scalars(command))
         log("/plots/residual/key_points", rr.Scalars(size))
         if not math.isnan(statistic):
             log("/plots/alarm/level", rr.Scalars(statistic))
@@ -163,21 +165,25 @@ def _curve(points_mm: np.ndarray) -> np.ndarray:
     return finer(kept, LINE_MM).astype(np.float32) if len(kept) > 1 else kept.astype(np.float32)
 
 
-def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
-    """The layout: bodies, events and colours beside plots, of the last minute with `follow`."""
+def live_blueprint(bench: LiveBench, end_s: float | None = None) -> rrb.Blueprint:
+    """The layout: bodies, events and colours beside plots.
+
+    end_s: length of a run that is over, which is shown as a whole; None: the last minute of one
+    that goes on.
+    """
     length = bench.length_mm
     middle = np.array([0.0, 0.0, 0.5 * length])
     eye = middle + 1.45 * length * np.array([0.3, -0.85, 0.35])
     scene = rrb.Spatial3DView(
         origin="/",
         contents=["+ /body/**"],
-        name=f"{bench.title}: residuals x {STRETCH:g}",
+        name=f"{bench.title} (arrows x {STRETCH:g})",
         background=rrb.Background(BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True),
         eye_controls=rrb.EyeControls3D(position=eye, look_target=middle, eye_up=(0.0, 0.0, 1.0)),
     )
     span = None
-    if follow:
+    if end_s is None:
         last = rrb.TimeRangeBoundary.cursor_relative(seconds=-WINDOW_S)
         now = rrb.TimeRangeBoundary.cursor_relative()
         span = [rrb.VisibleTimeRange(TIME, start=last, end=now)]
@@ -185,13 +191,17 @@ def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
     def plot(place: str, title: str, corner: Corner | None) -> rrb.TimeSeriesView:
         legend = rrb.PlotLegend(corner=corner) if corner else rrb.PlotLegend(visible=False)
         return rrb.TimeSeriesView(
-            origin=f"/plots/{place}", name=title, plot_legend=legend, time_ranges=span
+            origin=f"/plots/{place}",
+            name=title,
+            plot_legend=legend,
+            time_ranges=span,
+            axis_x=last_seconds(WINDOW_S) if end_s is None else time_axis(end_s),
         )
 
     plots = [
-        plot("residual", "Residual of each key point (mm)", "lefttop"),
+        plot("residual", "Residual of each key point (mm)", "righttop"),
         plot("alarm", "Alarm level; 1: the model stopped holding", None),
-        plot("pressure", f"Pressure ({bench.unit}); darker: command", "lefttop"),
+        plot("pressure", f"Pressure ({bench.unit}); darker: command", "righttop"),
     ]
     if bench.tracks:
         plots.append(plot("tracking", "Error of the task (mm)", None))
@@ -210,7 +220,7 @@ def live_blueprint(bench: LiveBench, follow: bool) -> rrb.Blueprint:
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(
-            state="collapsed", timeline=TIME, play_state="following" if follow else "paused"
+            state="collapsed", timeline=TIME, play_state="following" if end_s is None else "paused"
         ),
     )
 
@@ -249,13 +259,13 @@ def live_view(
             targets.append(rr.GrpcSink(f"rerun+http://{LOCAL}:{data}/proxy"))
         if file is not None:
             targets.append(rr.FileSink(stack.enter_context(new_file(file))))
-        recording.set_sinks(
-            *targets, default_blueprint=live_blueprint(bench, follow=viewer is not None)
-        )
+        recording.set_sinks(*targets, default_blueprint=live_blueprint(bench))
         stack.callback(recording.disconnect)
         if web:
             on_address(web_address(page, data))
-        yield LiveView(recording, bench)
+        view = LiveView(recording, bench)
+        yield view
+        recording.send_blueprint(live_blueprint(bench, view.end_s))
         recording.flush()
         if viewer is not None and stay():
             with contextlib.suppress(KeyboardInterrupt):

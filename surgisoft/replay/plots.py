@@ -66,6 +66,13 @@ LEGEND_ROOM = 0.42
 """Empty room at the end of each plot, in which its legend stands, as a share of the duration."""
 
 
+def last_seconds(window_s: float) -> rrb.TimeAxis:
+    """The time until the cursor, and room behind it for the legend, which so hides no curve."""
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s)
+    end = rrb.TimeRangeBoundary.cursor_relative(seconds=LEGEND_ROOM * window_s)
+    return rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end))
+
+
 def time_axis(end_s: float) -> rrb.TimeAxis:
     """The whole time from 0 on, and room behind it for the legend, which so hides no curve."""
     end = rrb.TimeRangeBoundary.absolute(seconds=end_s * (1.0 + LEGEND_ROOM))
@@ -111,13 +118,16 @@ def _lines(group: str, series: Mapping[str, np.ndarray]) -> tuple[Line, ...]:
 
 
 def _pressures(name: str, arm: ArmLog) -> tuple[Line, ...]:
-    """Each chamber's pressure and, thinner and darker, its command."""
+    """Each chamber's pressure and, thinner and darker, its command.
+
+    The viewer sorts a legend by entity: commands come last, since a low plot shows the first names.
+    """
     lines = []
     for i in range(arm.pressure_kPa.shape[1]):
         where, colour = f"/plots/pressure/{name}", series_colour(i)
         command, pressure = arm.command_kPa[:, i], arm.pressure_kPa[:, i]
-        lines.append(Line(f"{where}/c{i + 1}", f"command {i + 1}", command, paler(colour), 1.0))
         lines.append(Line(f"{where}/p{i + 1}", f"chamber {i + 1}", pressure, colour))
+        lines.append(Line(f"{where}/sent{i + 1}", f"command {i + 1}", command, paler(colour), 1.0))
     return tuple(lines)
 
 

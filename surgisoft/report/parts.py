@@ -2,6 +2,7 @@
 
 import base64
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +28,11 @@ class Text:
     """Paragraphs."""
 
     body: str
-    """Plain text; an empty line starts a new paragraph."""
+    """Plain text; an empty line starts a new paragraph, `backquotes` set code."""
 
     def to_html(self) -> str:
         paragraphs = (part.strip() for part in self.body.split("\n\n"))
-        return "".join(f"<p>{html.escape(part)}</p>" for part in paragraphs if part)
+        return "".join(f"<p>{_with_code(part)}</p>" for part in paragraphs if part)
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,11 @@ class Table:
         )
 
 
+def _with_code(text: str) -> str:
+    """Escaped text with what stands in backquotes as code."""
+    return re.sub("`([^`\n]+)`", r"<code>\1</code>", html.escape(text))
+
+
 def _flush(right: bool) -> str:
     return ' class="number"' if right else ""
 
@@ -123,7 +129,7 @@ def _cell(cell: str | Share, right: bool) -> str:
 
 
 def _is_numeric(cells: Sequence[str | Share]) -> bool:
-    known = [cell for cell in cells if not isinstance(cell, str) or cell not in ("", "-")]
+    known = [cell for cell in cells if not isinstance(cell, str) or cell not in ("", "-", "...")]
     return bool(known) and all(
         isinstance(cell, str) and cell.lstrip("+-−").lstrip("<").strip()[:1].isdigit()
         for cell in known

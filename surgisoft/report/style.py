@@ -44,9 +44,10 @@ border-radius:2px}}
 figure{{margin:0 0 16px}}
 img{{display:block;max-width:100%;height:auto}}
 .photo{{background:#fff;border-radius:4px}}
-.gallery{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,340px),1fr));
+.gallery{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,440px),1fr));
 gap:12px 20px}}
 .gallery img{{width:100%}}
+code{{font-size:.9em}}
 footer{{margin-top:40px}}
 @media (max-width:600px){{main{{padding:20px 14px 32px}}h1{{font-size:1.3rem}}
 .verdict{{font-size:1rem;padding:12px 14px}}}}

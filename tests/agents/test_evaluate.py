@@ -1,6 +1,7 @@
 """Numbers of episodes and their intervals, held against tables, simulation and the command."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import torch
 from surgisoft.agents.evaluate import bootstrap, episode_table, summary
 from surgisoft.agents.exact_checks import Contact, EpisodeCheck
 from surgisoft.agents.rollout import Rollout
-from surgisoft.agents.session import evaluate
+from surgisoft.agents.session import EvaluationRequest, evaluate
 from surgisoft.cli import run
+from surgisoft.scene.spec import PHANTOM
 from surgisoft.tasks.circle_ablation import CircleAblation
 from surgisoft.tasks.registry import make_task, read_config
 
@@ -198,3 +200,16 @@ def test_another_seed_gives_other_episodes(tmp_path):
     task = read_config("track_circle", tmp_path / "short.toml")
     asked = evaluate("random", "track_circle", config=task, episodes=2, seed=7)
     assert asked.results[0].per_episode["error_mean_mm"].tolist() == given[2][1]
+
+
+def test_a_policy_of_another_scene_is_warned_of(tmp_path):
+    """The packaged policy was trained on the phantom; the other scene has a smaller ring."""
+    other = tmp_path / "other"
+    shutil.copytree(PHANTOM, other)
+    file = other / "scene.toml"
+    file.write_text(file.read_text().replace("diameter_mm = 20.0", "diameter_mm = 18.0", 1))
+    told = []
+    for scene in (PHANTOM, other):
+        EvaluationRequest(("ring",), scene=scene).resolved(told.append)
+    assert len(told) == 1
+    assert "ring was trained in another scene (phantom_liver) than other" in told[0]

@@ -125,7 +125,8 @@ def test_task_and_world_have_the_same_arm(task):
 
 
 def test_without_noise_cameras_see_the_truth(task):
-    state = Episodes(on_rig(task, RigConfig(noise=0.0, settle_s=0.5))).seeded(0, 2)
+    raw = RigConfig(noise=0.0, settle_s=0.5, observer_gain=1.0)
+    state = Episodes(on_rig(task, raw)).seeded(0, 2)
     part = state.world.arms["arm"]
     torch.testing.assert_close(part.seen_mm, part.points_mm)
     # The prediction for the present pressure is the estimate: the offset takes the model there.

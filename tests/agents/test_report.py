@@ -1,8 +1,13 @@
 """The page of an evaluation, and what its charts say of logs whose truth is known."""
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from surgisoft.agents.evaluate import Summary
+from surgisoft.agents.report import in_words, verdict
 from surgisoft.agents.report_charts import broken_at_jumps, path_plane
 from surgisoft.cli import run
 from tests.report.browser import chromium, look
@@ -38,3 +43,31 @@ def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
         for width in (1280, 400):
             overflow, foreign, broken, _ = look(browser, tmp_path / "r" / "report.html", width)
             assert (overflow, foreign, broken) == (0, [], 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("beam_error_max_mm", "beam error max [mm]"),
+        ("healthy_mm2", "healthy [mm²]"),
+        ("time_s", "time [s]"),
+        ("collided", "collided"),
+        ("clearance_mm", "least clearance [mm]"),
+    ],
+)
+def test_numbers_have_names_with_units(name, words):
+    assert in_words(name) == words
+
+
+def test_an_error_that_never_applied_is_no_number_of_the_verdict():
+    never = Summary(math.nan, math.nan, math.nan, math.nan, math.nan, 0)
+    none, all_ = Summary(0.0, 0.0, 0.2, 0.0, 0.0, 9), Summary(0.4, 0.3, 0.5, 0.1, 0.7, 9)
+    found = [
+        SimpleNamespace(policy=policy, overall=overall, per_episode={"success": [0] * 9})
+        for policy, overall in (
+            ("a", {"success": none, "beam_error_mean_mm": never}),
+            ("runs/b", {"success": none, "beam_error_mean_mm": all_}),
+        )
+    ]
+    said = verdict("t", found)
+    assert said == "t, 9 episodes each. a: 0% success; b: 0% success, mean error 0.4 mm."

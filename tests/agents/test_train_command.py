@@ -5,6 +5,8 @@ import os
 import socket
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -98,3 +100,18 @@ def test_two_processes_learn_one_policy(tmp_path):
     one, other = (process["world"] for process in saved["processes"])
     assert not all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
     assert surgisoft(["train", "--resume", str(folder)]) == 2, "one process is not two"
+
+
+def test_a_logger_that_cannot_be_opened_leaves_nothing(tmp_path, capsys, monkeypatch):
+    """A stand-in for the library of a service that is not reached."""
+
+    def unreached(_):
+        raise ConnectionError("no server\nat localhost")
+
+    library = SimpleNamespace(set_experiment=unreached, __spec__=ModuleSpec("mlflow", None))
+    monkeypatch.setitem(sys.modules, "mlflow", library)
+    folder = tmp_path / "run"
+    assert surgisoft(["train", *SMALL, "--logger", "mlflow", "-o", str(folder)]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["surgisoft: error: --logger mlflow: cannot be opened: no server at localhost"]
+    assert not folder.exists()

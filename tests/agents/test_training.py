@@ -13,7 +13,7 @@ from surgisoft.agents.distributed import Processes
 from surgisoft.agents.learned import LearnedPolicy
 from surgisoft.agents.policies import Random
 from surgisoft.agents.ppo import algorithm_config, collect_rollout, make_ppo, set_noise
-from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, preset_for
+from surgisoft.agents.presets import PRESETS, Plan, Preset, config_for, envs_for, preset_for
 from surgisoft.agents.run_folder import BEST, LAST, RunFolder
 from surgisoft.agents.selection import SEED, evaluate_checkpoint, is_better
 from surgisoft.agents.session import EvaluationRequest
@@ -432,3 +432,33 @@ def test_weights_of_a_new_training_follow_from_its_seed():
 
     assert torch.equal(first(3), first(3))
     assert not torch.equal(first(3), first(4))
+
+
+def test_privileged_observations_reach_critics_and_never_actors():
+    """Whatever the simulation knows besides changes the critic's value, and no action."""
+    task = make_task("track_circle", config_for("robust", config_of("track_circle")))
+    env = JointEnv(task, 4, 0, 1.0, privileged=True)
+    (ppo,) = make_ppo(env, replace(TINY, envs=4), Processes()).values()
+    seen = env.get_observations()
+    wide = seen["arm"].shape[1]
+    other = seen.clone()
+    assert other[STATE].shape[1] > wide
+    other[STATE][:, wide:] += 1.0
+    assert torch.equal(ppo.actor(seen), ppo.actor(other))
+    assert not torch.allclose(ppo.critic(seen), ppo.critic(other))
+
+
+@pytest.mark.parametrize(
+    ("steps", "envs"),
+    [(8_000_000, 1024), (4_000_000, 1024), (3_999_999, 512), (1_000_000, 256), (100, 64)],
+)
+def test_a_short_training_keeps_its_updates_by_fewer_episodes(steps, envs):
+    """The path tasks' own training is 4 M steps of 1024 episodes."""
+    assert TrainingRequest("track_circle", steps=steps).plan().preset.envs == envs
+    named = TrainingRequest("track_circle", steps=steps, envs=1000).plan()
+    assert named.preset.envs == 1000
+    assert envs_for("paper", "track_circle", steps) == PRESETS["paper"].envs
+
+
+def test_a_training_by_the_clock_has_the_usual_episodes():
+    assert TrainingRequest("track_circle", minutes=1.0).plan().preset.envs == 1024

@@ -10,11 +10,13 @@ from benchmarks.decision.evidence_log import Labelled, append, read
 from benchmarks.decision.fit import (
     PRIORS,
     case_weights,
+    curve_of,
     fit,
     fit_one,
     log_losses,
     model_of,
     sample,
+    wrong_unknown_of,
 )
 from benchmarks.decision.own_rig import ROUND, Plan, draw
 from benchmarks.decision.table import (
@@ -28,6 +30,7 @@ from benchmarks.decision.table import (
 )
 from surgisoft.diagnosis.decision import (
     FEATURES,
+    Curve,
     Decision,
     Logistic,
     Probabilities,
@@ -145,6 +148,34 @@ def test_how_often_pairs_were_drawn_does_not_count():
     weights = case_weights("two", drawn("a", 10, 10) + drawn("b", 10, 30))
     assert weights[:10].sum() / weights[:20].sum() == pytest.approx(PRIORS["two"])
     assert weights[20:30].sum() / weights[20:].sum() == pytest.approx(PRIORS["two"])
+
+
+def test_a_calibration_gives_back_how_often_effects_are_missing():
+    """Of effects that were given 0.73, half are missing; of 0.27, one in twenty."""
+    predicted = []
+    for chance, count, hits in ((0.73, 200, 100), (0.27, 200, 10)):
+        for number in range(count):
+            known = number < hits
+            one = case(number, label="known" if known else "clean", truth=("creep",) * known)
+            predicted.append((one, Probabilities(1 - chance, 0, 0, {"creep": chance}, 0, ())))
+    curve = curve_of(1, predicted)
+    assert curve(0.73) == pytest.approx(0.5, abs=0.02)
+    assert curve(0.27) == pytest.approx(0.05, abs=0.02)
+    assert curve_of(2, predicted) == Curve()
+
+
+@pytest.mark.parametrize(("chance", "cost"), [(0.25, 0.25), (0.4, 1.0), (0.6, 2.0)])
+def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
+    """One in ten known effects has this probability of being outside the list."""
+    predicted = []
+    for number in range(20):
+        odd = number < 2
+        unknown = chance if odd else 0.0
+        model = {"creep": 0.01 if odd else 0.9}
+        rest = 1.0 - unknown - model["creep"]
+        predicted.append((case(number), Probabilities(rest, 0.0, unknown, model, 0.0, ())))
+    assert wrong_unknown_of(predicted, {}) == -cost
+    assert wrong_unknown_of(predicted[2:], {}) == -0.25
 
 
 def test_a_source_is_judged_without_its_own_cases(monkeypatch):

@@ -1,9 +1,10 @@
-"""How long work still takes: against clocks and paces given by hand."""
+"""Rate, rest and end of work: against clocks and rates given by hand."""
 
 import re
+from datetime import datetime
 
 import surgisoft.cli.progress as under_test
-from surgisoft.cli.progress import TimeLeft, progress
+from surgisoft.cli.progress import Pace, progress
 
 
 class Clock:
@@ -15,34 +16,46 @@ class Clock:
         return self.now
 
 
-def test_time_left_is_the_rest_at_the_mean_pace():
+def noon():
+    return datetime(2026, 11, 22, 12, 0, 0)
+
+
+def test_rate_rest_and_end_follow_the_mean_rate():
     clock = Clock()
-    left = TimeLeft(clock)
-    assert left(0, 10) == ""
+    pace = Pace(clock, noon)
+    assert pace(0, 10) == ""
     clock.now = 6.0
-    assert left(2, 10) == "24 s left"
+    assert pace(2, 10) == "3.3 %/s, 24 s left, ends 12:00"
     clock.now = 40.0
-    assert left(4, 30) == "4 min left"
-    assert left(30, 30) == ""
+    assert pace(4, 30) == "20 %/min, 4 min left, ends 12:04"
+    assert pace(30, 30) == ""
+
+
+def test_an_end_on_another_day_has_its_date():
+    clock = Clock()
+    pace = Pace(clock, noon)
+    pace(0, 24)
+    clock.now = 3600.0
+    assert pace(1, 24) == "0.069 %/min, 1380 min left, ends 2026-11-23 11:00"
 
 
 def test_work_that_goes_on_is_not_counted_as_done_in_no_time():
     clock = Clock()
-    left = TimeLeft(clock)
-    assert left(50, 100) == ""
+    pace = Pace(clock, noon)
+    assert pace(50, 100) == ""
     clock.now = 10.0
-    assert left(60, 100) == "40 s left"
+    assert pace(60, 100) == "1 %/s, 40 s left, ends 12:00"
 
 
-def test_the_next_part_of_the_work_has_its_own_pace():
+def test_the_next_part_of_the_work_has_its_own_rate():
     clock = Clock()
-    left = TimeLeft(clock)
-    left(0, 10)
+    pace = Pace(clock, noon)
+    pace(0, 10)
     clock.now = 100.0
-    left(10, 10)
-    assert left(1, 10) == ""
+    pace(10, 10)
+    assert pace(1, 10) == ""
     clock.now = 102.0
-    assert left(2, 10) == "16 s left"
+    assert pace(2, 10) == "5 %/s, 16 s left, ends 12:00"
 
 
 def test_without_a_terminal_occasional_lines_state_the_time_left(capsys, monkeypatch):
@@ -52,5 +65,7 @@ def test_without_a_terminal_occasional_lines_state_the_time_left(capsys, monkeyp
             report(done, 3, "playing")
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "surgisoft: evaluate scripted: 0%, playing"
-    assert re.fullmatch(r"surgisoft: evaluate scripted: 67%, playing, \d+ s left", lines[2])
+    assert re.fullmatch(
+        r"surgisoft: evaluate scripted: 67%, playing, \S+ %/s, \d+ s left, ends \d\d:\d\d", lines[2]
+    )
     assert lines[3] == "surgisoft: evaluate scripted: 100%, playing"

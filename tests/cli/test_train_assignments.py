@@ -56,6 +56,7 @@ def test_a_training_with_assignments_and_a_service(tmp_path, monkeypatch, capsys
     service.config = dict_like = ModuleType("config")
     dict_like.update = lambda values: sent.update(values)
     service.finish = lambda: ended.append(True)
+    service.run = ModuleType("run of wandb")
     monkeypatch.setattr(wandb_log_writer, "wandb", service)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: service)
     folder = tmp_path / "run"
@@ -73,6 +74,8 @@ def test_a_training_with_assignments_and_a_service(tmp_path, monkeypatch, capsys
     assert sent["train_cfg"]["gamma"] == 0.95
     assert any(name.startswith("evaluation/") for name in sent["values"])
     assert ended == [True]
+    assert service.run.name == "run", "not after the folder of TensorBoard's files"
+    assert [*(folder / "tensorboard").glob("events*")]
     assert "did not come far" in printed.err
 
 

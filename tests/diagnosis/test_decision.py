@@ -13,6 +13,7 @@ from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
     FEATURES,
+    Curve,
     DecisionModel,
     Logistic,
     claimable,
@@ -116,7 +117,7 @@ def test_every_kind_of_result(evidence, model, kind, effects):
     ],
 )
 def test_why_it_cannot_be_told(changes, reason):
-    quiet = given_odds(missing=0.0, known=-1.0)
+    quiet = given_odds(missing=0.0, known=-0.5)
     found = decide(replace(GOOD, **changes), quiet, Worth(wrong_network=-4.0))
     assert (found.kind, found.reason) == ("cannot_tell", reason)
 
@@ -155,6 +156,85 @@ def test_probabilities_by_hand():
     assert found.network == pytest.approx((1.0 - chance(1.0) * chance(2.0)) * chance(-1.0))
     total = found.nothing + found.network + found.unknown + found.known
     assert total == pytest.approx(1.0)
+
+
+CURVED = (Curve(-0.1, 1.1), Curve(-0.2, 1.2))
+"""Calibrations of the first effect and of the set."""
+
+
+def with_curves(model, name, both):
+    return replace(model, curves={"name": name, "set": both})
+
+
+def test_calibration_by_hand():
+    """First effect and set get the log odds of the curves; the others share what remains to 1."""
+    plain = given_odds(1.0, 2.0, network=-1.0, first=(("left", -2.0),))
+    raw = probabilities(GOOD, plain)
+    found = probabilities(GOOD, with_curves(plain, *CURVED))
+    first, second = raw.effects.values()
+
+    def odds(p):
+        return math.log(p / (1.0 - p))
+
+    both = sum(found.effects.values())
+    assert odds(found.effects["creep"]) == pytest.approx(-0.1 + 1.1 * odds(first))
+    assert odds(both) == pytest.approx(-0.2 + 1.2 * odds(first + second))
+    assert found.nothing + found.network + found.unknown + both == pytest.approx(1.0)
+    assert found.unknown / found.nothing == pytest.approx(raw.unknown / raw.nothing)
+
+
+@given(
+    missing=st.floats(-6, 9),
+    known=st.floats(-6, 9),
+    first=st.floats(-9, 0),
+    name=st.tuples(st.floats(-2, 2), st.floats(0.3, 3)),
+    both=st.tuples(st.floats(-2, 2), st.floats(0.3, 3)),
+)
+def test_calibrated_probabilities_are_probabilities(missing, known, first, name, both):
+    """They sum to 1, none is negative, and the most probable effect stays the first."""
+    model = given_odds(missing, known, first=(("left", first),))
+    evidence = replace(GOOD, proposals=(ALONE, PAIR))
+    raw, found = (
+        probabilities(evidence, one)
+        for one in (model, with_curves(model, Curve(*name), Curve(*both)))
+    )
+    chances = [found.nothing, found.network, found.unknown, *found.effects.values()]
+    assert min(chances) >= 0.0
+    assert sum(chances) == pytest.approx(1.0)
+    assert 0.0 <= found.pair <= found.known + 1e-12
+    assert next(iter(found.effects)) == next(iter(raw.effects))
+
+
+def test_no_model_is_off_where_a_paired_difference_is_explained():
+    """What is not in the list has changed otherwise, unless it is as large as what BEFORE does not
+    repeat."""
+    quiet = given_odds(missing=-9.0, network=9.0)
+    assert decide(replace(STATIC, paired=True), quiet).kind == "nothing_missing"
+    large = replace(STATIC, paired=True, error_over_validated=3.0)
+    assert probabilities(large, quiet).network == 0.0
+    assert decide(large, quiet).kind == "unknown_effect"
+
+
+def test_a_name_is_given_where_it_is_more_probably_right_than_wrong():
+    """By the cost of a wrong name alone: 1 to 1 needs 1/2, 2 to 1 needs 2/3."""
+    for chance, cost, kind in ((0.52, 1.0, "identified"), (0.64, 2.0, "cannot_tell")):
+        model = given_odds(missing=math.log(chance / (1.0 - chance)), known=9.0, first=CLEAR)
+        worth = Worth(wrong_name=-cost, needless_name=-cost, wrong_network=-4.0)
+        found = decide(replace(GOOD, free_static=0.85), model, worth)
+        assert found.kind == kind
+        worths = [one.worth for one in found.statements]
+        assert worths == sorted(worths, reverse=True)
+        named = next(one for one in found.statements if one.kind == "identified")
+        assert named.probability == pytest.approx(chance, abs=2e-3)
+
+
+def test_a_statement_below_the_least_probability_is_not_made():
+    """Free of cost it would be worth telling."""
+    vague = given_odds(missing=2.0, known=-1.0, first=CLEAR)
+    free = Worth(wrong_unknown=0.0, least_probability=0.6)
+    assert decide(GOOD, vague, free).kind == "unknown_effect"
+    free = replace(free, least_probability=0.7)
+    assert decide(GOOD, vague, free).kind == "cannot_tell"
 
 
 def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():
@@ -254,6 +334,28 @@ def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
     with pytest.raises(InputError, match=told) as caught:
         load_decision(bad)
     assert "\n" not in str(caught.value)
+
+
+def test_an_asset_of_the_first_schema_still_opens(tmp_path):
+    """Without calibration; the features that are newer have no weight."""
+    values = json.loads(ASSET.read_text())
+    for name, features in FEATURES.items():
+        for feature in features:
+            if feature.since > 1:
+                del values["models"][name]["weights"][feature.name]
+    for key in ("calibration", "wrong_unknown"):
+        del values[key]
+    values |= {"schema": 1}
+    old = tmp_path / "decision.json"
+    old.write_text(json.dumps(values | {"sha256": content_hash(values)}))
+    model = load_decision(old)
+    assert (model.curves, model.worth) == ({}, Worth())
+    newer = [feature.since > 1 for feature in FEATURES["missing"]]
+    assert any(newer)
+    weights = np.array(model.models["missing"].weights)
+    assert not weights[newer].any()
+    assert weights[~np.array(newer)].any()
+    assert decide(GOOD, model).kind == "identified"
 
 
 def test_an_asset_of_other_features_is_refused(tmp_path):

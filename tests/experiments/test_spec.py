@@ -1,6 +1,7 @@
 """Files of experiments: what is shipped loads, what is wrong is one line with its place."""
 
 import dataclasses
+import re
 
 import pytest
 
@@ -93,6 +94,16 @@ def test_hidden_effects_are_for_the_rig(tmp_path):
     text = TINY + case.replace('"creep"', '"grep"') + 'plant = "rig"\n'
     with pytest.raises(InputError, match="unknown hidden effect 'grep'"):
         settings(load_experiment(write(tmp_path, text)))
+
+
+def test_names_of_the_package_hold_in_any_folder(tmp_path):
+    text = re.sub("scene = .*", 'scene = "phantom_liver"', TINY)
+    case = '\n[[cases]]\nname = "learned"\npolicy = "ring"\n'
+    spec = load_experiment(write(tmp_path, text + case))
+    assert spec.scene == str(PHANTOM.resolve())
+    assert spec.cases[-1].policy.endswith("policies/ring")
+    with pytest.raises(InputError, match="there is no 'rung' beside this file"):
+        load_experiment(write(tmp_path, text + case.replace("ring", "rung")))
 
 
 def test_specs_are_values(tmp_path):

@@ -1,5 +1,7 @@
 """A body that leads its actuation is noticed, and nothing else is taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
@@ -147,3 +149,12 @@ def test_rests_steps_and_staircases_are_no_slow_sensor():
         (held(p, 5), held(p, 5)),  # the command is the staircase
     ):
         assert held_period_s(Recording("r", t_s, measured, points, commanded)) is None
+
+
+def test_samples_seconds_apart_have_no_lead():
+    """The largest lead that is looked for is shorter than one step of steady-state samples."""
+    rng = np.random.default_rng(2)
+    p = rng.uniform(0.0, 40.0, (400, 3))
+    recording = recorded(p, bent(p), rng)
+    slow = replace(recording, t_s=5.0 * np.arange(400))
+    assert body_lead(slow) is None

@@ -321,4 +321,6 @@ def test_a_legend_names_only_the_colours_that_are_drawn(log, replay):
 def test_pressure_lines_are_named(log):
     (laser,) = (plot for plot in plots_of(log) if plot.title == "Pressure of laser (kPa)")
     assert laser.legend
-    assert [line.name for line in laser.lines[:2]] == ["command 1", "chamber 1"]
+    by_entity = sorted(laser.lines, key=lambda line: line.entity)
+    names = [line.name for line in by_entity]
+    assert names == [f"{what} {i}" for what in ("chamber", "command") for i in (1, 2, 3)]

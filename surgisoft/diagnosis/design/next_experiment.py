@@ -68,6 +68,7 @@ from surgisoft.errors import InputError, unknown_name
 from surgisoft.measurement.histories import STILL_SHARE
 from surgisoft.measurement.protocols import SIGNALS, Protocol
 from surgisoft.measurement.recordings import Recording
+from surgisoft.progress import Progress, Stages, silent
 from surgisoft.surrogate.callables.arm import arm_by_itself
 from surgisoft.surrogate.callables.named import given_callable
 from surgisoft.surrogate.checkpoint import load_model
@@ -78,6 +79,8 @@ from surgisoft.workers import torch_threads
 
 # Competing effects and what is known of them -----------------------------------------------------
 
+QUESTION_STEPS = 4
+"""Steps that `pose_question` reports (a count)."""
 CLEAR = 3.0
 """Log evidence in the recordings, nats, from which on an effect's amplitudes are taken from
 them."""
@@ -120,12 +123,17 @@ class Question:
 
 
 def pose_question(
-    model: ArmModel, problem: Problem | None, competing: list[str] | None = None
+    model: ArmModel,
+    problem: Problem | None,
+    competing: list[str] | None = None,
+    progress: Progress = silent,
 ) -> Question:
     """The competing effects, with amplitudes from the recordings where those show them.
 
-    Default: every known effect that changes anything on this arm.
+    Default: every known effect that changes anything on this arm. progress: called with (steps
+    done, steps, note).
     """
+    progress(0, QUESTION_STEPS, "sensitivities of the effects")
     reference = reference_design(model)
     facts = None if problem is None else facts_of(problem)
     forms = forms_of(model, reference, competing, facts)
@@ -145,13 +153,16 @@ def pose_question(
     if problem is None:
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
     else:
+        progress(1, QUESTION_STEPS, "sensitivities on the recordings")
         dt, noise = sample_time(problem.history), problem.noise_mm
         design, residual = _thinned(problem)
         sensitivities = sensitivities_on(design, sizes.forms)
         uncertainty = uncertainty_of(model, noise, sizes.profile_mm, dt)
         gram = _with(residual, design, sensitivities, uncertainty).gram()
         fitted, gains = _fitted(gram, sizes)
+        progress(2, QUESTION_STEPS, "fits of the effects")
         sharp = _sharp(problem, sizes, fitted, gains) if competing else []
+        progress(3, QUESTION_STEPS, "what the recordings say")
         if sharp:
             sizes = Sizes.of(reference, sensitivities_on(reference, forms + sharp), forms + sharp)
             sensitivities += sensitivities_on(design, sizes.forms[len(sensitivities) :])
@@ -378,17 +389,27 @@ def pairs_of(names) -> list[tuple[str, str]]:
 
 
 def make_plans(
-    question: Question, limits: np.ndarray, minutes: float, settings: tuple[str, ...]
+    question: Question,
+    limits: np.ndarray,
+    minutes: float,
+    settings: tuple[str, ...],
+    progress: Progress = silent,
 ) -> list[Plan]:
     """The best runs on the bench as it stands and in every setting that touches a competing
-    effect."""
+    effect.
+
+    progress: called with (settings done, settings, note).
+    """
+    progress(0, 1, "predicted experiments")
     model = question.model
     runs = [draw_run(name, limits, 0) for name in SIGNALS]
     design = design_of(model, planned_history(model, runs), RUN_ROWS * len(runs))
     run = design.history.run_of_row[design.index].numpy()
     own = sensitivities_on(design, question.forms)
     answer = []
-    for name in dict.fromkeys([AS_IT_STANDS, *settings]):
+    names = list(dict.fromkeys([AS_IT_STANDS, *settings]))
+    for done, name in enumerate(names, 1):
+        progress(done, len(names) + 1, f"experiments: {name}")
         setting = SETUPS[name]
         if bench_minutes(LEAST_RUNS) > minutes - setting.minutes + 1e-9:
             continue
@@ -622,6 +643,7 @@ def next_experiment(
     reference: Sequence[Recording] | TrainingResiduals | None = None,
     predictions: Iterable[str | Path] | None = None,
     error_mm: float | None = None,
+    progress: Progress = silent,
 ) -> Recommendation:
     """The experiment that best distinguishes competing effects.
 
@@ -632,7 +654,7 @@ def next_experiment(
     between: the competing effects; without them those that explain the recordings best, and
     without recordings all known ones.
     settings: names of the experimental setups that may be asked for.
-    reference: as for `diagnose`.
+    reference: as for `diagnose`. progress: called with (done, total, note).
     """
     given = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
     if not given:
@@ -642,11 +664,15 @@ def next_experiment(
             )
         if callable(model) and not isinstance(model, ArmModel):
             model = arm_by_itself(given_callable(model))
-        return propose(load_model(model), between, minutes, settings)
+        return propose(load_model(model), between, minutes, settings, progress)
     arm, measured, _ = open_model(model, given, None, predictions, error_mm)
     arm, measured, notes = open_inputs(arm, measured)
     problem = identification_problem(arm, measured, reference)
-    found = recommend(problem, between or likely_competing(problem), minutes, settings)
+    stages = Stages(progress, 1.0)
+    if not between:
+        between = likely_competing(problem, progress=stages.stage(1 / 3, "likely effects"))
+    rest = stages.stage(1.0 - stages.done, "experiments")
+    found = recommend(problem, between, minutes, settings, rest)
     return replace(found, notes=notes)
 
 
@@ -655,12 +681,14 @@ def recommend(
     competing: Sequence[str],
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
+    progress: Progress = silent,
 ) -> Recommendation:
     """The experiment that best tells the competing effects apart, given a problem's recordings.
 
-    settings: names of the experimental setups that may be asked for.
+    settings: names of the experimental setups that may be asked for. progress: called with (done,
+    total, note).
     """
-    return _recommend(problem.model, problem, list(competing), minutes, settings)
+    return _recommend(problem.model, problem, list(competing), minutes, settings, progress)
 
 
 def propose(
@@ -668,21 +696,21 @@ def propose(
     competing: Sequence[str] | None = None,
     minutes: float = MINUTES,
     settings: tuple[str, ...] = tuple(SETUPS),
+    progress: Progress = silent,
 ) -> Recommendation:
     """The experiment that best tells the competing effects (default: all known effects) apart,
-    before anything was recorded."""
-    return _recommend(
-        model, None, None if competing is None else list(competing), minutes, settings
-    )
+    before anything was recorded. progress: called with (done, total, note)."""
+    names = None if competing is None else list(competing)
+    return _recommend(model, None, names, minutes, settings, progress)
 
 
-def likely_competing(problem: Problem, most: int = 4) -> list[str]:
+def likely_competing(problem: Problem, most: int = 4, progress: Progress = silent) -> list[str]:
     """The effects that explain the residual of a problem best: those that one could confuse.
 
     The best one, and up to `most` in all whose log evidence is at least half of its own; the two
     best where that is one alone.
     """
-    question = pose_question(problem.model, problem)
+    question = pose_question(problem.model, problem, progress=progress)
     gains = question.gains
     assert gains is not None, "a question about recordings has gains"
     best: dict[str, float] = {}
@@ -693,15 +721,16 @@ def likely_competing(problem: Problem, most: int = 4) -> list[str]:
     return order[:2] if len(near) < 2 else near[:most]
 
 
-def _recommend(model, problem, competing, minutes, settings) -> Recommendation:
+def _recommend(model, problem, competing, minutes, settings, progress) -> Recommendation:
     competing = None if competing is None else list(dict.fromkeys(competing))
     _check(model, competing, minutes)
-    question = pose_question(model, problem, competing)
+    stages = Stages(progress, 2.0)
+    question = pose_question(model, problem, competing, stages.stage(1.0, "effects"))
     limits = _limits(model, problem)
     for name in settings:
         if name not in SETUPS:
             raise unknown_name("experimental setup", name, SETUPS)
-    plans = make_plans(question, limits, minutes, settings)
+    plans = make_plans(question, limits, minutes, settings, stages.stage(1.0, "plans"))
     good = [plan for plan in plans if plan.worst >= TARGET]
     plan = min(good, key=lambda p: p.minutes) if good else max(plans, key=lambda p: p.worst)
     return _worded(question, plan, limits)

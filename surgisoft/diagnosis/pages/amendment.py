@@ -12,6 +12,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.improve import NETWORK, Improvement, Round
 from surgisoft.diagnosis.pages.pictures import bodies, save
 from surgisoft.diagnosis.residuals import ResidualTable
+from surgisoft.files import new_file
 from surgisoft.report import (
     Command,
     Facts,
@@ -387,9 +388,8 @@ def write_waterfall(
     """The waterfall as a PNG on white."""
     from matplotlib import pyplot as plt
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with drawing():
+    with drawing(), new_file(path) as fresh:
         figure = waterfall(before_mm, steps, floor_mm)
-        figure.savefig(path, dpi=160, facecolor="white")
+        figure.savefig(fresh, dpi=160, facecolor="white")
         plt.close(figure)
     return path

@@ -132,7 +132,8 @@ def _depends(result: Comparison, table: ResidualTable) -> Section:
         )
         for each in result.axes
     ]
-    listed = Table(["axis", "explains", "95 % interval", "counted", "what it is"], rows)
+    header = ["axis", "explains", "95 % interval [%]", "counted", "what it is"]
+    listed = Table(header, rows)
     charts = Gallery(axis_charts(result, table.spec.unit))
     return Section("What the error depends on", [*([listed] if rows else []), charts])
 
@@ -239,7 +240,7 @@ def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
         if share.axis == "direction":
             panel.set_xticks([-1, 0, 1], ["falling", "", "rising"])
     low.set_xlabel(f"{share.axis} [{share.unit}]" if share.unit else share.axis)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=7)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return chart(figure, f"what {share.axis} explains of the error")
 
 
@@ -282,7 +283,7 @@ def _chart(result: Comparison, axis: str, unit: str) -> Picture:
     low.set_xlabel(f"{axis} [{unit}]" if unit else axis)
     for panel in (top, low):
         if panel.get_legend_handles_labels()[1]:
-            panel.legend(fontsize=7, ncols=2)
+            panel.legend(fontsize=8, ncols=2)
     return chart(figure, f"error and bias over {axis}")
 
 
@@ -439,7 +440,7 @@ def _models_along(compared: Sequence[Compared]) -> Picture:
     axis.set_ylabel("error [mm]")
     axis.set_ylim(bottom=0)
     axis.set_title("along the arm")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=7)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return chart(figure, "error of each model along the arm")
 
 
@@ -463,5 +464,5 @@ def _models_over(compared: Sequence[Compared], name: str) -> Picture:
     axis.set_title(title)
     axis.set_xlabel(f"{name} [{unit}]" if unit else name)
     axis.set_ylabel("error [mm]")
-    figure.legend(loc="outside lower center", ncols=3, fontsize=7)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     return chart(figure, f"error of each model over {name}")

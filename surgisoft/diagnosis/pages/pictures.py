@@ -10,6 +10,7 @@ import torch
 
 from surgisoft.diagnosis.residuals import ResidualTable
 from surgisoft.error_scale import error_scale
+from surgisoft.files import new_file
 from surgisoft.palette import MEASURED_ON_LIGHT, RED, model_colour
 from surgisoft.time_axis import with_gaps
 
@@ -23,6 +24,8 @@ LADDER_ROWS = 400
 """Rows of the ladder's picture, in which one chamber moves alone."""
 POSTURES = 7
 """Bodies that the picture in space shows."""
+MOST_TICKS = 5
+"""Intervals between the marks on the horizontal axes in space, whose labels else overlap."""
 ERROR_COLOURS = "viridis"
 """Matplotlib's colour map of errors; the replay's is after it."""
 
@@ -47,8 +50,9 @@ def draw_all(table: ResidualTable, unit: str, folder: Path, title: str = "") -> 
 
 
 def save(figure, path: Path) -> Path:
-    """Write a figure and let go of it."""
-    figure.savefig(path, dpi=130)
+    """Write a figure, whole or not at all, and let go of it."""
+    with new_file(path) as fresh:
+        figure.savefig(fresh, dpi=130)
     plt.close(figure)
     return path
 
@@ -79,7 +83,7 @@ def ladder_loops(tables: dict[str, ResidualTable], unit: str):
         axes[0, column].set_title(f"{label}: tip RMSE {error:.2f} mm")
         axes[1, column].set_xlabel(f"chamber {chamber + 1} [{unit}]")
     axes[0, 0].set_ylabel("tip, main direction [mm]")
-    axes[1, 0].set_ylabel("tip less a cubic [mm]")
+    axes[1, 0].set_ylabel("tip minus a cubic [mm]")
     axes[0, 0].legend(frameon=False)
     return figure
 
@@ -113,7 +117,10 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
         static = _static(table.pressure, measured)
         pressure = table.pressure[rows, chamber]
         for row, (offset, what) in enumerate(
-            ((0 * static, "tip, main direction [mm]"), (static, "less what pressure explains [mm]"))
+            (
+                (0 * static, "tip, main direction [mm]"),
+                (static, "minus what pressure explains [mm]"),
+            )
         ):
             axis = axes[row, chamber]
             shown = (measured - offset)[rows]
@@ -210,6 +217,8 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
         axis.set_xlabel("x [mm]")
         axis.set_ylabel("y [mm]")
         axis.set_zlabel("z [mm]")
+        axis.locator_params(axis="x", nbins=MOST_TICKS)
+        axis.locator_params(axis="y", nbins=MOST_TICKS)
         known = table.error_mm[~np.isnan(table.error_mm)]
         rms = np.sqrt(np.square(known).mean())
         axis.set_title(f"{name}: error {rms:.3g} mm")

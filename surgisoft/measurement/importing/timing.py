@@ -105,7 +105,9 @@ class Moves:
         back, ahead = round(BACK_S / self.step_s), self._ahead(length)
         coarse = max(1, -(-back // STEPS))
         near = np.arange(-back, min(back, ahead) + 1, coarse)
-        far = np.geomspace(back, ahead, 12).round().astype(int) if ahead > back else near[:0]
+        far = (
+            np.geomspace(max(back, 1), ahead, 12).round().astype(int) if ahead > back else near[:0]
+        )
         shifts = np.union1d(np.union1d(near, far), [0]).astype(int)
         errors = {s: self._errors(rows, moved, length, s) for s in shifts.tolist()}
         best = min(errors, key=lambda s: errors[s].sum())

@@ -21,9 +21,15 @@ from surgisoft.surrogate.arm import ArmState
 from surgisoft.surrogate.backbone import Backbone
 from surgisoft.surrogate.compiled_step import CompiledStep
 from surgisoft.surrogate.model import ArmModel
+from surgisoft.tasks.world.adaptation import DisturbanceEstimator
 from surgisoft.tasks.world.compiled_arm import draw_body, drive, place
 from surgisoft.tasks.world.observer import AlphaBetaFilter, Belief
+from surgisoft.tasks.world.random_effects import RandomEffects
 from surgisoft.tasks.world.random_streams import Stream
+
+STOOD = 40
+"""Measurements at each pressure before an episode from which the observer learns, where it adapts:
+rigs are held there for 4 s."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,9 @@ class Randomisation:
     gain: float = 0.0
     """Standard deviation of the factor between a chamber's pressure and the model's input, no
     unit."""
+    effects_mm: float = 0.0
+    """Largest size of the effect out of the library that an episode's arm has and its model lacks:
+    root mean square displacement of the tip, mm. Each episode draws the kind and the size."""
     noise_mm: float = 0.0
     """Standard deviation of the noise on each coordinate of a measured key point, mm."""
     noise_kPa: float = 0.0
@@ -153,6 +162,8 @@ class ArmPart:
     None where the model moves it. Resets and row selections carry it like any tensor."""
     belief: Belief | None = None
     """Memory of the observer of a simulated arm; None where its estimate is the raw measurement."""
+    factors: Tensor | None = None
+    """(B, K): factors of the episode's random effects; None without any."""
 
     @property
     def model_beside(self) -> ArmState:
@@ -235,8 +246,9 @@ class ModelArm:
         samples: int,
         device: torch.device,
         observer: AlphaBetaFilter | None = None,
+        dt_s: float = 0.1,
     ):
-        """`samples` is the number K of centreline points."""
+        """`samples` is the number K of centreline points; dt_s: time of a step of the world, s."""
         spec = mounted.model.spec
         if spec.unit != "kPa":
             raise InputError(f"arm '{name}': its model has the unit {spec.unit}, expected kPa")
@@ -260,12 +272,21 @@ class ModelArm:
         self.shaft = torch.tensor([[0.0, 0.0, -mounted.shaft_mm]], **row)
         self.shaft = self.shaft if mounted.shaft_mm > 0.0 else self.shaft[:0]
         self._compiled = CompiledStep.of(self.model) if device.type == "cpu" else None
+        self._random_effects = RandomEffects(self.model) if randomisation.effects_mm > 0 else None
+        self._learner = None
+        if self.observer.adapts:
+            self._learner = DisturbanceEstimator(self.model, dt_s, device=device)
 
     def reference(self) -> ModelArm:
         """This arm stepped by differentiable tensor operations alone, which agree to rounding."""
         arm = copy.copy(self)
         arm._compiled = None
         return arm
+
+    @property
+    def _plant(self) -> ArmModel:
+        """The model that moves the simulated arm, which may have effects that `model` lacks."""
+        return self.model if self._random_effects is None else self._random_effects.model
 
     def start(self, stream: Stream) -> tuple[Stream, ArmPart]:
         """Draw parameters of an episode for each random number stream; returns (streams, arms)."""
@@ -278,9 +299,14 @@ class ModelArm:
         gain = 1.0 + vary.gain * normal
         pressure = (self.first + vary.start_kPa * spread).clamp(self.low, self.high)
         passed = (self.low + (self.high - self.low) * share).unbind(1)
-        state = self.model.initial_state(count)
+        factors = None
+        if self._random_effects is not None:
+            stream, factors = self._random_effects.draw(stream, vary.effects_mm)
+        state = self._plant.initial_state(count)
+        stood = []
         for target in (*passed, pressure):
-            state, points = self._advanced(state, gain * target, 1.0)
+            state, points = self._advanced(state, gain * target, 1.0, factors)
+            stood.append(points)
         mount = self._moved(turn)
         points = frames.apply(mount, points)
         part = ArmPart(
@@ -297,15 +323,29 @@ class ModelArm:
             seen_mm=points,
             seen_kPa=pressure,
             offset_mm=torch.zeros_like(points),
+            factors=factors,
         )
         stream, part = self._measured(stream, part)
         if self.observer.raw:
             return stream, part
         nominal = self.model.initial_state(count)
-        for target in (*passed, pressure):
+        learned = None if self._learner is None else self._learner.start(count)
+        for target, at in zip((*passed, pressure), stood, strict=True):
             nominal, shape = self._advanced(nominal, target, 1.0)
+            if self._learner is None:
+                continue
+            stream, noise = stream.normal(self.key_points, 3)
+            seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise
+            off = (seen - frames.apply(self.pose, shape)) @ self.pose[:3, :3]
+            learned, _ = self._learner.updated(learned, off, target, STOOD)
         offset = part.seen_mm - frames.apply(self.pose, shape)
-        return stream, replace(part, belief=Belief(nominal, offset, torch.zeros_like(offset)))
+        zero = torch.zeros_like(offset)
+        belief = Belief(nominal, offset, zero, zero[:, :1])
+        if self._learner is not None:
+            belief = replace(belief, adaptation=learned, offset_mm=zero)
+            now, belief = self._learned(belief, offset, part.seen_kPa)
+            part = replace(part, seen_mm=part.seen_mm - offset + now)
+        return stream, replace(part, belief=belief)
 
     def step(
         self, stream: Stream, part: ArmPart, action: Tensor, dt_s: float
@@ -313,7 +353,7 @@ class ModelArm:
         """Advance by dt_s seconds with changes (B, m) kPa of the commanded pressures."""
         inputs = (part.command, part.pressure, part.gain, part.mount, part.arm.pressure)
         step = self._compiled_for(*inputs, action)
-        if step is not None:
+        if step is not None and part.factors is None:
             part = self._stepped(step, part, action, dt_s)
         else:
             queue, action = self._due(part, action)
@@ -347,15 +387,25 @@ class ModelArm:
         self, part: ArmPart, pressure: Tensor, dt_s: Tensor | float
     ) -> tuple[ArmState, Tensor]:
         """The model's state and key points (B, n, 3) mm, world frame, at pressures (B, m) kPa."""
-        state, points = self._advanced(part.arm, part.gain * pressure, dt_s)
+        state, points = self._advanced(part.arm, part.gain * pressure, dt_s, part.factors)
         if self._compiled_for(points, part.mount) is None:
             return state, frames.apply(part.mount, points)
         return state, _placed(points, part.mount)
 
     def _advanced(
-        self, state: ArmState, pressure: Tensor, dt_s: Tensor | float
+        self,
+        state: ArmState,
+        pressure: Tensor,
+        dt_s: Tensor | float,
+        factors: Tensor | None = None,
     ) -> tuple[ArmState, Tensor]:
-        """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m)."""
+        """The model's state and key points (B, n, 3) mm, base frame, at its actuation (B, m).
+
+        factors: (B, K) of random effects, which the state then has the memories of.
+        """
+        if factors is not None:
+            assert self._random_effects is not None
+            return self._random_effects.step(state, pressure, dt_s, factors)
         step, change = self._compiled_for(pressure, state.pressure), pressure - state.pressure
         if step is None:
             return self.model.step(state, change, dt_s)
@@ -435,12 +485,13 @@ class ModelArm:
     def alone(self, part: ArmPart, dt_s: float) -> LoneArm | None:
         """Steps of one environment's arm in kept arrays; None where the reference has to step it.
 
-        It has to where the model cannot be compiled, where measurements have noise, and where an
-        observer estimates the key points.
+        It has to where the model cannot be compiled, where measurements have noise, where an
+        observer estimates the key points, and where the arm has random effects.
         """
         vary = self.vary
         plain = self.observer.raw and vary.noise_mm == vary.noise_kPa == 0.0
-        plain = plain and part.plant is None and part.belief is None and len(part.command) == 1
+        plain = plain and part.plant is None and part.belief is None and part.factors is None
+        plain = plain and len(part.command) == 1
         return LoneArm(self, self._compiled, part, dt_s) if plain and self._compiled else None
 
     def within_reach(self, part: ArmPart, dt_s: float) -> tuple[Tensor, Tensor]:
@@ -496,10 +547,25 @@ class ModelArm:
         if belief is None:
             return part
         arm, points = self._advanced(belief.arm, part.seen_kPa, dt_s)
-        points = frames.apply(self.pose, points)
-        surprise = part.seen_mm - points - belief.offset_mm
-        now, offset, drift = self.observer.adopted(surprise, belief.offset_mm, belief.drift_mm)
-        return replace(part, seen_mm=points + now, belief=Belief(arm, offset, drift))
+        points = frames.apply(self.pose, points) + belief.fed_mm
+        off = part.seen_mm - points
+        belief = replace(belief, arm=arm)
+        if belief.adaptation is None:
+            before = belief.offset_mm, belief.drift_mm
+            now, offset, drift = self.observer.adopted(off - belief.offset_mm, *before)
+            belief = replace(belief, offset_mm=offset, drift_mm=drift)
+        else:
+            now, belief = self._learned(belief, off, part.seen_kPa)
+        return replace(part, seen_mm=points + now, belief=belief)
+
+    def _learned(self, belief: Belief, off: Tensor, pressure: Tensor) -> tuple[Tensor, Belief]:
+        """Disturbance now (B, n, 3) mm, world frame, and the belief after a measurement `off`."""
+        assert self._learner is not None
+        assert belief.adaptation is not None
+        turn = self.pose[:3, :3]
+        memory, now = self._learner.updated(belief.adaptation, off @ turn, pressure)
+        offset = self._learner.expected(memory, pressure) @ turn.mT
+        return now @ turn.mT, replace(belief, adaptation=memory, offset_mm=offset)
 
 
 class LoneArm:

@@ -148,7 +148,14 @@ class World:
         c = self.config
         self.arms: dict[str, Arm] = {
             name: ModelArm(
-                name, mounted, c.pneumatics, c.randomisation, c.samples, self.device, c.observer
+                name,
+                mounted,
+                c.pneumatics,
+                c.randomisation,
+                c.samples,
+                self.device,
+                c.observer,
+                c.dt_s,
             )
             for name, mounted in arms.items()
         }
@@ -282,7 +289,7 @@ def fed(part: ArmPart, move_mm: Tensor) -> ArmPart:
     belief = part.belief
     if belief is not None:
         # the feed is known to the observer
-        belief = replace(belief, offset_mm=belief.offset_mm + shift[:, None])
+        belief = replace(belief, fed_mm=belief.fed_mm + shift[:, None])
     return replace(part, mount=mount, points_mm=points, seen_mm=seen, belief=belief)
 
 

@@ -35,7 +35,10 @@ def table_of_body(
     body = _cleaned(body, role)
     first = next((line for line in body.split(b"\n", 1000) if line), b"")
     if not first:
-        raise InputError(f"{path}: no rows of numbers, expected at least one")
+        raise InputError(
+            f"{path}: no rows of numbers, expected at least one: it was read as text; "
+            "docs/recordings.md lists the other formats that are read"
+        )
     separator = "\t" if role.separator == "whitespace" else role.separator
     count = len(_split(first, separator, path))
     names = names or [""] * count

@@ -1,0 +1,373 @@
+"""Benchmark `robust`: `circle_ablation` on rigs of robots that took no part in any training.
+
+Every method is judged with the model of the package, so that the rig is another robot of the same
+make, and with a model of the robot itself: a lab records ten minutes of it and fits a model to them
+(`surgisoft fit`). Hidden effects, which no model has, are then switched on one at a time. Every
+case, one robot with one method, is a file in the folder of the study, so that an interrupted study
+goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from benchmarks.cache import Cache
+from benchmarks.robust_floor import Floor, floor
+from surgisoft.agents.evaluate import bootstrap, evaluate
+from surgisoft.agents.on_rig import RigConfig, on_rig
+from surgisoft.agents.policies import open_policy
+from surgisoft.agents.run_folder import RunFolder
+from surgisoft.errors import InputError
+from surgisoft.measurement.histories import arm_spec, history_of
+from surgisoft.measurement.protocols import make_protocol
+from surgisoft.progress import Progress, noted
+from surgisoft.rig import VirtualRig
+from surgisoft.rig.hidden import HIDDEN
+from surgisoft.surrogate.checkpoint import save_model
+from surgisoft.surrogate.fit import FitConfig, fit
+from surgisoft.tasks.base import Task
+from surgisoft.tasks.registry import config_of, make_task, with_fields
+
+TASK = "circle_ablation"
+"""The task that is judged."""
+DEVELOPMENT = range(11)
+"""Seeds of robots on which the observer's constants were chosen, or that earlier results show."""
+MINUTES_POINTS = 12_000
+"""Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""
+FIRE_MM = 0.5
+"""Measured distance of the beam from its target within which it is released, mm."""
+FILTER, LEARNS = "filter", "learns"
+"""The two observers: an alpha-beta filter with one gain, or `tasks.world.adaptation`."""
+DEFAULT, OWN = "of the package", "of the robot"
+"""The two arm models."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A controller and what estimates the arms for it."""
+
+    name: str
+    """Name in the table."""
+    policy: str
+    """`scripted`, or the folder or name of a training run."""
+    observer: str
+    """`FILTER` or `LEARNS`."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Size of the study."""
+
+    methods: tuple[Method, ...]
+    """What is compared."""
+    robots: tuple[int, ...]
+    """Seeds of the robots."""
+    own: tuple[int, ...]
+    """Those that a model is fitted to, too."""
+    episodes: int
+    """Episodes of each robot."""
+    hidden_methods: tuple[str, ...]
+    """Names of the methods that are judged with hidden effects."""
+    hidden_robots: tuple[int, ...]
+    """Robots with hidden effects."""
+    hidden_episodes: int
+    """Episodes of each hidden effect on each of these robots."""
+    exact: bool = True
+    """Whether FCL decides about contact; else the engine of training."""
+    seed: int = 2000
+    """Seed of the episodes, which no training has."""
+
+    def __post_init__(self):
+        known = [robot for robot in (*self.robots, *self.hidden_robots) if robot in DEVELOPMENT]
+        if known:
+            raise InputError(
+                f"robust: robots {', '.join(map(str, known))} took part in the development; "
+                f"expected seeds from {DEVELOPMENT.stop}"
+            )
+        names = [method.name for method in self.methods]
+        for name in self.hidden_methods:
+            if name not in names:
+                raise InputError(f"robust: method '{name}', expected one of {', '.join(names)}")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One robot with one method."""
+
+    method: str
+    """Name of the method."""
+    model: str
+    """`DEFAULT` or `OWN`."""
+    robot: int
+    """Seed of the robot."""
+    hidden: str
+    """Name of the hidden effect; empty without one."""
+    cut: list[bool]
+    """Of each episode: whether the ring was cut without contact."""
+    contact: list[bool]
+    """Whether anything touched anything."""
+    beam_error_mm: list[float]
+    """Mean true distance of the beam's axis from its target while the beam is on."""
+    pointing_error_mm: list[float]
+    """The same at every step after the first 5 s, with the beam on or off: not truncated."""
+    pointing_error_p95_mm: list[float]
+    """95 % quantile of that distance over the episode."""
+    share_on: list[float]
+    """Time in which the ring was cut over the time that was allowed; 1 where it was not cut."""
+    clearance_mm: list[float]
+    """Least clearance."""
+
+
+def run(study: Study, folder: Path, report: Progress) -> tuple[list[Row], list[Floor]]:
+    """Judge all methods; cases that are in the folder are not judged again."""
+    kept = Cache(folder / "cases")
+    jobs = [
+        (method, model, robot, "", study.episodes)
+        for method in study.methods
+        for model, robots in ((DEFAULT, study.robots), (OWN, study.own))
+        for robot in robots
+    ]
+    jobs += [
+        (method, DEFAULT, robot, hidden, study.hidden_episodes)
+        for method in study.methods
+        if method.name in study.hidden_methods
+        for hidden in HIDDEN
+        for robot in study.hidden_robots
+    ]
+    rows = []
+    for number, (method, model, robot, hidden, episodes) in enumerate(jobs):
+        note = f"{method.name}, model {model}, robot {robot} {hidden}".strip()
+        report(number, len(jobs), note)
+        about = {
+            "policy": _identity(method.policy),
+            "observer": method.observer,
+            "model": model,
+            "robot": robot,
+            "hidden": hidden,
+            "episodes": episodes,
+            "seed": study.seed,
+            "exact": study.exact,
+        }
+        arm = None if model == DEFAULT else own_model(robot, folder, noted(report, note))
+        make = partial(_judged, method, arm, robot, hidden, episodes, study.seed, study.exact)
+        values = kept.values(f"{method.name}-{robot}".replace(" ", "-"), about, make)
+        rows.append(Row(method.name, model, robot, hidden, **values))
+    about = {"floor": list(study.robots)}
+    floors = kept.values("floor", about, lambda: [asdict(floor(robot)) for robot in study.robots])
+    return rows, [Floor(**each) for each in floors]
+
+
+def _identity(policy: str) -> str:
+    """What a policy depends on, for the cache."""
+    if policy == "scripted":
+        return policy
+    return str(RunFolder(policy).checkpoint("best").stat().st_size) + RunFolder(policy).path.name
+
+
+def own_model(robot: int, folder: Path, report: Progress) -> Path:
+    """Folder of the model that is fitted to ten minutes of a robot; made once."""
+    place = folder / "models" / f"robot-{robot}"
+    if not (place / "config.json").is_file():
+        rig = VirtualRig(robot)
+        protocol = make_protocol("mixed", rig.limits, MINUTES_POINTS, seed=robot)
+        recording, _ = rig.record(protocol)
+        config = FitConfig(effects=("hysteresis",), seed=robot)
+        result = fit(history_of([recording]), None, arm_spec([recording]), config)
+        save_model(result.model, place, result.report(), force=True, known=result.known)
+    return place
+
+
+def _judged(
+    method: Method,
+    arm: Path | None,
+    robot: int,
+    hidden: str,
+    episodes: int,
+    seed: int,
+    exact: bool,
+) -> dict[str, list]:
+    """Fields of a `Row` from the episodes of one robot; exact: FCL decides about contact."""
+    task = _task(method.policy, arm)
+    config = RigConfig(
+        seed=robot,
+        hidden=((hidden, 1.0),) if hidden else (),
+        adapts=method.observer == LEARNS,
+    )
+    place = on_rig(task, config)
+    found = evaluate(place, method.name, open_policy(method.policy, place), episodes, seed, exact)
+    each = found.per_episode
+    allowed = task.steps * task.world.config.dt_s
+    return {
+        "cut": [bool(value) for value in each["success"]],
+        "contact": [bool(value) for value in each["collided"]],
+        "beam_error_mm": _plain(each["beam_error_mean_mm"]),
+        "pointing_error_mm": _plain(each["pointing_error_mean_mm"]),
+        "pointing_error_p95_mm": _plain(each["pointing_error_p95_mm"]),
+        "share_on": _plain(each["time_s"] / allowed),
+        "clearance_mm": _plain(each["clearance_mm"]),
+    }
+
+
+def _task(policy: str, arm: Path | None) -> Task:
+    """The task with its usual rules, and the model of the package or one of the robot."""
+    config: Any = with_fields(config_of(TASK), fire_mm=FIRE_MM)
+    return make_task(TASK, config if arm is None else with_fields(config, arm=str(arm)))
+
+
+def _plain(values: np.ndarray) -> list[float]:
+    return [float(value) for value in values]
+
+
+def _rate(flags: Sequence[bool]) -> str:
+    """`37 of 40 (80 to 97 %)`: with Wilson's (1927) 95 % interval."""
+    low, high = binomtest(sum(flags), len(flags)).proportion_ci(0.95, "wilson")
+    return f"{sum(flags)} of {len(flags)} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _mean(values: Sequence[float]) -> str:
+    """Mean with its 95 % interval, by bootstrap over the robots."""
+    known = np.array([value for value in values if np.isfinite(value)])
+    if len(known) < 2:
+        return f"{known.mean():.3f}" if len(known) else "-"
+    low, high = bootstrap(known)
+    return f"{known.mean():.3f} ({low:.3f} to {high:.3f})"
+
+
+def _of(rows: Sequence[Row], field: str) -> list:
+    return [value for row in rows for value in getattr(row, field)]
+
+
+def _by_robot(rows: Sequence[Row], field: str) -> list[float]:
+    return [float(np.nanmean(values)) for row in rows if (values := getattr(row, field))]
+
+
+def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
+    """The tables of the study."""
+    robots = f"{study.robots[0]} to {study.robots[-1]}"
+    lines = [
+        f"`{TASK}` with the beam released within {FIRE_MM} mm of its target, as measured; "
+        f"{study.episodes} episodes (seed {study.seed}) on each of the robots {robots} of the "
+        "virtual rig. None of them took part in a training, a fit of the package, or a choice of a "
+        "constant. Errors are true ones; "
+        f"{'FCL' if study.exact else 'the engine of training'} decides about contact. Rates with "
+        "Wilson's 95 % interval, means with a bootstrap over the robots.",
+        "",
+        "| policy, observer | arm model | ring cut | beam error, mm | pointing error, mm "
+        "| its 95 % quantile, mm | contact | time, share |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for method in study.methods:
+        for model in (DEFAULT, OWN):
+            some = [r for r in rows if (r.method, r.model, r.hidden) == (method.name, model, "")]
+            if not some:
+                continue
+            lines.append(
+                f"| {method.name} | {model} | {_rate(_of(some, 'cut'))} "
+                f"| {_mean(_by_robot(some, 'beam_error_mm'))} "
+                f"| {_mean(_by_robot(some, 'pointing_error_mm'))} "
+                f"| {np.mean(_of(some, 'pointing_error_p95_mm')):.2f} "
+                f"| {sum(_of(some, 'contact'))} | {np.mean(_of(some, 'share_on')):.2f} |"
+            )
+    lines += ["", *_hidden_lines(rows, study), "", *_floor_lines(rows, floors, study)]
+    return "\n".join(lines) + "\n"
+
+
+def _hidden_lines(rows: list[Row], study: Study) -> list[str]:
+    """The table of hidden effects."""
+    names = study.hidden_methods
+    number = len(study.hidden_robots) * study.hidden_episodes
+    lines = [
+        "## With a hidden effect",
+        "",
+        f"Each hidden effect at strength 1, model of the package, {number} episodes (robots "
+        f"{', '.join(map(str, study.hidden_robots))}): rings cut, and mean beam error in mm.",
+        "",
+        "| hidden effect | " + " | ".join(names) + " |",
+        "|---" * (len(names) + 1) + "|",
+    ]
+
+    def cell(some: list[Row]) -> str:
+        error = np.nanmean(_of(some, "beam_error_mm"))
+        return f"{sum(_of(some, 'cut'))} of {len(_of(some, 'cut'))}, {error:.2f}"
+
+    for hidden in HIDDEN:
+        parts = [[r for r in rows if (r.method, r.hidden) == (name, hidden)] for name in names]
+        if all(parts):
+            lines.append(f"| `{hidden}` | " + " | ".join(cell(part) for part in parts) + " |")
+    every = [[r for r in rows if r.method == name and r.hidden] for name in names]
+    if all(every):
+        cells = [f"{_rate(_of(e, 'cut'))}, contact {sum(_of(e, 'contact'))}" for e in every]
+        lines.append("| all | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _floor_lines(rows: list[Row], floors: list[Floor], study: Study) -> list[str]:
+    """What the cameras' noise alone allows."""
+
+    def mean(field: str) -> float:
+        return float(np.mean([getattr(each, field) for each in floors]))
+
+    return [
+        "## What the cameras allow",
+        "",
+        "The robots' own camera noise on an arm that is exactly the model: mean error of the "
+        "estimated beam at its target along the ring, over the same robots.",
+        "",
+        "| estimate | mm |",
+        "|---|---|",
+        f"| a single picture | {mean('raw_mm'):.3f} |",
+        f"| alpha-beta filter | {mean('filter_mm'):.3f} |",
+        f"| observer that learns | {mean('learns_mm'):.3f} |",
+        "",
+        f"1.5 times that floor is {1.5 * mean('learns_mm'):.3f} mm.",
+    ]
+
+
+def draw(rows: list[Row], floors: list[Floor], study: Study, folder: Path) -> Path:
+    """Write the figure: mean beam error of every robot by method and model."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    groups = [
+        (method, model)
+        for method in study.methods
+        for model in (DEFAULT, OWN)
+        if any((r.method, r.model, r.hidden) == (method.name, model, "") for r in rows)
+    ]
+    figure, axes = plt.subplots(figsize=(8.0, 0.42 * len(groups) + 1.4), layout="constrained")
+    for place, (method, model) in enumerate(groups):
+        some = [r for r in rows if (r.method, r.model, r.hidden) == (method.name, model, "")]
+        each, cut = _by_robot(some, "pointing_error_mm"), _of(some, "cut")
+        colour = "tab:blue" if method.observer == LEARNS else "tab:orange"
+        axes.plot(each, np.full(len(each), place), "o", color=colour, alpha=0.6, ms=5)
+        axes.text(
+            1.02,
+            place,
+            f"{sum(cut)} of {len(cut)}",
+            va="center",
+            transform=axes.get_yaxis_transform(),
+        )
+    axes.set_yticks(range(len(groups)), [f"{m.name}, model {kind}" for m, kind in groups])
+    level = float(np.mean([each.learns_mm for each in floors]))
+    axes.axvline(level, color="0.5", ls=":", label="cameras' noise alone")
+    axes.axvline(0.15, color="0.3", ls="--", label="goal")
+    axes.set(
+        xlabel="mean distance of the beam from its target [mm], one dot a robot", xlim=(0, None)
+    )
+    axes.text(1.02, len(groups) - 0.35, "rings cut", transform=axes.get_yaxis_transform())
+    axes.invert_yaxis()
+    axes.legend(loc="lower right")
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "robust.png"
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+    return file

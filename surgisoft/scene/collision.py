@@ -617,10 +617,9 @@ class ExactScene:
 GUIDE_SLACK_MM = 1e-6
 """Rounding that the compiled search for the nearest segments may have (mm); of the segments within
 it of the nearest all are given to FCL."""
-GUIDED_FACES = 50_000
-"""Faces of a body up to which FCL is guided (a count). Beside a sphere, its worst case, the search
-costs as much as FCL's distance of a whole arm at 20,000 faces (`surgisoft benchmark scaling`);
-beside the phantom's organ of 24,136 it costs 22 microseconds."""
+GUIDED_FACES = 5_000
+"""Faces of a body up to which FCL is guided (a count): beside larger ones the search may cost more
+than FCL's distance of the whole arm (`surgisoft benchmark scaling`)."""
 BEAM_SLACK_MM = 0.01
 """FCL and the closed forms are asked about everything that comes within this of a beam (mm): ten
 times the width of the triangle that represents the beam."""

@@ -19,6 +19,7 @@ from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.images import VECTOR, images_of
+from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import joined, streams
 
 SPREAD = 7919
@@ -147,6 +148,12 @@ class BatchedEnv:
         if self._images is None:
             return vectors
         return {agent: {VECTOR: vector, **images} for agent, vector in vectors.items()}
+
+    @property
+    def state(self) -> TaskState:
+        """The true state of all episodes, for what a policy may not see: the task's scripted
+        expert (`task.script(state)`), or what a picture shows."""
+        return tree_map(torch.clone, self._now)
 
     @property
     def _now(self) -> TaskState:

@@ -66,12 +66,13 @@ class Moves:
             return None
         step = max(float(np.median(np.concatenate(steps))), LEAST_STEP_S)
         scaled = (2 * (recording.measured - low) / np.where(live, high - low, 1.0) - 1)[:, live]
-        actuation, body = [], []
+        actuation: list[np.ndarray] = []
+        body: list[np.ndarray] = []
         for run in recording.runs:
             t_s = recording.t_s[run]
             if t_s[-1] - t_s[0] > MOST_GAPS * len(t_s) * step:
                 continue
-            left = MOST_SAMPLES - sum(map(len, body))
+            left = MOST_SAMPLES - sum(len(part) for part in body)
             grid = np.arange(t_s[0], t_s[-1] + 1e-9, step)[:left]
             if len(grid) > 4 * BACK_S / step:
                 actuation.append(_on(grid, t_s, scaled[run]))

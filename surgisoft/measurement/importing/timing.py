@@ -66,7 +66,8 @@ class Moves:
             return None
         step = max(float(np.median(np.concatenate(steps))), LEAST_STEP_S)
         scaled = (2 * (recording.measured - low) / np.where(live, high - low, 1.0) - 1)[:, live]
-        actuation, body = [], []
+        actuation: list[np.ndarray] = []
+        body: list[np.ndarray] = []
         for run in recording.runs:
             t_s = recording.t_s[run]
             if t_s[-1] - t_s[0] > MOST_GAPS * len(t_s) * step:

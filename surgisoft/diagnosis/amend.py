@@ -245,6 +245,12 @@ def amend(
 ) -> Amendment:
     """The model with the named effects fitted to the recordings; the given model stays as it is.
 
+    The effects' parameters are fitted to the first three quarters of each recording, and the error
+    is validated on the last quarter: `Amendment.claimed` says whether it fell significantly, and
+    `Amendment.model` is the new model. Key points are in mm in the arm base frame. Raises
+    InputError for an unknown effect, and where a model cannot take effects or does not fit the
+    recordings.
+
     Model and recordings may be given by their paths; a callable, or its name, is a model too, with
     error_mm as its validated error, mm (docs/your_model.md).
 

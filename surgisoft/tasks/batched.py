@@ -176,6 +176,10 @@ def batched_env(
 ) -> BatchedEnv:
     """Many episodes of a task in one batch, tensors in and out, for any number of agents.
 
+    Observations are (B, D), scaled to the order of 1 (docs/environments); actions are (B, m),
+    changes of the commanded pressure, kPa; B is num_envs. Raises InputError for an unknown task or
+    field.
+
     task: name of the task, or a task; the other arguments are those of `parallel_env` and of
     `BatchedEnv`.
     """

@@ -27,6 +27,7 @@ from surgisoft.tasks.registry import (
     config_of,
     make_task,
     read_config,
+    with_fields,
 )
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
@@ -96,6 +97,15 @@ def test_the_same_seed_gives_the_same_episode_to_the_last_step(name):
         for agent in episodes.task.agents:
             assert torch.equal(one[agent], other[agent])
     assert not torch.equal(total, played(episodes, 3, steps, seed=9)[1])
+
+
+@every_task
+def test_every_condition_of_a_phase_is_a_decision_for_each_episode(name):
+    task = task_of(name)
+    state = Episodes(task).seeded(0, 2)
+    for condition in TASKS[name].experiment.conditions.values():
+        held = condition.holds(task, state, condition.within)
+        assert (held.dtype, held.shape) == (torch.bool, (2,))
 
 
 @every_task
@@ -489,3 +499,11 @@ def test_the_fine_term_has_its_own_scale():
     assert near != 1.0
     torch.testing.assert_close(reward["track"], torch.exp(-error))
     torch.testing.assert_close(reward["fine"], torch.exp(-error / near))
+
+
+@pytest.mark.parametrize("change", [{"loop_s": 1e308}, {"loops": 2**62}])
+def test_an_episode_without_end_is_one_line(change):
+    """As a damaged config.json of a training run asks for it."""
+    config = with_fields(config_of("track_circle"), **change)
+    with pytest.raises(InputError, match="an episode of more than 10,000,000 steps"):
+        make_task("track_circle", config)

@@ -118,7 +118,7 @@ def write_organ(faces: int, folder: Path) -> tuple[Path, int]:
     """A mesh of about so many faces with bumps, 80 mm in radius, and the number of its faces."""
     import trimesh
 
-    side = max(8, round((faces / 2) ** 0.5))
+    side = max(8, round((faces / 4) ** 0.5))
     mesh = trimesh.creation.uv_sphere(radius=1.0, count=[side, side])
     way = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     bump = 1.0 + 0.05 * np.sin(5.0 * way[:, :1]) * np.cos(4.0 * way[:, 1:2])

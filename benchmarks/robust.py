@@ -282,6 +282,8 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
 def _hidden_lines(rows: list[Row], study: Study) -> list[str]:
     """The table of hidden effects."""
     names = study.hidden_methods
+    if not (names and study.hidden_robots):
+        return []
     number = len(study.hidden_robots) * study.hidden_episodes
     lines = [
         "## With a hidden effect",

@@ -25,6 +25,28 @@ Output = Annotated[
     typer.Option("-o", "--output", metavar="FILE", help="Write the results to this file."),
 ]
 """Option of all studies."""
+Processes = Annotated[
+    int, typer.Option(min=1, help="Number of processes that work at the same time.")
+]
+"""Option of the studies with independent cases."""
+Work = Annotated[
+    Path,
+    typer.Option(
+        metavar="DIR",
+        help="Folder of recordings, models and results in between; what is there is reused.",
+    ),
+]
+"""Option of the studies that can be interrupted."""
+Robots = Annotated[str, typer.Option(help="Seeds of the virtual robots, with commas.")]
+"""Option of the studies on virtual robots."""
+RealData = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
+    ),
+]
+"""Option of the studies on recordings of real robots."""
 
 
 @contextlib.contextmanager
@@ -64,7 +86,7 @@ def modelling(
         int | None,
         typer.Option(min=64, help="Number of training points; default 13,824, as in the paper."),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Number of fits in parallel.")] = 2,
+    processes: Processes = 2,
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -92,11 +114,8 @@ def diagnosis(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the cases; 1 to 10 served for calibration.")
     ] = 11,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
-    ] = Path("runs/benchmark-diagnosis"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-diagnosis"),
     amend: Annotated[
         int,
         typer.Option(
@@ -134,11 +153,8 @@ def intervals(
     clean: Annotated[
         int, typer.Option(min=0, help="Number of recordings of each setting without an effect.")
     ] = 32,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of base models and of each case's result."),
-    ] = Path("runs/benchmark-intervals"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-intervals"),
     output: Output = None,
 ) -> None:
     """Coverage of the intervals of `amend`, and falls that it claims on clean arms."""
@@ -167,21 +183,16 @@ def decision(
             help="Cases that take no part in any fit: judged by the fit to all others.",
         ),
     ] = None,
-    robots: Annotated[
-        str, typer.Option(help="Seeds of the own rig's robots, with commas.")
-    ] = "200,201,202,203,204,205",
+    robots: Robots = "200,201,202,203,204,205",
     undertrained: Annotated[
-        str, typer.Option(help="Those among them with an undertrained model too.")
+        str, typer.Option(help="Robots among them that also get an undertrained model.")
     ] = "200,201,203",
     count: Annotated[
         int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
     ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path,
-        typer.Option(metavar="DIR", help="Folder of models and of each case's evidence."),
-    ] = Path("runs/benchmark-decision"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-decision"),
     asset: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write the decision fitted to all cases to this file."),
@@ -207,7 +218,7 @@ def decision(
 
 @app.command("setup-faults")
 def setup_faults(
-    robots: Annotated[str, typer.Option(help="Seeds of the robots, with commas.")] = "142,143",
+    robots: Robots = "142,143",
     folders: Annotated[
         list[Path] | None,
         typer.Option(
@@ -220,10 +231,8 @@ def setup_faults(
         int, typer.Option(min=1, help="Number of single faults, and of pairs, of each source.")
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the faults.")] = 1,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
-    work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of base models and recordings.")
-    ] = Path("runs/benchmark-setup-faults"),
+    processes: Processes = 2,
+    work: Work = Path("runs/benchmark-setup-faults"),
     output: Output = None,
 ) -> None:
     """Faults of the set-up in recordings: frames, units, orders, chambers, clocks."""
@@ -247,13 +256,7 @@ def hidden_effect(
     steps: Annotated[int, typer.Option(min=1, help="Training steps of each policy.")] = 2_000_000,
     episodes: Annotated[int, typer.Option(min=2, help="Episodes of each policy.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of training and of episodes.")] = 0,
-    work: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of recordings, models and policies; existing ones are reused.",
-        ),
-    ] = Path("runs/benchmark-hidden-effect"),
+    work: Work = Path("runs/benchmark-hidden-effect"),
     images: Images = None,
     output: Output = None,
 ) -> None:
@@ -411,16 +414,12 @@ def robust(
 
 @app.command()
 def live(
-    robots: Annotated[
-        str, typer.Option(help="Seeds of the robots, with commas.")
-    ] = "204,205,206,207",
+    robots: Robots = "204,205,206,207",
     hours: Annotated[
         float, typer.Option(min=0.2, help="Hours of clean rig for each robot and motion.")
     ] = 5.0,
-    models: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
-    ] = Path("runs/benchmark-live"),
-    processes: Annotated[int, typer.Option(min=1, help="Number of recordings in parallel.")] = 2,
+    models: Work = Path("runs/benchmark-live"),
+    processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -450,19 +449,11 @@ def real(
             help="Entries, or folders of them; default: those of the project.",
         ),
     ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
-        ),
-    ] = None,
+    data: RealData = None,
     only: Annotated[
         str | None, typer.Option(metavar="NAME", help="Run this one entry of them.")
     ] = None,
-    work: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of fitted models, which are reused.")
-    ] = Path("runs/benchmark-real"),
+    work: Work = Path("runs/benchmark-real"),
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -491,13 +482,7 @@ def inject(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the cases.")
     ],
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Folder of your copy of the recordings; default: SURGISOFT_REAL_DATA.",
-        ),
-    ] = None,
+    data: RealData = None,
     robots: Annotated[
         str | None, typer.Option(help="Robots, with commas; default: all of them.")
     ] = None,
@@ -523,7 +508,7 @@ def cases(
     only: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Number of cases in parallel.")] = 2,
+    processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
 ) -> None:

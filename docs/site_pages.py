@@ -1,7 +1,8 @@
 """Pages of the documentation site that are made while it is built (a hook of mkdocs).
 
-`index.md`, `contributing.md` and `changelog.md` are README.md, CONTRIBUTING.md and CHANGELOG.md of
-the repository's root with their links changed. `api/` has one page for each part of the package.
+`index.md`, `contributing.md`, `changelog.md` and `security.md` are README.md, CONTRIBUTING.md,
+CHANGELOG.md and SECURITY.md of the repository's root with their links changed. `api/` has one page
+for each part of the package.
 """
 
 import re
@@ -16,6 +17,7 @@ FROM_ROOT = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
 }
 """File of the repository's root -> page of the site."""
 TITLES = {

@@ -45,7 +45,7 @@ class _AfterGymnasium:
             execute(module)
             register()
 
-        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]  # on purpose
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]  # wrapped
         return spec
 
 

@@ -17,7 +17,11 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples" / "models"
 
 
 def opened(name: str):
-    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    return opened_file(EXAMPLES / f"{name}.py")
+
+
+def opened_file(file: Path):
+    spec = importlib.util.spec_from_file_location(f"example_{file.stem}", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -93,3 +97,19 @@ def test_the_rod_bends_to_an_arc_and_sags_as_a_cantilever(bench):
     coarse = example.ElasticaRod(levels=2, elements=6)
     found, _ = surgisoft.compare(coarse, bench, part="training", error_mm=3.0)
     assert 0.5 < found.rmse_mm < 8
+
+
+def test_the_endoscope_learns_from_pictures_that_show_the_lesion(monkeypatch):
+    """Its expert finds the lesion, whose place differs; the network gets pictures alone of it."""
+    example = opened_file(EXAMPLES.parent / "endoscope_from_images.py")
+    monkeypatch.setattr(example, "STEPS", 21)
+    monkeypatch.setattr(example, "LATE_STEP", 20)
+    env = surgisoft.batched_env(example.scene_task(), 2, 0)
+    data, error, view = example.run(env, 0, lambda _p, _m, expert: expert, blank=False)
+    pictures, measured, expert = data
+    assert error < 3.0
+    assert view > 0.9
+    net = example.Eye(measured.shape[1], 3)
+    assert net(pictures, measured).shape == expert.shape == (42, 3)
+    first, second = pictures[-2:].float()
+    assert (first - second).abs().mean() > 1.0, "another lesion is another picture"

@@ -75,7 +75,7 @@ class Outcome:
     oracle_mm: float | None = None
     """Error on the held-out quarter after amending by the truth, mm; None: no effect is true."""
     held_out_mm: float | None = None
-    """Error on the held-out quarter before amending, mm."""
+    """Error on the held-out quarter without the effects (`_amended`), mm."""
 
     @property
     def named(self) -> bool:
@@ -232,11 +232,17 @@ def run_entry(entry: Entry, data: Path, cache: Cache, tell: Progress) -> Outcome
 def _amended(
     model: ArmModel, after: Sequence[Recording], effects: Sequence[str]
 ) -> tuple[float, float] | None:
-    """Error before and after amending, on the held-out quarter, mm; None without effects."""
+    """Error without and with effects on the held-out quarter, mm; None without effects.
+
+    Where they were fitted together with the network: without them that of the network that was
+    trained on as long. The given model may have been fitted to the held-out rows, the trained ones
+    have not.
+    """
     if not effects:
         return None
-    held_out = amend(model, list(after), list(effects)).held_out
-    return held_out.before, held_out.after
+    found = amend(model, list(after), list(effects))
+    fall = found.held_out if found.refit is None else found.alone
+    return fall.before, fall.after
 
 
 def run(entries: Sequence[Entry], data: Path, work: Path, report: Progress) -> list[Outcome]:

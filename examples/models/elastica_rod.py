@@ -7,6 +7,9 @@ the rod is solved on a grid once, when it is first called, and interpolated in b
 model. Inertia does not count in a steady state, so the density is chosen for a long time step, and
 the weight is stated by itself.
 
+The virtual rig `elastica` of the package has a rod of its own, which moves; this file imports
+nothing of it, so that it can be copied and changed.
+
     surgisoft compare examples/models/elastica_rod.py:rod bench.parquet
 
 PyElastica is the extra `elastica`: pip install 'surgisoft[elastica]'.

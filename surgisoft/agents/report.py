@@ -103,8 +103,8 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
     for result in results:
         success, error = result.overall.get("success"), _error(result)
         words = [] if success is None else [f"{success.mean:.0%} success"]
-        measured = error is not None and error.episodes
-        words += [f"mean error {error.mean:.3g} mm"] if measured else []
+        if error is not None and error.episodes:
+            words.append(f"mean error {error.mean:.3g} mm")
         parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
     episodes = len(next(iter(results[0].per_episode.values())))
     plural = "s" if episodes > 1 else ""

@@ -55,8 +55,8 @@ class TrainingRequest:
         """Resolve the request to a `Plan`; raises InputError for contradicting options."""
         if self.steps is not None and self.minutes is not None:
             raise InputError(
-                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them: the "
-                "training ends by one or the other"
+                f"--steps {self.steps} and --minutes {self.minutes:g}: give only one of them; "
+                "either of them ends the training"
             )
         config = task_config(self.task, self.config, self.arm, self.scene)
         envs = self.envs
@@ -108,7 +108,12 @@ def train(
     logger: str = TENSORBOARD,
     **fields: Any,
 ) -> TrainedRun:
-    """Train the agents of a task with PPO; all of them learn at the same time.
+    """Train the agents of a task at the same time with PPO (Schulman et al. 2017).
+
+    Each agent has its own actor, which sees its own observation, and a critic, which sees those of
+    all agents (centralised training, decentralised execution). Returns the run's folder, which
+    opens without further code, and the result of its last evaluation. Raises InputError before any
+    step for options that do not fit each other.
 
     output: folder of the new run; default `runs/TASK-DATE-TIME`.
     resume_from: folder of an interrupted run that goes on, in place of a task and its fields.

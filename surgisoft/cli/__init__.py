@@ -90,8 +90,25 @@ def _root(
     pass
 
 
+def _with_arm(arguments: list[str]) -> list[str]:
+    """`collect --preflight MODEL`, as it was once written, as `--preflight --arm MODEL`."""
+    if arguments[:1] != ["collect"]:
+        return arguments
+    found: list[str] = []
+    for given in arguments:
+        name, _, model = given.partition("=")
+        if name == "--preflight" and model:
+            found += ["--preflight", "--arm", model]
+        elif found[-1:] == ["--preflight"] and (given == "default" or Path(given).is_dir()):
+            found += ["--arm", given]
+        else:
+            found.append(given)
+    return found
+
+
 def spread(arguments: list[str]) -> list[str]:
-    """Repeat each option of `MANY` before every value that follows it; rename old options."""
+    """Repeat each option of `MANY` before every value that follows it; accept old spellings."""
+    arguments = _with_arm(arguments)
     repeated, option = [], None
     old = {} if arguments[:1] == ["benchmark"] else OLD_NAMES
     for given in arguments:

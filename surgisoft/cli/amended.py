@@ -14,7 +14,9 @@ def claim_other_folder(output: Path, model: Path, force: bool) -> None:
     from surgisoft.surrogate.checkpoint import claim_folder
 
     if output.resolve() == model.resolve():
-        raise InputError(f"{output}: is the model that is read; choose another folder")
+        raise InputError(
+            f"{output}: is the folder of the model to amend; choose another one for the result"
+        )
     claim_folder(output, force)
 
 

@@ -10,7 +10,7 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import check_model, warn
-from surgisoft.cli.options import SEED_MAX, Force, Hidden, NewRecording
+from surgisoft.cli.options import SEED_MAX, Force, Hidden, NewRecording, Preflight
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -102,13 +102,10 @@ def collect(
         float | None,
         typer.Option(help="Factor on all sensor and camera noise of a simulated rig."),
     ] = None,
-    preflight: Annotated[
+    preflight: Preflight = False,
+    arm: Annotated[
         Path | None,
-        typer.Option(
-            metavar="MODEL",
-            help="On a real rig: first try each chamber alone, a little, and go on only if the arm "
-            "moves as this model of it predicts ('surgisoft rig check').",
-        ),
+        typer.Option(metavar="MODEL", help="With --preflight: the model of this arm."),
     ] = None,
     dry_run: Annotated[
         bool,
@@ -137,6 +134,10 @@ def collect(
     from surgisoft.measurement.recordings import save_recording
 
     check_new_recording(output, force)
+    if preflight and arm is None:
+        raise InputError("--preflight: expected the model of this arm too; add --arm MODEL")
+    if arm is not None and not preflight:
+        raise InputError("--arm names the model of the pre-flight check; add --preflight")
     effects = _pairs(hidden or [], strength or [])
     mount = {
         "gravity": gravity,
@@ -151,9 +152,7 @@ def collect(
 
         show_commands(protocol, rig, print, **fields)
         return
-    recording = record_on(
-        protocol, rig, output, force, preflight=preflight, hidden=effects, **fields
-    )
+    recording = record_on(protocol, rig, output, force, preflight=arm, hidden=effects, **fields)
     save_recording(recording, output, force)
     log_of(output).unlink(missing_ok=True)
     print(written_line(output, recording, effects))

@@ -84,11 +84,11 @@ def compare(
     context = read_context(credibility)
 
     if scale is not None and not replay:
-        raise InputError("--error-scale is that of a replay; add --replay FILE.rrd")
+        raise InputError("--error-scale scales the colours of a replay; add --replay FILE.rrd")
     check_model(model, predictions)
     others, recordings = leading_models(recordings)
     if others and predictions:
-        raise InputError("--predictions: one model only; its predictions take the place of one")
+        raise InputError("--predictions is for one model; leave the other models out")
     measured = read_recordings(recordings)
     earlier = read_before(before, paired)
 

@@ -31,8 +31,9 @@ def import_(
         typer.Option(
             "--map",
             metavar="MAP.toml",
-            help="Map file, or the ready map motive. The log of an interrupted recording (.jsonl) "
-            "and a LeRobotDataset with a recording's names need none.",
+            help="Map file, or motive, the map for files of OptiTrack Motive. The log of an "
+            "interrupted recording (.jsonl), and a LeRobotDataset with a recording's names, need "
+            "none.",
         ),
     ] = None,
     force: Force = False,
@@ -49,7 +50,7 @@ def import_(
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames.
 
-    Notes tell what cannot be right: lengths, reversed key points, clocks that are apart. With a
+    Notes name what looks wrong: lengths, reversed key points, clocks that differ. With a
     model of the arm, frames, units, orders, chambers and dead channels are tested, too.
     """
     from surgisoft.measurement.importing import (
@@ -131,13 +132,13 @@ def recording_(
         ),
     ] = None,
     task: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--lerobot-task",
             metavar="TEXT",
-            help="With --lerobot: what the robot does, in words.",
+            help="With --lerobot: what the robot does, in words; default: Drive the soft arm.",
         ),
-    ] = "Drive the soft arm.",
+    ] = None,
     fps: Annotated[
         int | None,
         typer.Option(
@@ -152,12 +153,12 @@ def recording_(
     With --lerobot they are written as a LeRobotDataset, too, which LeRobot trains policies on.
     """
     from surgisoft.measurement.recordings import summary
-    from surgisoft.measurement.recordings.lerobot import save_lerobot
+    from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot
 
     opened = read_recordings(recordings)
     for recording in opened:
         print(*summary(recording), sep="\n")
     if lerobot:
-        for note in save_lerobot(opened, lerobot, task, fps):
+        for note in save_lerobot(opened, lerobot, TASK if task is None else task, fps):
             print(f"note: {note}")
         print(f"wrote {lerobot}: a LeRobotDataset v3.0")

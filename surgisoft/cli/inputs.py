@@ -56,11 +56,11 @@ def leading_models(given: list[Path]) -> tuple[list[Path], list[Path]]:
     models, recordings = given[:count], given[count:]
     for path in recordings:
         if _is_model(path):
-            raise InputError(f"{path}: a model behind a recording; give all models first")
+            raise InputError(f"{path}: a model after a recording; give all models first")
     if not recordings:
         raise InputError(
             f"{' '.join(map(str, given))}: models only; expected recordings (.csv, .parquet) or "
-            "folders of them behind"
+            "folders of them after the models"
         )
     return models, recordings
 

@@ -78,12 +78,16 @@ def run(
     reference: Annotated[
         float,
         typer.Option(
-            "--clean", metavar="S", help="Without --before: clean time at the begin of the run."
+            "--clean",
+            metavar="S",
+            help="Without --before: time at the start of the run in which the arm is unchanged.",
         ),
     ] = 120.0,
     false_alarm: Annotated[
         float,
-        typer.Option(metavar="H", help="Mean time between false alarms that is designed for, h."),
+        typer.Option(
+            metavar="H", help="Mean time between false alarms for which the detector is set, h."
+        ),
     ] = 10.0,
     stop_on_alarm: Annotated[
         bool, typer.Option("--stop-on-alarm", help="End the run with the first alarm.")
@@ -110,7 +114,7 @@ def run(
     effect_files: EffectFiles = None,
     force: Force = False,
 ) -> None:
-    """Run a policy or a schedule on a rig at a fixed rate, and report when the model stops holding.
+    """Run a policy or a schedule on a rig at a fixed rate, and warn when the model no longer fits.
 
     Every sample is predicted by the model, recorded as it comes, and shown with --show or --web.
     Ctrl-C ends the run: the arm is vented and the recording is complete.

@@ -44,7 +44,7 @@ def new(
     ] = None,
     scale: Annotated[
         float | None,
-        typer.Option(metavar="MM", help="Millimetres in one unit of the files, not --unit."),
+        typer.Option(metavar="MM", help="Length of one unit of the files, mm, instead of --unit."),
     ] = None,
     up: Annotated[
         str | None,

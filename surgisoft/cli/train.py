@@ -127,7 +127,8 @@ def train(
     target_error: Annotated[
         float | None,
         typer.Option(
-            metavar="MM", help="Stop when an evaluation has no larger mean error, and full success."
+            metavar="MM",
+            help="Stop when an evaluation has at most this mean error, and every episode succeeds.",
         ),
     ] = None,
     output: Annotated[

@@ -147,19 +147,21 @@ class Split:
         for basis in self.bases[number]:
             ridge = self.ridges[level, basis.points]
             weight = np.maximum(basis.values, 0.0)[:, None] + ridge
-            answer[:, basis.points] = turned[:, basis.points] / weight[..., None, None]
+            at = _at_once(basis.points, turned.shape[1])
+            answer[:, at] = turned[:, at] / weight[..., None, None]
         return answer
 
     def away(self, field: np.ndarray, shrunk: np.ndarray, number: int) -> np.ndarray:
         """(s, n, 3, C) what a fold's static fit leaves of a field on the rows that it holds out."""
         rows = self.held[number]
-        answer = field[rows].copy()
+        answer = field[rows]
         for place, basis in enumerate(self.bases[number]):
             if (number, place) not in self.rotated:
                 self.rotated[number, place] = self.features[rows] @ basis.vectors
             own = self.rotated[number, place]
-            part = own @ shrunk[:, basis.points].reshape(len(shrunk), -1)
-            answer[:, basis.points] -= part.reshape(len(rows), len(basis.points), *field.shape[2:])
+            at = _at_once(basis.points, field.shape[1])
+            part = own @ shrunk[:, at].reshape(len(shrunk), -1)
+            answer[:, at] -= part.reshape(len(rows), len(basis.points), *field.shape[2:])
         answer[~self.seen[rows]] = 0.0
         return answer
 
@@ -260,6 +262,8 @@ def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.nd
     grams = np.broadcast_to(parts.sum(axis=0) - parts, (levels, folds, *size)).copy()
     held_out = np.empty((levels, len(split.fold), *size), np.float32)
     for number, rows in enumerate(split.held):
+        block = split.block[rows]
+        owned = [(one, np.flatnonzero(block == one)) for one in np.unique(block)]
         for level in range(levels):
             mine = split.shrunk(turned_b[number], number, level)
             grams[level, number] -= _product(turned_a[number], mine)
@@ -267,10 +271,19 @@ def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.nd
             left = right
             if a is not b:
                 left = split.away(a, split.shrunk(turned_a[number], number, level), number)
-            for one in np.unique(split.block[rows]):
-                own = split.block[rows] == one
+            for one, own in owned:
                 held_out[level, one] = _product(left[own], right[own])
     return grams, held_out
+
+
+def _at_once(places: np.ndarray, count: int | None = None) -> np.ndarray | slice:
+    """Rising places as a slice, which copies nothing, where they have no gaps.
+
+    count: of all places; a slice then is only taken for all of them.
+    """
+    if len(places) != (places[-1] - places[0] + 1 if count is None else count):
+        return places
+    return slice(int(places[0]), int(places[-1]) + 1)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

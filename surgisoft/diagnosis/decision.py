@@ -812,10 +812,9 @@ def statements(
     quiet, unknown = chances.nothing + chances.network, chances.unknown
     if claimable(evidence, claim):
         add("nothing_missing", (), quiet, quiet + (1.0 - quiet) * worth.wrong_nothing)
-    elif evidence.paired:
-        # More has changed than what does not repeat: what is not in the list is outside it.
-        unknown += quiet
-    add("unknown_effect", (), unknown, unknown + (1.0 - unknown) * worth.wrong_unknown)
+    if unknown >= quiet:
+        # Not where "nothing" is more probable and only not to be claimed.
+        add("unknown_effect", (), unknown, unknown + (1.0 - unknown) * worth.wrong_unknown)
     if not evidence.paired:
         # An error too large for "nothing" that is static is the model's, and no effect's.
         static = _mostly_static(evidence) and not claimable(evidence, claim)

@@ -228,6 +228,12 @@ def diagnose(
 ) -> Diagnosis:
     """Name the effects that a model is missing on recordings of its own arm.
 
+    Returns one of the verdicts of docs/diagnosis.md with its confidence, the evidence for it, and
+    every effect with its score: cross-validated forward selection among first-order sensitivities,
+    beside a Gaussian-process model discrepancy (Kennedy & O'Hagan 2001), and a fitted decision.
+    Errors are in mm, parameters in the units of their effect. Raises InputError where the
+    recordings are too short or do not fit the model.
+
     Model and recordings may be given by their paths; a model of other origin as for `compare`.
     Where `setup_tests` prove a fault of the set-up, the verdict is `setup`, and no effect is
     looked for: `Diagnosis.setup` mends the recordings.

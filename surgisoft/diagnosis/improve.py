@@ -136,6 +136,10 @@ def improve(
 ) -> Improvement:
     """Add effects to a model one by one, until no further one is significant.
 
+    Each round is `diagnose` on the first three quarters of each recording, and the fit of the
+    effect that it names; `Improvement` has the rounds, the model, and its error on the last
+    quarter, mm. The given model stays as it is. Raises InputError as `amend` does.
+
     Model and recordings may be given by their paths; a callable, or its name, is a model too, with
     error_mm as its validated error, mm (docs/your_model.md).
 

@@ -6,6 +6,7 @@ with the reason.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from surgisoft.diagnosis.candidates import Candidate
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.other_models import has_slope
 from surgisoft.diagnosis.residuals import Problem
-from surgisoft.surrogate.effects import hypothesis_of, known_effects
+from surgisoft.surrogate.effects import Effect, hypothesis_of, known_effects
 
 Cause = Literal["no_motion", "no_reversals", "no_change", "below_noise", "no_slope"]
 """Steady-state samples only; no inner reversals of the actuation; no change of the prediction at
@@ -56,9 +57,10 @@ def testable(
     """(candidates that the recordings can show, effects among `names` that they cannot show)."""
     kept: list[Candidate] = []
     left_out = []
+    kinds, static = known_effects(), _Static(problem)
     for name in names:
         own = [candidate for candidate in some if candidate.name == name]
-        cause = _cause(problem, name, own)
+        cause = _cause(problem, kinds[name], own, static)
         if cause is None:
             kept += own
         else:
@@ -66,25 +68,38 @@ def testable(
     return kept, tuple(left_out)
 
 
-def _cause(problem: Problem, name: str, own: list[Candidate]) -> Cause | None:
+class _Static:
+    """Cubics of a problem's actuation, made when they are first asked for."""
+
+    def __init__(self, problem: Problem):
+        self._problem = problem
+
+    @cached_property
+    def basis(self) -> np.ndarray:
+        """(S, F), see `cubics`."""
+        return cubics(self._problem.pressure)
+
+
+def _cause(
+    problem: Problem, kind: type[Effect], own: list[Candidate], static: _Static
+) -> Cause | None:
     """Why an effect cannot show; None where it can."""
-    hypothesis = hypothesis_of(known_effects()[name])
-    if known_effects()[name].stage in ("line", "material") and not has_slope(problem.model):
+    hypothesis = hypothesis_of(kind)
+    if kind.stage in ("line", "material") and not has_slope(problem.model):
         return "no_slope"
     if hypothesis.needs_motion and not problem.table.timed[problem.index.numpy()].any():
         return "no_motion"
     if not own:
         return "no_change"
-    if hypothesis.needs_reversals and not any(_beyond_cubics(problem, each) for each in own):
+    if hypothesis.needs_reversals and not any(_beyond_cubics(static.basis, each) for each in own):
         return "no_reversals"
     if not any(_stands_out(problem, each) for each in own):
         return "below_noise"
     return None
 
 
-def _beyond_cubics(problem: Problem, candidate: Candidate) -> bool:
-    """Whether some sensitivity is more than a cubic of the actuation and its directions."""
-    basis = cubics(problem.pressure)
+def _beyond_cubics(basis: np.ndarray, candidate: Candidate) -> bool:
+    """Whether some sensitivity is more than a cubic of the actuation, basis as of `cubics`."""
     for column in np.moveaxis(candidate.sensitivities, 3, 0):
         part = column.reshape(len(column), -1)
         part = part - part.mean(axis=0)

@@ -1,4 +1,4 @@
-"""`run`: a closed loop on a rig with a model beside it, which says when the model stops holding."""
+"""`run`: a closed loop on a rig, with a model beside it and an alarm when it no longer holds."""
 
 from __future__ import annotations
 
@@ -257,6 +257,10 @@ def run(
     **fields: Any,
 ) -> RunResult:
     """Drive a rig by a policy or a schedule in a closed loop, with a model beside it.
+
+    Returns the recording, the model's predictions (T, n, 3) mm in the arm base frame, and when and
+    since when the model stopped to describe the arm, s. Raises InputError before the rig moves for
+    requests that do not fit the rig.
 
     policy: see `RunRequest.policy`; rig: text as for `--rig`, or an open rig; model: the arm model
     that predicts every sample. before: recordings of the unchanged arm as the detector's reference.

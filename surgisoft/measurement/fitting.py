@@ -28,6 +28,10 @@ def fit(
 ) -> FitResult:
     """Fit an arm model (HAW-NN, optionally with effects) to recordings of one arm.
 
+    The model (Chen et al. 2025) maps actuation (T, m), in the recordings' unit, to key points
+    (T, n, 3) mm in the arm base frame. Raises InputError where the recordings are of different
+    arms, too short, or hold numbers that are not finite.
+
     Returns the model with the account of its fit; `save_model(result.model, folder,
     result.report())` writes both.
 

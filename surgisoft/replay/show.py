@@ -85,6 +85,9 @@ def open_replay(
 ) -> Replay | None:
     """Open an episode in the Rerun viewer: arms, beam, organ, endoscope, plots, events.
 
+    Positions are in mm in the world frame, times in s. Raises InputError where there is no replay,
+    and where options do not fit each other.
+
     what: a replay (.rrd), the log of an episode (.npz), or a folder whose newest replay is opened.
     save: write the replay of a log to this .rrd file instead. screenshot: write a picture to this
     .png file instead, at `time_s` (default: two thirds of the episode), of one `view` or of all,

@@ -57,6 +57,10 @@ def collect(
 ) -> Recording:
     """Record a protocol: its name, a schedule file (.csv), or a `Protocol`.
 
+    Returns the recording: times (T,) s, measured and commanded pressures (T, m) in the rig's unit,
+    key points (T, n, 3) mm in the arm base frame. Raises InputError where protocol and rig do not
+    fit each other, and where a real rig leaves its limits.
+
     rig: the rig to record on: an object (`surgisoft.rig.interface.Rig`), or text
     `NAME[:option=value,...]` (`surgisoft.rig.registry`); default: `virtual`. A real rig runs inside
     `SafeRig` and is vented at the end.

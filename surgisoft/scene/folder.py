@@ -63,7 +63,10 @@ class Scene:
 
 
 def open_scene(path: str | Path) -> Scene:
-    """Open a scene folder (or its scene.toml); an InputError names what is missing or bad."""
+    """Open a scene folder (or its scene.toml); an InputError names what is missing or bad.
+
+    Meshes, mounts and lesion of a `Scene` are in mm in the world frame, whose z axis points up.
+    """
     spec = load_spec(path)
     folder = spec_path(path).parent
     where, bodies = read_toml(spec_path(path))[1] / "bodies", []

@@ -19,6 +19,7 @@ from surgisoft.memory import keep_freed_memory
 from surgisoft.tasks.base import Episodes, Task, TaskState
 from surgisoft.tasks.registry import make_with
 from surgisoft.tasks.world.images import VECTOR, images_of
+from surgisoft.tasks.world.pytree import tree_map
 from surgisoft.tasks.world.random_streams import joined, streams
 
 SPREAD = 7919
@@ -149,6 +150,12 @@ class BatchedEnv:
         return {agent: {VECTOR: vector, **images} for agent, vector in vectors.items()}
 
     @property
+    def state(self) -> TaskState:
+        """The true state of all episodes, for what a policy may not see: the task's scripted
+        expert (`task.script(state)`), or what a picture shows."""
+        return tree_map(torch.clone, self._now)
+
+    @property
     def _now(self) -> TaskState:
         assert self._state is not None, "the constructor resets"
         return self._state
@@ -168,6 +175,10 @@ def batched_env(
     image_pixels: int | None = None,
 ) -> BatchedEnv:
     """Many episodes of a task in one batch, tensors in and out, for any number of agents.
+
+    Observations are (B, D), scaled to the order of 1 (docs/environments); actions are (B, m),
+    changes of the commanded pressure, kPa; B is num_envs. Raises InputError for an unknown task or
+    field.
 
     task: name of the task, or a task; the other arguments are those of `parallel_env` and of
     `BatchedEnv`.

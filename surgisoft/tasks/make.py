@@ -12,6 +12,8 @@ def make(task: str, **options: Any) -> SingleEnv | SurgicalEnv:
     """The named task as an environment.
 
     A task of one agent becomes a `gymnasium.Env`, a task of several a PettingZoo `ParallelEnv`.
+    Actions (m,) are changes of the commanded pressure, kPa; observations (D,) are scaled to the
+    order of 1. Raises InputError for an unknown task or option.
 
     options: those of `parallel_env`: `config`, `device`, `scene`, `arm`, `geometry`,
     `render_mode`.

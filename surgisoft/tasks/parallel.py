@@ -173,6 +173,10 @@ def parallel_env(
 ) -> SurgicalEnv:
     """The named task as a PettingZoo ParallelEnv.
 
+    Observations (D,) are scaled to the order of 1 (docs/environments), actions (m,) are changes of
+    the commanded pressure, kPa, both float32. Raises InputError for an unknown task, scene or
+    field.
+
     config: the task's whole config, None: its default one. scene: a scene's folder. arm: an arm
     model's folder or `default`. None leaves scene or arm as the config has it. geometry: `fcl`, the
     exact collision checker, or `batched`, the faster engine of training, for contact and for the

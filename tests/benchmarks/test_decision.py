@@ -171,9 +171,11 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
     for number in range(20):
         odd = number < 2
         unknown = chance if odd else 0.0
-        model = {"creep": 0.01 if odd else 0.9}
-        rest = 1.0 - unknown - model["creep"]
-        predicted.append((case(number), Probabilities(rest, 0.0, unknown, model, 0.0, ())))
+        effects = {"creep": 0.9}
+        if odd:
+            effects = {f"effect {place}": (1.0 - chance) / 5 for place in range(5)}
+        rest = 1.0 - unknown - sum(effects.values())
+        predicted.append((case(number), Probabilities(rest, 0.0, unknown, effects, 0.0, ())))
     assert wrong_unknown_of(predicted, {}) == -cost
     assert wrong_unknown_of(predicted[2:], {}) == -0.25
 

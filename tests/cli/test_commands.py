@@ -152,9 +152,24 @@ def test_one_name_means_one_thing_in_every_command():
         if "--output" in option.opts:
             assert kind == (option.metavar or "a metavar", False, True), command
             continue
-        # A file, a run or a model here, a choice there.
-        for name in set(option.opts) - {"--map", "--resume", "--preflight"}:
+        # A file or a run here, a choice there.
+        for name in set(option.opts) - {"--map", "--resume"}:
             assert told.setdefault(name, kind) == kind, f"{name} of {command}"
+
+
+def test_collect_accepts_the_model_behind_preflight_as_before(tmp_path):
+    """A folder or `default` behind the switch is the arm model, a protocol's name is not."""
+    new = ["collect", "walk", "--preflight", "--arm", "default"]
+    assert spread(["collect", "walk", "--preflight", "default"]) == new
+    assert spread(["collect", "walk", "--preflight=default"]) == new
+    folder = str(tmp_path)
+    assert spread(["collect", "--preflight", folder, "walk"])[1:4] == [
+        "--preflight",
+        "--arm",
+        folder,
+    ]
+    for other in (["collect", "--preflight", "walk"], ["evaluate", "--preflight", "default"]):
+        assert spread(other) == other
 
 
 def test_every_option_of_many_values_shows_it_in_the_help():

@@ -170,7 +170,7 @@ def test_an_effect_of_ones_own(lab, tmp_path, capsys):
 WRONG = {
     "unknown effect 'magic': known are": {"effect": "magic"},
     "no arm model there": {"model": "nowhere"},
-    "is the model that is read": {"output": "arm"},
+    "is the folder of the model to amend": {"output": "arm"},
     "key points: 3, but the model has 5": {"data": "other.parquet"},
     "every key point is missing in every row": {"data": "blind.parquet"},
     "0 blocks of time": {"data": "half_blind.parquet"},

@@ -16,6 +16,8 @@ from surgisoft.diagnosis.decision import (
     Curve,
     DecisionModel,
     Logistic,
+    Probabilities,
+    chosen,
     claimable,
     content_hash,
     decide,
@@ -206,13 +208,13 @@ def test_calibrated_probabilities_are_probabilities(missing, known, first, name,
 
 
 def test_no_model_is_off_where_a_paired_difference_is_explained():
-    """What is not in the list has changed otherwise, unless it is as large as what BEFORE does not
-    repeat."""
+    """Nothing has changed up to what BEFORE does not repeat; more than that is not "nothing"."""
     quiet = given_odds(missing=-9.0, network=9.0)
+    assert decide(STATIC, quiet).kind == "surrogate_undertrained"
     assert decide(replace(STATIC, paired=True), quiet).kind == "nothing_missing"
     large = replace(STATIC, paired=True, error_over_validated=3.0)
     assert probabilities(large, quiet).network == 0.0
-    assert decide(large, quiet).kind == "unknown_effect"
+    assert decide(large, quiet).kind == "cannot_tell"
 
 
 def test_a_name_is_given_where_it_is_more_probably_right_than_wrong():
@@ -235,6 +237,14 @@ def test_a_statement_below_the_least_probability_is_not_made():
     assert decide(GOOD, vague, free).kind == "unknown_effect"
     free = replace(free, least_probability=0.7)
     assert decide(GOOD, vague, free).kind == "cannot_tell"
+
+
+def test_nothing_that_cannot_be_claimed_is_not_called_unknown():
+    """Of 0.4 for "unknown" and 0.55 or 0.35 for "nothing", where the error is too large for it."""
+    for quiet, kind in ((0.55, "cannot_tell"), (0.35, "unknown_effect")):
+        effects = {"creep": 0.6 - quiet}
+        found = chosen(GOOD, Probabilities(quiet, 0.0, 0.4, effects, 0.0, ()))
+        assert found.kind == kind
 
 
 def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():

@@ -156,3 +156,13 @@ def test_another_vibration_is_no_load(model, unloaded):
     assert min(left) > 0.97
     # Two sines, of amplitude 1 mm along x and y, in either recording.
     assert both.pairs.free_mm[-1] == pytest.approx(np.sqrt(2), rel=0.15)
+
+
+def test_a_load_acts_on_the_motion_that_both_recordings_share(model):
+    """Slow motion comes again, a vibration of 1 mm does not: it is taken off the body of BEFORE."""
+    t = PERIOD_S * np.arange(ROWS)
+    slow = np.stack([4 * np.sin(2 * np.pi * 0.1 * t), 4 * np.cos(2 * np.pi * 0.23 * t)], -1)
+    before, after = take(slow, "before", 1, 1.0), take(slow, "after", 2, 1.0)
+    body = before_and_after(residual_table(model, [after]), [before]).pairs.body_mm[:, -1, :2]
+    shaken = before.key_points_mm[:, -1, :2] - slow
+    assert np.std(body - slow) < 0.4 * np.std(shaken)

@@ -288,6 +288,13 @@ def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
     assert amended.refit.winner == "line_lag"
     assert amended.model.validation.rmse_mm < 0.5 * model.validation.rmse_mm
     assert "fitted together with the network" in amended.sentence
+    # A model that knows the held-out rows from its fit is no rival of one that does not.
+    known = replace(amended.held_out, before=0.01, fall=-1.0, ci95=(-2.0, -0.5), in_fit=0.4)
+    seen = replace(amended, held_out=known)
+    assert seen.claimed
+    assert f"{seen.alone.before:.3f} to {seen.alone.after:.3f} mm" in seen.sentence
+    assert "had been fitted to 40% of these rows" in seen.sentence
+    assert not replace(amended, held_out=replace(known, in_fit=0.0)).claimed
     better = improving.improve(arm, data, most_effects=1)
     assert better.steps[0][0] == "line_lag"
     assert better.rounds[0].together

@@ -110,7 +110,17 @@ def test_another_number_of_chambers_is_one_line(predict):
 
 def test_collect_goes_on_only_if_the_check_passes(tmp_path, capsys, monkeypatch):
     out = tmp_path / "r.parquet"
-    command = ["collect", "walk", "--points", "24", "-o", str(out), "--preflight", "default"]
+    command = [
+        "collect",
+        "walk",
+        "--points",
+        "24",
+        "-o",
+        str(out),
+        "--preflight",
+        "--arm",
+        "default",
+    ]
     swapped = "tests.rig.test_preflight:Faulty:tubes=1/0/2"
     monkeypatch.setattr(Faulty.__init__, "__annotations__", {"tubes": tuple[int, ...]})
     assert run([*command, "--rig", swapped]) == 2

@@ -99,6 +99,15 @@ def test_the_same_seed_gives_the_same_episode_to_the_last_step(name):
 
 
 @every_task
+def test_every_condition_of_a_phase_is_a_decision_for_each_episode(name):
+    task = task_of(name)
+    state = Episodes(task).seeded(0, 2)
+    for condition in TASKS[name].experiment.conditions.values():
+        held = condition.holds(task, state, condition.within)
+        assert (held.dtype, held.shape) == (torch.bool, (2,))
+
+
+@every_task
 def test_time_is_out_at_the_end_and_not_before(name):
     task = copy.copy(task_of(name))
     if task.world.scene is not None:  # a whole episode takes seconds there

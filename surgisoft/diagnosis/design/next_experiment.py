@@ -645,7 +645,11 @@ def next_experiment(
     error_mm: float | None = None,
     progress: Progress = silent,
 ) -> Recommendation:
-    """The experiment that best distinguishes competing effects.
+    """The experiment that best distinguishes competing effects (Box & Hill 1967).
+
+    Returns a schedule for the rig (times in s, pressures in the model's unit), the changes of the
+    experimental setup that go before it, and the probability with which it tells each pair of
+    effects apart. Raises InputError where fewer than two effects compete, or the time is too short.
 
     Model and recordings may be given by their paths; a model of other origin as for `compare`.
     The recordings are looked at as `diagnose` does: the training part, the

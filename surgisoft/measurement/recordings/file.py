@@ -33,7 +33,13 @@ Warn = Callable[[str], None]
 
 
 def load_recording(path: str | Path, on_warning: Warn | None = None) -> Recording:
-    """Read one recording; data-quality warnings go to `on_warning` (default: warnings.warn)."""
+    """Read one recording; data-quality warnings go to `on_warning` (default: warnings.warn).
+
+    Its arrays have one row for each of T samples: `t_s` (T,) s, `measured` (T, m) and `commanded`
+    (T, m) in `unit` (kPa, if the file states no other), `key_points_mm` (T, n, 3) mm in the arm
+    base frame, NaN where one was not seen. Raises InputError, with file and row, for a file that is
+    not such a table.
+    """
     return _read(Path(path), on_warning or _warn)
 
 
@@ -43,7 +49,8 @@ def load_recordings(
 ) -> list[Recording]:
     """Read files, and every recording of folders in the order of their names.
 
-    Recordings that are open already stay as they are.
+    Recordings that are open already stay as they are. Raises InputError where a path does not
+    exist, a folder holds no recording, or a file is not one (`load_recording`).
     """
     given = [paths] if isinstance(paths, str | Path | Recording) else list(paths)
     if any(isinstance(item, Recording) for item in given):

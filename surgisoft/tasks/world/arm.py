@@ -332,7 +332,7 @@ class ModelArm:
         learned = None if self._learner is None else self._learner.start(count)
         for target, at in zip((*passed, pressure), stood, strict=True):
             nominal, shape = self._advanced(nominal, target, 1.0)
-            if self._learner is None:
+            if self._learner is None or learned is None:
                 continue
             stream, noise = stream.normal(self.key_points, 3)
             seen = frames.apply(mount, at) + vary.noise_mm / math.sqrt(STOOD) * noise

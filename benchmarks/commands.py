@@ -564,3 +564,53 @@ def guard(
 
     if not run(against, repeats):
         raise typer.Exit(1)
+
+
+@app.command()
+def rows(
+    sizes: Annotated[
+        str, typer.Option("--rows", help="Rows of recordings, with commas.")
+    ] = "10000,100000,1000000",
+    diagnosed: Annotated[
+        str, typer.Option(help="Rows of recordings that are diagnosed, with commas.")
+    ] = "12000,200000,2000000",
+    faces: Annotated[str, typer.Option(help="Faces of organs, with commas.")] = "80000,500000",
+    output: Output = None,
+) -> None:
+    """Processor time and memory of commands on large files."""
+    from benchmarks.rows import markdown, run
+
+    numbers = _numbers("--rows", sizes), _numbers("--faces", faces)
+    with progress("rows") as report:
+        found = run(*numbers, _numbers("--diagnosed", diagnosed), report)
+    command = f"surgisoft benchmark rows --rows {sizes} --diagnosed {diagnosed} --faces {faces}"
+    _show("Cost of commands on large files", command, markdown(found), output)
+
+
+@app.command()
+def peers(
+    turns: Annotated[int, typer.Option(min=2, help="Turns of each environment.")] = 5,
+    output: Output = None,
+) -> None:
+    """Speed of other projects' environments and of this one's, in one run."""
+    from benchmarks.peers import markdown, run
+
+    with progress("peers") as report:
+        found = run(turns, report)
+    command = f"surgisoft benchmark peers --turns {turns}"
+    _show("Environments of other projects", command, markdown(found), output)
+
+
+@app.command()
+def scaling(images: Images = None, output: Output = None) -> None:
+    """How cost grows with environments, faces, key points and rows."""
+    from benchmarks.scaling import draw, markdown, run
+
+    check_folder(images)
+    with progress("scaling") as report:
+        curves = run(report)
+    body = markdown(curves)
+    if images:
+        images.mkdir(parents=True, exist_ok=True)
+        body += f"\n![Cost against size](../images/{draw(curves, images).name})\n"
+    _show("How cost grows", "surgisoft benchmark scaling", body, output)

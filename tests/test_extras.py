@@ -1,5 +1,6 @@
 """The core without its extras: what it can do, and what it says where an extra is missing."""
 
+import json
 import subprocess
 import sys
 import tomllib
@@ -87,31 +88,48 @@ print(surgisoft.diagnose("default", [folder / "bench.parquet"]).verdict.kind)
     assert done.stdout.startswith("True\n")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        ("train --task track_circle", "train"),
-        ("scene check phantom_liver", "scene"),
-        ("replay x.rrd", "replay"),
-        ("collect mixed --rig elastica -o x.parquet", "elastica"),
-    ],
-)
-def test_a_missing_library_names_its_extra(arguments, extra):
-    done = core("from surgisoft.cli import run; sys.exit(run(sys.argv[1:]))", *arguments.split())
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert f"pip install 'surgisoft[{extra}]'" in done.stderr
+MISSING = {
+    "train --task track_circle": "train",
+    "scene check phantom_liver": "scene",
+    "replay x.rrd": "replay",
+    "collect mixed --rig elastica -o x.parquet": "elastica",
+}
+"""Commands that need an extra, and which."""
 
 
-def test_python_names_the_extra_too():
+@pytest.fixture(scope="module")
+def said():
+    """What a function and these commands say, one after another in one program."""
     done = core(
         """
+import contextlib, io, json
 import surgisoft
+said = {}
 try:
     surgisoft.parallel_env
 except ImportError as error:
-    print(error)
-"""
+    said["python"] = [1, str(error)]
+from surgisoft.cli import run as command
+for line in sys.argv[1:]:
+    with contextlib.redirect_stderr(io.StringIO()) as errors:
+        code = command(line.split())
+    said[line] = [code, errors.getvalue()]
+print(json.dumps(said))
+""",
+        *MISSING,
     )
-    assert "surgisoft.parallel_env: the package" in done.stdout
-    assert "pip install 'surgisoft[train]'" in done.stdout
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(("arguments", "extra"), MISSING.items())
+def test_a_missing_library_names_its_extra(said, arguments, extra):
+    code, errors = said[arguments]
+    assert code == 2
+    assert errors.count("\n") == 1
+    assert f"pip install 'surgisoft[{extra}]'" in errors
+
+
+def test_python_names_the_extra_too(said):
+    assert "surgisoft.parallel_env: the package" in said["python"][1]
+    assert "pip install 'surgisoft[train]'" in said["python"][1]

@@ -199,10 +199,11 @@ class Batch:
         self.now[:16] = struct.pack("<qd", self.first, time.monotonic())
         self.out, self.began = Path(tempfile.mkdtemp(dir=self.folder)), time.monotonic()
         sys.stdout.flush()
+        parent = os.getpid()
         self.pid = os.fork()
         if self.pid == 0:
             try:
-                self._work()
+                self._work(parent)
                 os._exit(0)
             except BaseException:
                 traceback.print_exc()
@@ -239,7 +240,8 @@ class Batch:
         file = self.out / "findings.jsonl"
         return file.read_text().splitlines() if file.is_file() else []
 
-    def _work(self) -> None:
+    def _work(self, parent: int) -> None:
+        """Read inputs until the time is over, or the parent has gone."""
         target = TARGETS[self.target]
         for name in target.imports:
             __import__(name)
@@ -253,7 +255,7 @@ class Batch:
         with (self.out / "findings.jsonl").open("w") as file:
             _limit(self.limits)
             number, end = self.first, min(self.end, time.monotonic() + self.limits.batch_s)
-            while time.monotonic() < end and number != self.last:
+            while time.monotonic() < end and number != self.last and os.getppid() == parent:
                 self.now[:16] = struct.pack("<qd", number, time.monotonic())
                 with inputs.put(number) as sample:
                     signal.setitimer(signal.ITIMER_PROF, self.limits.hang_s)

@@ -870,6 +870,9 @@ def make_results(folder: Path) -> None:
     run_experiment(spec, place)
     file.unlink()
     shutil.rmtree(place / "logs", ignore_errors=True)
+    lines = (place / "experiment.toml").read_text().splitlines()
+    lines = [f'scene = "{PHANTOM}"' if line.startswith("scene") else line for line in lines]
+    (place / "experiment.toml").write_text("\n".join(lines) + "\n")
 
 
 def read_results(sample: Path) -> None:

@@ -230,7 +230,7 @@ def load_experiment(path: str | Path) -> Experiment:
     path = Path(path)
     table, where = read_toml(path)
     name = table.get("scenario", FIRST_TASK)
-    if name not in TASKS:
+    if not isinstance(name, str) or name not in TASKS:
         raise (where / "scenario").error(f"got {describe(name)}", f"one of {', '.join(TASKS)}")
     of = spec_of(name)
     given = table.pop("task", {})

@@ -617,6 +617,9 @@ class ExactScene:
 GUIDE_SLACK_MM = 1e-6
 """Rounding that the compiled search for the nearest segments may have (mm); of the segments within
 it of the nearest all are given to FCL."""
+GUIDED_FACES = 5_000
+"""Faces of a body up to which FCL is guided (a count): beside larger ones the search may cost more
+than FCL's distance of the whole arm (`surgisoft benchmark scaling`)."""
 BEAM_SLACK_MM = 0.01
 """FCL and the closed forms are asked about everything that comes within this of a beam (mm): ten
 times the width of the triangle that represents the beam."""
@@ -664,9 +667,13 @@ class GuidedChecker:
         checker, line = self.checker, chain.shape.centreline_mm
         bound, found = checker.horizon_mm + chain.shape.radius_mm, np.empty(2, np.int64)
         guide = (bound, GUIDE_SLACK_MM, self._trees[index], found, *self._work)
-        least = nearest_to_surface(line, *self._frames[index], *guide)
+        least = None
+        if len(checker.bodies[index].mesh.faces) <= GUIDED_FACES:
+            least = nearest_to_surface(line, *self._frames[index], *guide)
         body = checker._objects[index]
-        if least >= bound:  # the clearance saturates
+        if least is None:
+            centre = min(_least(chain.whole, body), bound)
+        elif least >= bound:  # the clearance saturates
             centre = least
         else:
             centre = _least(chain.part(found[0], found[1] + 1), body)

@@ -42,6 +42,8 @@ TASKS: dict[str, TaskSpec] = {
     "keyhole_ablation": KEYHOLE_ABLATION,
 }
 """Every task by name."""
+MOST_STEPS = 10_000_000
+"""Most steps of an episode: eleven days at 0.1 s."""
 
 
 def spec_of(task: str) -> TaskSpec:
@@ -52,9 +54,22 @@ def spec_of(task: str) -> TaskSpec:
 
 
 def make_task(name: str, config: Any = None, device: str | torch.device = "cpu") -> DocumentedTask:
-    """Build the named task; without a config with its default one."""
+    """Build the named task; without a config with its default one.
+
+    Raises InputError for an episode of more than `MOST_STEPS` steps.
+    """
     spec = spec_of(name)
-    return spec.build(spec.config if config is None else config, device)
+    try:
+        task = spec.build(spec.config if config is None else config, device)
+        steps = task.steps
+    except OverflowError:  # a time over dt_s is infinite
+        steps = MOST_STEPS + 1
+    if steps > MOST_STEPS:
+        raise InputError(
+            f"{name}: an episode of more than {MOST_STEPS:,} steps; expected shorter times, fewer "
+            "loops or a longer dt_s in its configuration"
+        )
+    return task
 
 
 def make_with(

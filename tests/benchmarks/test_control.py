@@ -105,15 +105,16 @@ def test_goals_are_bold_where_they_are_reached_and_only_there():
 def test_two_processes_train_together_and_are_taken_once_they_are_done(tmp_path, monkeypatch):
     place = tmp_path / "whole"
     told = []
-    run_folder = trained_by_two(place, "track_circle", 100_000, lambda *seen: told.append(seen))
+    monkeypatch.setattr(two_processes, "ENVS", 64)
+    run_folder = trained_by_two(place, "track_circle", 2_000, lambda *seen: told.append(seen))
     assert run_folder.config["processes"] == 2
-    assert all(of == 100_000 for _, of, _ in told)
+    assert all(of == 2_000 for _, of, _ in told)
     assert told
-    assert cost(run_folder).steps == 2 * 2 * 4096 * 12  # two turns of two processes
+    assert cost(run_folder).steps == 2 * 2 * 64 * 12  # two turns of two processes
     monkeypatch.setattr(two_processes.subprocess, "Popen", lambda *a, **k: pytest.fail("again"))
-    assert trained_by_two(place, "track_circle", 100_000, nothing).path == place
+    assert trained_by_two(place, "track_circle", 2_000, nothing).path == place
     with pytest.raises(InputError, match="track_circle by 2 processes, expected track_square by 2"):
-        trained_by_two(place, "track_square", 100_000, nothing)
+        trained_by_two(place, "track_square", 2_000, nothing)
 
 
 def test_two_processes_that_fail_say_where_to_look(tmp_path, monkeypatch):

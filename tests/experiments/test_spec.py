@@ -141,3 +141,10 @@ def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
         with_rigs(simulated, ("virtual",))
     with pytest.raises(InputError, match="no arm 'knife'"):
         with_rigs(spec, ("knife=virtual",))
+
+
+@pytest.mark.parametrize("value", ["[]", "{}", "1", '"cure"'])
+def test_a_scenario_that_is_no_name_is_one_line(tmp_path, value):
+    path = write(tmp_path, f"scenario = {value}\n{TINY}")
+    with pytest.raises(InputError, match=r"tiny\.toml:1: scenario: got"):
+        load_experiment(path)

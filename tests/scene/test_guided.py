@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from surgisoft.scene import collision
 from surgisoft.scene.batched import BatchedScene
 from surgisoft.scene.camera import LIFT_MM, SHORT_MM, Camera, seen_from
 from surgisoft.scene.capsules import ArmShape
@@ -55,6 +56,23 @@ def test_guided_clearances_are_those_of_whole_arms(checkers, seed, bend, inwards
     expected = [exact.bodies_mm.values(), exact.arms_mm.values(), exact.self_mm.values()]
     for one, other in zip(found, expected, strict=True):
         assert one == pytest.approx([*other], abs=1e-6)
+
+
+def test_bodies_of_many_faces_are_given_to_fcl_as_a_whole(bodies, checkers, monkeypatch):
+    monkeypatch.setattr(collision, "GUIDED_FACES", 100)
+    asked = []
+    search = collision.nearest_to_surface
+    monkeypatch.setattr(
+        collision, "nearest_to_surface", lambda *a: asked.append(len(a[5][0])) or search(*a)
+    )
+    lines = curled(3, 2.0, 0.5)
+    arms = {n: ArmShape(line, RADII[n]) for n, line in zip(RADII, lines, strict=True)}
+    found, _, _ = GuidedChecker(checkers.plain).clearances(arms)
+    expected = checkers.plain.clearance(arms).bodies_mm
+    assert found == pytest.approx([*expected.values()], abs=1e-9)
+    small = [len(body.mesh.faces) for body in bodies if len(body.mesh.faces) <= 100]
+    assert asked == 2 * small
+    assert 0 < len(small) < len(bodies)
 
 
 def test_the_search_leaves_little_to_whole_arms(bodies):

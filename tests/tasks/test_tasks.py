@@ -27,6 +27,7 @@ from surgisoft.tasks.registry import (
     config_of,
     make_task,
     read_config,
+    with_fields,
 )
 from surgisoft.tasks.track import TrackConfig, track_circle
 from surgisoft.tasks.track_body import TrackBody, TrackBodyConfig
@@ -498,3 +499,11 @@ def test_the_fine_term_has_its_own_scale():
     assert near != 1.0
     torch.testing.assert_close(reward["track"], torch.exp(-error))
     torch.testing.assert_close(reward["fine"], torch.exp(-error / near))
+
+
+@pytest.mark.parametrize("change", [{"loop_s": 1e308}, {"loops": 2**62}])
+def test_an_episode_without_end_is_one_line(change):
+    """As a damaged config.json of a training run asks for it."""
+    config = with_fields(config_of("track_circle"), **change)
+    with pytest.raises(InputError, match="an episode of more than 10,000,000 steps"):
+        make_task("track_circle", config)

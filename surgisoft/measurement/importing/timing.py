@@ -35,6 +35,9 @@ GAP_S = 0.2
 """Key points are on a line over gaps up to this, or up to five samples [s]."""
 RIDGE = 1e-4
 """Ridge of the regression, as a share of the features' mean square."""
+MOST_SAMPLES = 300_000
+"""Samples of the even clock, those of the first runs, among which a lead of the body is looked for;
+the cost grows with them (a count)."""
 MOST_GAPS = 100
 """Times that a run may last longer than its samples at the usual step: beyond it the run is mostly
 gaps, and an even clock would have as many samples as its longest time claims."""
@@ -63,12 +66,14 @@ class Moves:
             return None
         step = max(float(np.median(np.concatenate(steps))), LEAST_STEP_S)
         scaled = (2 * (recording.measured - low) / np.where(live, high - low, 1.0) - 1)[:, live]
-        actuation, body = [], []
+        actuation: list[np.ndarray] = []
+        body: list[np.ndarray] = []
         for run in recording.runs:
             t_s = recording.t_s[run]
             if t_s[-1] - t_s[0] > MOST_GAPS * len(t_s) * step:
                 continue
-            grid = np.arange(t_s[0], t_s[-1] + 1e-9, step)
+            left = MOST_SAMPLES - sum(len(part) for part in body)
+            grid = np.arange(t_s[0], t_s[-1] + 1e-9, step)[:left]
             if len(grid) > 4 * BACK_S / step:
                 actuation.append(_on(grid, t_s, scaled[run]))
                 points = recording.key_points_mm[run]
@@ -228,19 +233,21 @@ def held_period_s(recording: Recording) -> float | None:
     """
     if recording.kind == "settled":
         return None
-    gaps, alive, same = [], [], []
-    for run in recording.runs:
-        fresh = renewed_rows(recording.measured[run])
-        gaps.append(np.diff(fresh))
+    renewed = [renewed_rows(recording.measured[run]) for run in recording.runs]
+    steps = np.concatenate([np.diff(fresh) for fresh in renewed])
+    usual = np.median(steps) if len(steps) >= LEAST_ROWS else 1.0
+    if usual < 2:
+        return None
+    alive, same = [], []
+    for run, fresh in zip(recording.runs, renewed, strict=True):
         points = recording.key_points_mm[run].reshape(run.stop - run.start, -1)
         moved = (np.diff(points, axis=0) != 0) & ~np.isnan(np.diff(points, axis=0))
-        held = np.setdiff1d(np.arange(1, len(points)), fresh)
-        alive.append(moved[held - 1].any(axis=1))
+        held = np.ones(len(points), bool)
+        held[0] = held[fresh] = False
+        alive.append(moved[held[1:]].any(axis=1))
         if recording.commanded is not None:
             same.append(np.isin(fresh[1:], renewed_rows(recording.commanded[run])[1:]))
-    steps = np.concatenate(gaps)
-    usual = np.median(steps) if len(steps) >= LEAST_ROWS else 1.0
-    if usual < 2 or np.concatenate(alive).mean() < 0.5:
+    if np.concatenate(alive).mean() < 0.5:
         return None
     low, high = (factor * usual for factor in HELD_RANGE)
     if ((steps >= low) & (steps <= high)).mean() < HELD_REGULAR:

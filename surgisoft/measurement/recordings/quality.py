@@ -8,6 +8,7 @@ before.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -168,10 +169,10 @@ def _key_point_changes(recording: Recording) -> list[np.ndarray]:
 
 def _actuation_moves(recording: Recording, rows: slice, share: float) -> bool:
     """Whether any channel moves by this share of its whole range within the rows."""
-    for values in (recording.measured, recording.commanded):
-        if values is not None and len(values[rows]):
+    for values, ranges in recording.actuation_ranges:
+        if len(values[rows]):
             moved = np.ptp(values[rows], axis=0)
-            if (moved > share * np.maximum(np.ptp(values, axis=0), 1e-300)).any():
+            if (moved > share * np.maximum(ranges, 1e-300)).any():
                 return True
     return False
 
@@ -231,9 +232,7 @@ class _Track:
 
     def _usual(self, first: np.ndarray) -> np.ndarray:
         """(C,) median of the steps in the window that begins at each of these, as far as known."""
-        padding = np.full(STEP_WINDOW, np.nan)
-        padded = np.concatenate([padding, self.steps_mm, padding])
-        usual = np.zeros(len(first))
+        padded, usual = self._padded_mm, np.zeros(len(first))
         for some in np.array_split(np.arange(len(first)), len(first) // 100_000 + 1):
             windows = padded[first[some, None] + STEP_WINDOW + np.arange(STEP_WINDOW)]
             whole = ~np.isnan(windows).any(axis=1)
@@ -242,6 +241,12 @@ class _Track:
                 known = window[~np.isnan(window)]
                 usual[i] = np.median(known) if len(known) else 0.0
         return usual
+
+    @cached_property
+    def _padded_mm(self) -> np.ndarray:
+        """The steps between two windows of unknown ones."""
+        padding = np.full(STEP_WINDOW, np.nan)
+        return np.concatenate([padding, self.steps_mm, padding])
 
     def ratio_near(self, row: int) -> float:
         """The largest ratio of the steps that end within one fresh position of a sample."""

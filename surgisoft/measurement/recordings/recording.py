@@ -114,6 +114,12 @@ class Recording:
         edges = [0, *(np.flatnonzero(np.diff(self.run)) + 1).tolist(), self.samples]
         return [slice(a, b) for a, b in itertools.pairwise(edges)]
 
+    @cached_property
+    def actuation_ranges(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Measured and commanded actuation (T, m) as far as known, each with its ranges (m,)."""
+        known = [values for values in (self.measured, self.commanded) if values is not None]
+        return [(values, np.ptp(values, axis=0)) for values in known if len(values)]
+
     @property
     def label(self) -> str:
         """What an error message calls it: the file where there is one."""

@@ -87,7 +87,11 @@ def _cleaned(body: bytes, role: FileRole) -> bytes:
     if role.separator == "whitespace":
         body = re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", body)
         return re.sub(rb"[ \t]+", b"\t", body)
-    return re.sub(rb"(?m)^[ \t]+$", b"", body) if role.separator != "\t" else body
+    # A search for lines of blanks alone goes through every line, which few files need.
+    blank = body[:1] in (b" ", b"\t") or b"\n " in body or b"\n\t" in body
+    if role.separator == "\t" or not blank:
+        return body
+    return re.sub(rb"(?m)^[ \t]+$", b"", body)
 
 
 def _without_torn_end(

@@ -1,0 +1,218 @@
+"""Cost of commands on large files: processor time and memory against rows and faces.
+
+    surgisoft benchmark rows
+
+The files are made here: recordings of the packaged arm with a slow drift and noise, the same as a
+raw file of a lab with its map, and an organ of many faces. Each command runs in a process of its
+own; its processor time counts all its threads, its memory is the peak of resident pages. On a
+machine that does other work processor time still grows with the load, by caches that are shared.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from surgisoft.measurement.recordings import Recording, save_recording
+from surgisoft.progress import Progress, silent
+from surgisoft.surrogate.checkpoint import default_arm
+
+RUN_ROWS, SIMULATED, HOLD_ROWS = 3000, 30_000, 20
+"""Rows of a run, rows that are simulated, and rows between two pressures of the schedule."""
+DT_S, NOISE_MM, DRIFT_MM, DRIFT_S = 0.05, 0.05, 1.5, 90.0
+"""Time between rows, s; standard deviation of the noise, mm; size of the slow drift, mm, and its
+time constant, s."""
+MAP = """[time]
+column = "time"
+unit = "s"
+
+[measured]
+columns = ["pA", "pB", "pC"]
+unit = "kPa"
+
+[key_points]
+positions = [{names}]
+unit = "mm"
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one command cost."""
+
+    command: str
+    """The command, files by their number of rows or faces."""
+    size: int
+    """Rows or faces."""
+    processor_s: float
+    """Processor time of all its threads, s."""
+    memory_gb: float
+    """Peak of its resident memory, GB."""
+    limit: str
+    """What it may cost."""
+    failed: str
+    """Last line of its error; empty where it ended well."""
+
+
+def recording(rows: int, seed: int = 0) -> Recording:
+    """A recording of the packaged arm with a drift that its model does not have.
+
+    Motions of more than `SIMULATED` rows are repeated run by run, each with noise of its own.
+    """
+    arm, random = default_arm(), torch.Generator().manual_seed(seed)
+    steps = min(rows, RUN_ROWS)
+    runs = min(max(1, rows // steps), SIMULATED // RUN_ROWS)
+    low, high = torch.tensor(arm.spec.low), torch.tensor(arm.spec.high)
+    count = -(-steps // HOLD_ROWS) + 1
+    knots = torch.rand(runs, count, arm.spec.chambers, generator=random) * (high - low) + low
+    place = torch.arange(steps) / HOLD_ROWS
+    below = place.long()
+    pressure = torch.lerp(knots[:, below], knots[:, below + 1], (place - below)[None, :, None])
+    state, points = arm.initial_state(runs, pressure[:, 0]), []
+    lag = pressure[:, 0].clone()
+    with torch.inference_mode():
+        for step in range(steps):
+            state, now = arm.step(state, pressure[:, step] - state.pressure, DT_S)
+            lag += DT_S / DRIFT_S * (pressure[:, step] - lag)
+            share = torch.linspace(0.0, 1.0, now.shape[1])[None, :, None] ** 2
+            points.append(now + DRIFT_MM * share * ((lag - low) / (high - low))[:, None, :3])
+    number = torch.arange(max(1, rows // steps)) % runs
+    measured = torch.stack(points, 1)[number]
+    measured += NOISE_MM * torch.randn(measured.shape, generator=random)
+    return Recording(
+        name=f"rows{rows}",
+        t_s=np.tile(DT_S * np.arange(steps), len(number)),
+        measured=pressure[number].flatten(0, 1).numpy(),
+        key_points_mm=measured.flatten(0, 1).numpy(),
+        run=np.repeat(np.arange(len(number)), steps),
+    )
+
+
+def write_raw(made: Recording, folder: Path) -> tuple[Path, Path]:
+    """A recording's rows as a table of a lab, and its map; all rows are one run there."""
+    import pyarrow as pa
+    import pyarrow.csv
+
+    columns = {"time": DT_S * np.arange(made.samples)}
+    columns |= {f"p{c}": made.measured[:, i].round(4) for i, c in enumerate("ABC")}
+    names = []
+    for k in range(made.key_points):
+        each = [f"{axis}{k}" for axis in "xyz"]
+        names.append(f'["{each[0]}", "{each[1]}", "{each[2]}"]')
+        columns |= {n: made.key_points_mm[:, k, i].round(4) for i, n in enumerate(each)}
+    raw, map_file = folder / "raw.csv", folder / "map.toml"
+    pyarrow.csv.write_csv(pa.table(columns), raw)
+    map_file.write_text(MAP.format(names=", ".join(names)))
+    return raw, map_file
+
+
+def write_organ(faces: int, folder: Path) -> tuple[Path, int]:
+    """A mesh of about so many faces with bumps, 80 mm in radius, and the number of its faces."""
+    import trimesh
+
+    levels = max(1, round(np.log(faces / 20) / np.log(4)))
+    mesh = trimesh.creation.icosphere(subdivisions=levels, radius=1.0)
+    if len(mesh.faces) < faces:  # cut some faces in four, to come near
+        extra = np.arange((faces - len(mesh.faces)) // 3)
+        vertices, cut = trimesh.remesh.subdivide(mesh.vertices, mesh.faces, extra)
+        mesh = trimesh.Trimesh(vertices, cut)
+    way = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    bump = 1.0 + 0.05 * np.sin(5.0 * way[:, :1]) * np.cos(4.0 * way[:, 1:2])
+    mesh.vertices = 80.0 * bump * way
+    file = folder / f"organ{faces}.ply"
+    mesh.export(file)
+    return file, len(mesh.faces)
+
+
+CHILD = """
+import atexit, pathlib, sys
+file = pathlib.Path(sys.argv.pop(1))
+status = pathlib.Path("/proc/self/status")
+atexit.register(lambda: status.is_file() and file.write_text(status.read_text()))
+from surgisoft.cli import main
+main()
+"""
+"""A process that runs a command and leaves its peak of memory behind. The system's accounts of a
+child begin with the memory of the process that started it."""
+
+
+def cost(words: list[str], label: str, size: int, limit: str = "") -> Cost:
+    """Run `surgisoft WORDS...` in a process and measure it."""
+    with tempfile.TemporaryDirectory() as name:
+        status, log = Path(name) / "status", Path(name) / "log"
+        with log.open("w") as out:
+            child = subprocess.Popen(
+                [sys.executable, "-c", CHILD, str(status), *words], stdout=out, stderr=out
+            )
+            _, ended, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(ended)
+        lines = log.read_text().strip().splitlines()
+        peak = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+    failed = "" if child.returncode in (0, 1) else f"exit {child.returncode}: {lines[-1:]}"
+    seconds = used.ru_utime + used.ru_stime
+    memory = 1024e-9 * int(peak[0].split()[1]) if peak else float("nan")
+    return Cost(label, size, seconds, memory, limit, failed)
+
+
+def run(
+    rows: list[int], faces: list[int], diagnosed: list[int], report: Progress = silent
+) -> list[Cost]:
+    """Measure the commands; rows of `recording` and `import`, of `diagnose`, faces of scenes."""
+    found = [cost(["--help"], "--help", 0, "0.4 s")]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tasks: list[tuple[str, Callable[[], list[Cost]]]] = []
+
+        def of_rows(count: int) -> list[Cost]:
+            made, file = recording(count), folder / f"{count}.parquet"
+            save_recording(made, file)
+            raw, map_file = write_raw(made, folder)
+            out = folder / f"imported{count}.parquet"
+            words = ["import", str(raw), "--map", str(map_file), "-o", str(out)]
+            return [
+                cost(["recording", str(file)], "recording REC", count, "5 s for 1,000,000"),
+                cost(words, "import RAW --map MAP", count, "5 s for 1,000,000"),
+            ]
+
+        def of_diagnosis(count: int) -> list[Cost]:
+            file = folder / f"{count}.parquet"
+            if not file.is_file():
+                save_recording(recording(count), file)
+            limit = "5 s for 12,000; 60 s, 4 GB for 2,000,000"
+            return [cost(["diagnose", "default", str(file)], "diagnose default REC", count, limit)]
+
+        def of_faces(count: int) -> list[Cost]:
+            file, real = write_organ(count, folder)
+            words = ["scene", "new", str(file), "-o", str(folder / f"scene{count}")]
+            return [cost(words, "scene new MESH", real, "30 s for 500,000")]
+
+        for kind, sizes in ((of_rows, rows), (of_diagnosis, diagnosed), (of_faces, faces)):
+            tasks += [(f"{kind.__name__} {n:,}", lambda k=kind, n=n: k(n)) for n in sizes]
+        for number, (label, work) in enumerate(tasks):
+            report(number, len(tasks), label)
+            found += work()
+    return found
+
+
+def markdown(found: list[Cost]) -> str:
+    """The table of costs."""
+    lines = [
+        "Processor time of all threads, and peak of resident memory, of one process each.",
+        "",
+        "| command | rows or faces | processor time | memory | limit |",
+        "|---|---|---|---|---|",
+    ]
+    for each in found:
+        size = f"{each.size:,}" if each.size else "-"
+        numbers = f"{each.processor_s:.2f} s | {each.memory_gb:.2f} GB"
+        numbers = f"{each.failed} | -" if each.failed else numbers
+        lines.append(f"| `surgisoft {each.command}` | {size} | {numbers} | {each.limit} |")
+    return "\n".join(lines) + "\n"

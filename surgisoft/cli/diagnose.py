@@ -189,7 +189,7 @@ def _show(found) -> None:
     for check in found.checks:
         print(f"check: {check}")
     print(f"{'effect':18s} {'conf.':>6s} {'alone':>7s} {'unique':>7s} {'held-out RMSE':>24s}")
-    for row in found.ranking:
+    for row in found.shown:
         low, high = row.ci95
         print(
             f"{row.effect:18s} {row.confidence:6.2f} {100 * row.gain_alone:6.1f}% "

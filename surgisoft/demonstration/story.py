@@ -25,7 +25,7 @@ from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.replay.model_error import write_compared, write_models
 from surgisoft.replay.show import open_replay
-from surgisoft.report import Command, Gallery, Page, Picture, Section, Text, write_page
+from surgisoft.report import Command, Page, Picture, Section, Text, write_page
 from surgisoft.rig.trial import collect
 from surgisoft.surrogate.checkpoint import save_model
 
@@ -37,6 +37,8 @@ HIDDEN = "creep"
 """The hidden effect of the robot that is recorded: the wall yields slowly under load."""
 POINTS = 6000
 """Samples of the recording: five minutes of the bench at 20 Hz."""
+BROAD_PX = 620
+"""Width below which a broad picture scrolls, pixels."""
 STEPS = ("cut", "measure", "compare", "diagnose", "amend")
 """Names of the steps, in their order."""
 
@@ -155,7 +157,8 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
         Text(
             "Two soft arms over a liver phantom: one carries the laser, the other the endoscope. "
             "The policies see pressures, key points and the lesion. An exact collision checker "
-            "(FCL) decides what the beam hits. Look around in the replay: surgisoft replay cut.rrd"
+            "(FCL) decides what the beam hits. Look around in the replay: "
+            "`surgisoft replay cut.rrd`"
         ),
     ]
     if picture is not None:
@@ -170,8 +173,9 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
             track_chart(result.amendment.tracks[1], "Held-out part of the recording"),
             Text(
                 "The folder amended holds the new model; it is used like any other, for example "
-                "by surgisoft train --task track_circle --arm amended. "
-                "Details: amendment.html; before and after in 3-D: surgisoft replay amended.rrd"
+                "by `surgisoft train --task track_circle --arm amended`. "
+                "Details: `amendment.html`; before and after in 3-D: "
+                "`surgisoft replay amended.rrd`"
             ),
         ]
     return Page(
@@ -191,7 +195,7 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
                     Text(
                         "The virtual rig plays a robot that creeps: its wall yields slowly under "
                         "load. The model does not know. On a bench of your own the recording comes "
-                        "from surgisoft import or from a rig driver."
+                        "from `surgisoft import` or from a rig driver."
                     ),
                 ],
             ),
@@ -201,7 +205,7 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
                     Command("surgisoft compare default bench.parquet --report compare"),
                     Text(said["compare"]),
                     *_error_pictures(drawn),
-                    Text("Details: compare/report.html; in 3-D: surgisoft replay compare.rrd"),
+                    Text("Details: `compare/report.html`; in 3-D: `surgisoft replay compare.rrd`"),
                 ],
             ),
             Section(
@@ -210,7 +214,7 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
                     Command("surgisoft diagnose default bench.parquet"),
                     Text(said["diagnose"]),
                     *_ranking_parts(result.diagnosis),
-                    Text("Details: diagnosis.html"),
+                    Text("Details: `diagnosis.html`"),
                 ],
             ),
             Section("5. The effect is added, and the error falls", amended),
@@ -231,13 +235,13 @@ def _cut_sentence(cut: Evaluations) -> str:
 
 
 def _error_pictures(drawn: list[Path]) -> list:
-    """Body and loops side by side, the error below."""
+    """Body, loops and error; the broad ones scroll on a narrow page."""
     by_name = {path.stem: path for path in drawn}
-    pair = [
+    return [
         Picture.from_file(by_name["body"], "Measured key points and predicted bodies"),
-        Picture.from_file(by_name["loops"], "Hysteresis loops, measured and predicted"),
+        Picture.from_file(by_name["loops"], "Loops, measured and predicted", "", BROAD_PX),
+        Picture.from_file(by_name["error"], "Error over the recording", "", BROAD_PX),
     ]
-    return [Gallery(pair), Picture.from_file(by_name["error"], "Error over the recording")]
 
 
 def _ranking_parts(found: Diagnosis) -> list:

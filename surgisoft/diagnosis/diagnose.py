@@ -199,6 +199,14 @@ class Diagnosis:
     refit: Refit | None = None
     """What candidates did that were fitted together with the network; None where none was."""
 
+    @property
+    def shown(self) -> tuple[Ranked, ...]:
+        """The ranking in the order of tables and charts: by confidence as it is printed, then by
+        the error that is left."""
+        return tuple(
+            sorted(self.ranking, key=lambda row: (-round(row.confidence, 2), row.heldout_rmse_mm))
+        )
+
     def to_json(self) -> dict:
         """Plain values, as `diagnose --json` writes them."""
         plain = asdict(replace(self, setup=None, track=None, change=None, refit=None))

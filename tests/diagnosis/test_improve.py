@@ -9,7 +9,7 @@ import pytest
 from surgisoft.cli import run
 from surgisoft.diagnosis import improve as loop
 from surgisoft.diagnosis.decision import Probabilities
-from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Verdict
+from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict
 from surgisoft.diagnosis.improve import NETWORK, improve, next_effects
 from surgisoft.diagnosis.residuals import held_out_rows
 from surgisoft.errors import InputError
@@ -146,3 +146,15 @@ def test_the_second_effect_of_an_answer_does_not_repeat_its_sentence(recited):
     assert [r.step for r in result.rounds] == ["creep", "gain_mismatch", None]
     assert result.rounds[0].sentence == "several it is"
     assert result.rounds[1].sentence == "named beside creep by the same diagnosis"
+
+
+def test_tables_follow_the_confidence_that_they_print():
+    """Equal confidences by the error that is left."""
+    rows = [("a", 0.001, 0.5), ("b", 0.004, 0.2), ("c", 0.9, 0.4), ("d", 0.06, 0.1)]
+    ranking = tuple(
+        Ranked(name, confidence, 0.0, 0.0, error, (0.0, 1.0), 1.0, 0.0, {})
+        for name, confidence, error in rows
+    )
+    found = Diagnosis(Verdict("identified", ("c",), "c"), ErrorLevels(1.0, 0.1, 0.1), ranking)
+    assert [row.effect for row in found.shown] == ["c", "d", "b", "a"]
+    assert found.ranking == ranking

@@ -218,7 +218,7 @@ def _ranking(found: Diagnosis) -> Table:
             f"{row.ci95[0]:.3f} .. {row.ci95[1]:.3f}",
             f"{row.p_value:.4f}",
         )
-        for row in found.ranking
+        for row in found.shown
     ]
     header = ["effect", "confidence", "alone", "unique", "held-out [mm]", "95 %", "p-value"]
     return Table(header, rows)
@@ -294,7 +294,7 @@ def _chart(found: Diagnosis):
     """Held-out error with each effect, between the error before and the noise floor."""
     from surgisoft.report.charts import AMBER, BLUE, GREEN, RED, chart, drawing, plt
 
-    rows = found.ranking[::-1]
+    rows = found.shown[::-1]
     with drawing():
         figure, axis = plt.subplots(figsize=(4.8, 0.6 + 0.24 * max(len(rows), 3)))
         for place, row in enumerate(rows):

@@ -352,6 +352,7 @@ def main() -> int:
     parser.add_argument("--rig-episodes", type=int, default=32, help="episodes on the virtual rig")
     parser.add_argument("--steps", type=int, default=400, help="longest episode, steps")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", choices=laser_tasks(), default=laser_tasks())
     parser.add_argument("--scene", nargs="*", default=[], help="further scenes, folders")
     given = parser.parse_args()
     broken = 0
@@ -359,7 +360,7 @@ def main() -> int:
     print("|", " | ".join((*columns, "ended by NaN", "broken", "seconds")), "|")
     print("|---|---|---|---|---|---|---|---|---|---|")
     reasons: Counter = Counter()
-    for name in laser_tasks():
+    for name in given.only:
         for scene in (None, *given.scene):
             for plant, count in (("simulation", given.episodes), ("rig", given.rig_episodes)):
                 began, found = time.perf_counter(), Findings()

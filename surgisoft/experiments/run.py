@@ -7,7 +7,6 @@ one go and one that was interrupted give the same rows.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -35,7 +34,7 @@ from surgisoft.experiments.spec import (
     load_experiment,
     save_experiment,
 )
-from surgisoft.files import json_safe, read_json, write_json
+from surgisoft.files import json_safe, new_folder, read_json, write_json
 from surgisoft.progress import Progress, silent
 from surgisoft.surrogate.code import name_code, named_code
 from surgisoft.tasks.episodes.file import save_episode
@@ -107,14 +106,14 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
                 "--force replaces them"
             )
     check_playable(spec)
-    if force and there:
-        shutil.rmtree(folder)
-    (folder / "rows").mkdir(parents=True, exist_ok=True)
     about: dict[str, object] = {"versions": versions()}
     if spec.in_scene:
         about["scene_hash"] = scene_of(spec, settings(spec)[0]).content_hash
-    write_json(folder / "versions.json", about)
-    save_experiment(spec, folder / FILE)
+    replaced = [path.name for path in folder.iterdir()] if folder.exists() else []
+    with new_folder(folder, own=replaced) as fresh:  # old results stay until the new ones begin
+        (fresh / "rows").mkdir()
+        write_json(fresh / "versions.json", about)
+        save_experiment(spec, fresh / FILE)
 
 
 def check_playable(spec: Experiment) -> None:

@@ -204,6 +204,11 @@ def load_model(
         _check_finite(folder, weights)
         spec = from_table(ArmSpec, config["arm"], Where(file) / "arm")
         low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+        if weights["rest_mm"].shape != (spec.key_points, 3):
+            raise InputError(
+                f"{folder}: {spec.key_points} key points by config.json, 'rest_mm' has shape "
+                f"{list(weights['rest_mm'].shape)} in the weights; fit the model again"
+            )
         network = dict(config["network"])
         kind = network.pop("kind")
         if kind not in NETWORKS:

@@ -11,6 +11,7 @@ from surgisoft.agents import session
 from surgisoft.agents.evaluate import Evaluation
 from surgisoft.cli import run
 from surgisoft.errors import InputError
+from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import load_experiment
@@ -105,6 +106,27 @@ def test_list_names_what_is_shipped(capsys):
     out = capsys.readouterr().out
     for name in ("liver", "multi_lesion", "fault", "sweep", "contours", "area", "breathing"):
         assert f"{name}.toml: " in out
+
+
+def test_old_results_stay_until_the_new_ones_have_begun(whole, tmp_path, monkeypatch):
+    """What ends --force in the middle leaves all of the old results, and nothing half."""
+    file, folder = whole
+    results, spec = tmp_path / "results", load_experiment(file)
+    shutil.copytree(folder, results)
+    before = sorted(path.name for path in results.rglob("*"))
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment_run, "save_experiment", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            open_results(spec, results, force=True)
+    assert sorted(path.name for path in results.rglob("*")) == before
+    open_results(spec, results, force=True)
+    assert sorted(path.name for path in results.iterdir()) == [
+        "experiment.toml",
+        "rows",
+        "versions.json",
+    ]
+    assert not list((results / "rows").iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
 
 
 def test_a_damaged_row_is_one_line(whole, tmp_path):

@@ -43,6 +43,17 @@ def test_a_log_is_the_recording(protocol, tmp_path):
     same(read, recording)
 
 
+def test_a_temperature_that_a_frame_lacks_is_none_of_the_recording(tmp_path):
+    """Several frames of one steady-state point, the second without it."""
+    log = tmp_path / "r.log.jsonl"
+    collect(VirtualRig(1), SETTLED, log=log)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert lines[1]["row"] == lines[2]["row"]
+    del lines[2]["temp_C"]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert read_log(log)[0].temp_C is None
+
+
 def test_a_torn_log_opens_and_says_what_is_missing(tmp_path, capsys):
     log = tmp_path / "r.log.jsonl"
     whole = collect(VirtualRig(1), SETTLED, log=log)

@@ -58,3 +58,13 @@ def test_training_residuals_of_other_rows_are_refused(folder):
     with pytest.raises(InputError, match="do not have the same rows"):
         load_model(folder)
     assert torch.equal(known["actuation"], load_model("default").training_residuals.actuation)
+
+
+def test_key_points_that_the_weights_do_not_have_take_no_memory(folder):
+    """A billion of them would be 12 GB for the arm at rest alone."""
+    config = json.loads((folder / "config.json").read_text())
+    config["arm"]["key_points"] = 10**9
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"1000000000 key points by config\.json") as caught:
+        load_model(folder)
+    assert caught.value.__cause__ is None

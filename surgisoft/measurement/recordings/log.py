@@ -207,7 +207,7 @@ def read_log(path: str | Path) -> tuple[Recording, str]:
         commanded=_last(ordered, "c", header.chambers),
         run=np.array([group[-1]["run"] for group in ordered], np.int64),
         unit=header.unit,
-        temp_C=column("temp_C") if all("temp_C" in g[0] for g in ordered) else None,
+        temp_C=column("temp_C") if all("temp_C" in line for line in lines[1:]) else None,
         payload_g=None if header.payload_g is None else np.full(len(t_s), header.payload_g),
         arm=header.arm,
         gravity=None if header.gravity is None else np.array(header.gravity),

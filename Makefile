@@ -21,7 +21,7 @@ $(DOCS_STAMP): $(STAMP)
 
 demo: $(STAMP)  ## train two arms to cut a ring, replay it; find the effect that a model is missing
 	rm -rf demo/ring
-	$(BIN)/surgisoft train --task circle_ablation --preset randomised --minutes 4 -o demo/ring
+	$(BIN)/surgisoft train --task circle_ablation --preset robust --minutes 4 -o demo/ring
 	$(BIN)/surgisoft evaluate demo/ring scripted random --task circle_ablation --episodes 4 --replay demo/ring.rrd
 	$(BIN)/surgisoft evaluate demo/ring scripted --on rig --episodes 2
 	$(BIN)/surgisoft collect mixed --seed 0 --hidden creep -o demo/bench.parquet --force

@@ -341,6 +341,9 @@ def robust(
     hidden_episodes: Annotated[
         int, typer.Option(min=1, help="Episodes of each hidden effect and robot.")
     ] = 2,
+    observers: Annotated[
+        str, typer.Option(help="Observers, with commas: filter, learns.")
+    ] = "filter,learns",
     exact: Annotated[
         bool,
         typer.Option(
@@ -361,17 +364,22 @@ def robust(
     import torch
 
     from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
+    from surgisoft.errors import unknown_name
 
     check_free(json_file, "cases")
     check_folder(work)
     check_folder(images)
+    for observer in observers.split(","):
+        if observer not in (FILTER, LEARNS):
+            raise unknown_name("observer", observer, (FILTER, LEARNS))
     names = {policy: Path(policy).name for policy in policies.split(",")}
     methods = tuple(
         Method(f"{name}, {observer}", policy, observer)
         for policy, name in names.items()
-        for observer in (FILTER, LEARNS)
+        for observer in observers.split(",")
     )
-    best = tuple(method.name for method in methods[:2] if method.observer == LEARNS)
+    first = policies.split(",")[0]
+    best = tuple(m.name for m in methods if m.policy == first and m.observer == LEARNS)
 
     def seeds(option: str, text: str) -> tuple[int, ...]:
         return tuple(_numbers(option, text)) if text else ()
@@ -394,6 +402,7 @@ def robust(
     command = f"surgisoft benchmark robust --policies {','.join(names.values())}"
     command += f" --robots {robots} --own '{own}' --episodes {episodes}"
     command += f" --hidden-robots '{hidden_robots}' --hidden-episodes {hidden_episodes}"
+    command += "" if observers == "filter,learns" else f" --observers {observers}"
     command += "" if exact else " --batched"
     shown = ""
     if images:

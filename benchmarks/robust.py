@@ -282,6 +282,8 @@ def markdown(rows: list[Row], floors: list[Floor], study: Study) -> str:
 def _hidden_lines(rows: list[Row], study: Study) -> list[str]:
     """The table of hidden effects."""
     names = study.hidden_methods
+    if not (names and study.hidden_robots):
+        return []
     number = len(study.hidden_robots) * study.hidden_episodes
     lines = [
         "## With a hidden effect",
@@ -363,9 +365,9 @@ def draw(rows: list[Row], floors: list[Floor], study: Study, folder: Path) -> Pa
     axes.set(
         xlabel="mean distance of the beam from its target [mm], one dot a robot", xlim=(0, None)
     )
-    axes.text(1.02, len(groups) - 0.35, "rings cut", transform=axes.get_yaxis_transform())
-    axes.invert_yaxis()
-    axes.legend(loc="lower right")
+    axes.text(1.02, -0.8, "rings cut", transform=axes.get_yaxis_transform())
+    axes.set_ylim(len(groups) - 0.4, -0.6)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "robust.png"
     figure.savefig(file, dpi=150)

@@ -28,8 +28,8 @@ class TrainingRequest:
     task: str
     """Name of the task."""
     preset: str = "fast"
-    """`fast`; `randomised`: the same under domain randomization; or `paper`: the hyper-parameters
-    of Chen et al. 2025."""
+    """`fast`; `randomised`: the same under domain randomization; `robust`: for robots that differ
+    from the model; or `paper`: the hyper-parameters of Chen et al. 2025."""
     steps: int | None = None
     """Steps over all episodes; None: the number that the task names, unless minutes are given."""
     minutes: float | None = None

@@ -225,8 +225,9 @@ ObserverGain = Annotated[
         "--observer-gain",
         min=0.0,
         max=1.0,
-        help="On a rig: share of the difference between cameras and model that the policy's "
-        "estimate adopts per step, 0 to 1. Default 0.3.",
+        help="On a rig: an alpha-beta filter with this gain, the share of the difference between "
+        "cameras and model that the policy's estimate adopts per step, 0 to 1. Default: an "
+        "observer that learns online what the model gets wrong.",
     ),
 ]
 Threads = Annotated[

@@ -99,9 +99,11 @@ def train(
     preset: Annotated[
         str | None,
         typer.Option(
-            metavar="fast|randomised|paper",
+            metavar="fast|randomised|robust|paper",
             help="fast (default); randomised: with camera noise, mounts and gains that differ "
-            "between episodes, and a state observer; or the hyper-parameters of the paper.",
+            "between episodes, and a state observer; robust: for robots that differ from the "
+            "model, with effects out of the library and an observer that learns online; or the "
+            "hyper-parameters of the paper.",
         ),
     ] = None,
     steps: Annotated[

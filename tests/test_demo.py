@@ -1,6 +1,9 @@
 """The demonstration: five steps, each with its result on the page and its files."""
 
+import base64
+
 import pytest
+from PIL import Image
 
 from surgisoft.cli import run
 from surgisoft.demonstration import story
@@ -10,8 +13,19 @@ from surgisoft.surrogate.checkpoint import load_model
 
 
 def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
-    """On a shorter recording; the packaged policies cut, the hidden effect is found and added."""
+    """On a shorter recording; the packaged policies cut, the hidden effect is found and added.
+
+    The picture of the replay is a small one: `tests/replay` has those of the viewer.
+    """
     monkeypatch.setattr(story, "POINTS", 1600)
+    shown = []
+
+    def picture(replay, screenshot):
+        assert replay.stat().st_size > 10_000
+        Image.new("RGB", (64, 40), "teal").save(screenshot)
+        shown.append(screenshot.read_bytes())
+
+    monkeypatch.setattr(story, "open_replay", picture)
     folder = tmp_path / "story"
     assert run(["demo", "-o", str(folder)]) == 0
     said = capsys.readouterr().out
@@ -28,6 +42,7 @@ def test_five_steps_with_their_pictures(tmp_path, monkeypatch, capsys):
         assert (folder / name).stat().st_size > 10_000
     # pictures: dose and paths of the cut, bodies, loops and error, ranking, the fall
     assert page.count("<img") >= 9
+    assert base64.b64encode(shown[0]).decode() in page
     # a second call keeps the first one's files
     assert run(["demo", "-o", str(folder)]) == 2
     assert "already there" in capsys.readouterr().err

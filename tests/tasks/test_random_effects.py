@@ -49,6 +49,9 @@ def test_an_episode_has_one_kind_of_at_most_the_largest_size(drawn):
     had = torch.stack([(factors[:, kinds == k] != 0.0).any(1) for k in range(len(KINDS))], 1)
     assert (had.sum(1) == 1).all()
     assert had.float().mean(0).min() > 0.05
+    creeps, gains = (drawn.names.index(name) for name in ("creep", "gain_mismatch"))
+    assert factors[:, creeps].min() == 0.0, "a wall does not creep back"
+    assert factors[:, gains].min() < 0.0 < factors[:, gains].max()
     size = factors.norm(dim=1)
     assert 0.6 < size.mean() < 0.9
     assert size.max() <= 1.5

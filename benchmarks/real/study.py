@@ -93,12 +93,15 @@ class Outcome:
 def right(answer: Answer, truth: Sequence[str], faults: Sequence[str] = ()) -> bool:
     """Whether the truth is named, alone or in a set of at most two (or as many as there are).
 
-    Where nothing changed: whether nothing was named. faults: those of the set-up, which have to be
+    Where nothing changed: whether nothing was named. A verdict of several effects claims that all of
+    them are missing, so each of them has to be true. faults: those of the set-up, which have to be
     found exactly where the truth is `setup`.
     """
     if not truth:
         return not answer.names
     if not set(truth) <= set(answer.names) or len(answer.names) > max(MOST_NAMES, len(truth)):
+        return False
+    if answer.kind == "several" and not set(answer.names) <= set(truth):
         return False
     return not faults or set(answer.faults) == set(faults)
 

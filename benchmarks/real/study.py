@@ -93,9 +93,9 @@ class Outcome:
 def right(answer: Answer, truth: Sequence[str], faults: Sequence[str] = ()) -> bool:
     """Whether the truth is named, alone or in a set of at most two (or as many as there are).
 
-    Where nothing changed: whether nothing was named. A verdict of several effects claims that all of
-    them are missing, so each of them has to be true. faults: those of the set-up, which have to be
-    found exactly where the truth is `setup`.
+    Where nothing changed: whether nothing was named. A verdict of several effects claims that all
+    of them are missing, so each of them has to be true. faults: those of the set-up, which have to
+    be found exactly where the truth is `setup`.
     """
     if not truth:
         return not answer.names

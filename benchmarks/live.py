@@ -1,7 +1,8 @@
 """Benchmark `live`: how often the change detector is wrong, and how soon it is right.
 
-The robots took no part in setting the detector's constants (those were set on robots 0 and 200 to
-203, with recordings of other seeds). Hours of a clean rig, and runs in which an effect begins, are recorded in two kinds of motion:
+The robots took no part in setting the detector's constants: those were set on robots 0 and 200 to
+203, with recordings of other seeds. Hours of a clean rig, and runs in which an effect begins, are
+recorded in two kinds of motion:
 
 - `circles`: what the policies of the task `track_circle` command: 23 s episodes of a circle in the
   pressures with a random start and direction, the arm waiting 3 s at its start;
@@ -276,9 +277,8 @@ def markdown(clean: Sequence[Clean], changes: Sequence[Change]) -> str:
             cells += [f"{len(delays)} of {len(some)}", shown]
             before = np.mean([c.before_mm for c in some])
             after = np.mean([c.after_mm for c in some])
-        lines.append(
-            f"| {motion} | `{effect}` | {strength:g} | {before:.3f} | {after:.3f} | {' | '.join(cells)} |"
-        )
+        about = f"{motion} | `{effect}` | {strength:g} | {before:.3f} | {after:.3f}"
+        lines.append(f"| {about} | {' | '.join(cells)} |")
     early = {
         name: sum(c.early for c in changes if c.reference == name) for name in ("before", "begin")
     }

@@ -159,7 +159,7 @@ def test_an_error_that_stands_while_the_arm_does_counts_once():
 
 
 def test_the_static_error_of_the_reference_hides_no_change():
-    """A model that errs by 1 mm as a function of the actuation: 0.2 mm more are found in seconds."""
+    """A model that errs by 1 mm along with the actuation: 0.2 mm more are found in seconds."""
     t_s, values = residual(300, 13, sd_mm=0.02)
     values[..., 0] += (waves(t_s)[:, :1] - 25.0) / 10.0
     found = fit_detector([(t_s, values)])

@@ -9,14 +9,17 @@ recorded in two kinds of motion:
 - `mixed`: the project's richest excitation, each time with other random parts.
 
 The reference is a recording of the same robot and kind of motion (`run --before`), or the begin of
-the run (`run --clean`). Every recording has noise of its own.
+the run (`run --clean`). Every recording has noise of its own. What is complete is kept in the work folder, so that an
+interrupted study goes on, and one of more robots takes what is there.
 """
 
+import hashlib
+import inspect
 import itertools
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,7 +27,9 @@ import numpy as np
 import torch
 from scipy.stats import chi2
 
+from benchmarks.cache import Cache
 from benchmarks.diagnosis.robots import base_model
+from surgisoft.live import change as detector_code
 from surgisoft.live.change import Charts, Detector, Stretch, fit_detector
 from surgisoft.live.session import elsewhere, residual_runs
 from surgisoft.measurement.protocols import Protocol, make_protocol
@@ -34,7 +39,7 @@ from surgisoft.rig import VirtualRig
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.workers import workers
 
-MOTIONS = ("circles", "mixed")
+MOTIONS = ("mixed", "circles")
 """Kinds of motion."""
 WAIT_S, LOOP_S = 3.0, 20.0
 """Waiting time and time of a circle, as in the task track_circle [s]."""
@@ -204,6 +209,32 @@ def change(robot: int, motion: str, effect: str, strength: float, folder: Path) 
     return found
 
 
+def code() -> str:
+    """Hash of the detector's code: other code gives other results."""
+    return hashlib.sha256(inspect.getsource(detector_code).encode()).hexdigest()[:12]
+
+
+def kept_clean(robot: int, motion: str, hours: float, folder: Path) -> list[Clean]:
+    """`clean_hours`, or what the folder has of it."""
+    about = {"robot": robot, "motion": motion, "hours": hours, "code": code()}
+    values = Cache(folder).values(
+        "clean", about, lambda: [asdict(c) for c in clean_hours(robot, motion, hours, folder)]
+    )
+    return [Clean(**each) for each in values]
+
+
+def kept_change(
+    robot: int, motion: str, effect: str, strength: float, folder: Path
+) -> list[Change]:
+    """`change`, or what the folder has of it."""
+    case = robot, motion, effect, strength
+    about = {"case": list(case), "code": code()}
+    values = Cache(folder).values(
+        "change", about, lambda: [asdict(c) for c in change(*case, folder)]
+    )
+    return [Change(**each) for each in values]
+
+
 def run(
     robots: Sequence[int], hours: float, folder: Path, processes: int, report: Progress
 ) -> tuple[list[Clean], list[Change]]:
@@ -215,9 +246,9 @@ def run(
     cases = list(itertools.product(robots, CHANGES))
     with workers(processes) as pool:
         jobs = {
-            pool.submit(clean_hours, r, m, hours, folder): clean for r in robots for m in MOTIONS
+            pool.submit(kept_clean, r, m, hours, folder): clean for r in robots for m in MOTIONS
         }
-        jobs |= {pool.submit(change, r, *case, folder): changes for r, case in cases}
+        jobs |= {pool.submit(kept_change, r, *case, folder): changes for r, case in cases}
         for done, job in enumerate(as_completed(jobs), 1):
             jobs[job].extend(job.result())
             report(done, len(jobs), "")

@@ -9,8 +9,8 @@ recorded in two kinds of motion:
 - `mixed`: the project's richest excitation, each time with other random parts.
 
 The reference is a recording of the same robot and kind of motion (`run --before`), or the begin of
-the run (`run --clean`). Every recording has noise of its own. What is complete is kept in the work folder, so that an
-interrupted study goes on, and one of more robots takes what is there.
+the run (`run --clean`). Every recording has noise of its own. What is complete is kept in the work
+folder, so that an interrupted study goes on, and one of more robots takes what is there.
 """
 
 import hashlib

@@ -41,7 +41,7 @@ independent values counts with the upper end of its 95 % confidence interval. Th
 until resampled hours of the reference (moving blocks of 20 s; Künsch 1989), judged by statistics
 that were estimated without them, raise no more false alarms than wanted: errors of a network have
 heavier tails than a normal distribution. Ten minutes hold some fifty independent values of the slow
-part, and hours hold rarer ones; so no independent value may add more than 0.4 h.
+part, and hours hold rarer ones; so no independent value may add more than h / 3.
 
 A reference says nothing about motions that are not in it: a network errs more in the corners of its
 range. A block counts only where some block of the reference has an actuation, and a change of it
@@ -86,10 +86,10 @@ FOLDS = 5
 """Parts of a reference that are judged by statistics of the others."""
 CONFIDENCE = 0.95
 """Level of the upper confidence bound of a variance (Chew 1966)."""
-MOST_BLOCK, MOST_VALUE = 0.25, 0.4
+MOST_BLOCK, MOST_VALUE = 1 / 4, 1 / 3
 """Most that one block, and one independent value, may add to a chart, as shares of the threshold: a
-marker's glitch is two blocks, out and back, and two motions in which the model errs by much more
-than in the reference raise no alarm; three do."""
+marker's glitch is two blocks, out and back, and three motions in which the model errs by much more
+than in the reference raise no alarm yet."""
 ENLARGE = 1.1
 """Factor between two tried enlargements of the scale."""
 HIGHEST = 1.25

@@ -117,6 +117,10 @@ class Softening(WallFibres):
         """(2, ..., m) change of the actuation by each amplitude: closed form."""
         return torch.stack(self._softened(signal, memory)).detach()
 
+    def config(self) -> dict:
+        """Whether the fibres stand in a ring, or bending and stretch are in their place."""
+        return {**super().config(), "section": self.section}
+
     def quantities(self) -> list[Quantity]:
         """Shares of push that softening adds, its energy range and the fibres' mixture."""
         rubber = "wide: at most twice the push; a wall does not heal by load (Mullins 1969)"

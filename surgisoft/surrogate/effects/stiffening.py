@@ -94,6 +94,10 @@ class Stiffening(WallFibres, Memoryless):
         """(2, ..., m) change of the actuation by each amplitude: closed form."""
         return torch.stack(self._lost(signal)).detach()
 
+    def config(self) -> dict:
+        """Whether the fibres stand in a ring, or bending and stretch are in their place."""
+        return {**super().config(), "section": self.section}
+
     def quantities(self) -> list[Quantity]:
         """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"

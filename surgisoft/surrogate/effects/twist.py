@@ -31,6 +31,10 @@ from surgisoft.surrogate.effects.base import (
 from surgisoft.surrogate.effects.beam import Beam, displaced
 from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
 
+LEAST_BENT = 0.01
+"""Displacement of a key point of the arm at rest by a twist of 1 rad, as a share of its length,
+from which identification asks whether weight bends the arm."""
+
 
 class Twist(Effect):
     """Torsion of the body by the mean load of the chambers."""
@@ -114,7 +118,10 @@ class Twist(Effect):
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     """A body that is bent at rest as it was cast, and one that weight bends."""
-    return [Twist(facts), *([Twist(facts, hanging=1.0)] if facts.rest_mm.any() else [])]
+    hanging = Twist(facts, hanging=1.0)
+    length = float(Beam.through(facts.rest_mm).length_mm)
+    bent = bool(hanging.at_rest.abs().max() > LEAST_BENT * length)
+    return [Twist(facts), *([hanging] if bent else [])]
 
 
 # A body is bent at rest in one way.

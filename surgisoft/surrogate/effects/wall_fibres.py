@@ -48,8 +48,8 @@ class WallFibres(Effect, ABC):
         return self.load(signal) @ self.fibres.T
 
     def config(self) -> dict:
-        """Whether the fibres stand in a ring, and whether there are any."""
-        return {"ring": self.ring, "section": self.section}
+        """Whether the fibres stand in a ring."""
+        return {"ring": self.ring}
 
     @classmethod
     def migrated(cls, config: dict, version: int | None) -> dict:

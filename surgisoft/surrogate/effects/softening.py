@@ -71,7 +71,7 @@ class Softening(WallFibres):
 
     def memory_parameters(self) -> list[nn.Parameter]:
         """The fibres' mixture."""
-        return [] if self.others is None else [self.others]
+        return [] if self.section else [self.others]
 
     def energy(self, signal: Tensor) -> Tensor:
         """(..., K + 1) energy of each fibre and the chambers' mean, from actuation (..., m); of a
@@ -133,7 +133,7 @@ class Softening(WallFibres):
             Quantity("width_share", value_of(self.log_width.exp()), "", 0.001, 5.0, rubber),
             Quantity("growth_share", value_of(self.log_growth.exp()), "", 1e-4, 5.0, rubber),
         ]
-        if self.others is None:
+        if self.section:
             return quantities
         mixed = "a mixture of shares"
         return [*quantities, Quantity("others_share", value_of(self.others), "", -1.0, 1.0, mixed)]
@@ -141,7 +141,7 @@ class Softening(WallFibres):
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
     walls = walls_tried(len(facts.low), OTHERS)
-    return [Softening(facts, *widths, *some) for widths in GRID for some in walls]
+    return [Softening(facts, width, growth, *one) for width, growth in GRID for one in walls]
 
 
 HYPOTHESIS = Hypothesis(Softening, _grid)

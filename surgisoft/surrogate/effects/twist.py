@@ -43,6 +43,7 @@ class Twist(Effect):
     chords: Tensor
     collect: Tensor
     at_rest: Tensor
+    hanging: nn.Parameter | None
 
     stage = "body"
 
@@ -55,8 +56,10 @@ class Twist(Effect):
         self.register_buffer("places", beam.places / beam.length_mm, persistent=False)
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)
-        self.hanging = None if hanging is None else nn.Parameter(torch.tensor([float(hanging)]))
-        self.register_buffer("at_rest", self._moved(facts.rest_mm), persistent=False)
+        share = None if hanging is None else nn.Parameter(torch.tensor([float(hanging)]))
+        self.register_parameter("hanging", share)
+        at_rest = self._moved(facts.rest_mm.to(self.places))
+        self.register_buffer("at_rest", at_rest, persistent=False)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
         """Twist of the tip against the base at full load, rad."""

@@ -26,7 +26,8 @@ class WallFibres(Effect, ABC):
     """Version 1 had one fibre along each chamber; 2 also has a ring of fibres and redefines
     `others`."""
 
-    others: nn.Parameter | None
+    others: nn.Parameter
+    """(1,) share of the other chambers; None of a section."""
 
     def set_fibres(self, others: float, ring: bool, section: bool = False) -> None:
         """Add the parameter of the mixture; others and ring are those of `fibre_matrix`.
@@ -35,12 +36,12 @@ class WallFibres(Effect, ABC):
         single fibres.
         """
         self.ring, self.section = bool(ring), bool(section)
-        self.others = None if section else nn.Parameter(torch.tensor([float(others)]))
+        shared = None if section else nn.Parameter(torch.tensor([float(others)]))
+        self.register_parameter("others", shared)
 
     @property
     def fibres(self) -> Tensor:
         """(K, m) loads of the fibres by those of the chambers."""
-        assert self.others is not None, "a section has no single fibres"
         return fibre_matrix(self.others, len(self.reach), self.ring)
 
     def fibre_loads(self, signal: Tensor) -> Tensor:

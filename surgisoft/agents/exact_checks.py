@@ -129,7 +129,8 @@ class ExactChecks:
         around = task.world.scene
         if around is None:
             raise InputError(
-                f"task {task.name}: its world is empty, expected bodies to check against"
+                f"task {task.name} has no scene, so the exact collision checker has no bodies to "
+                "check against; use --no-exact-checks"
             )
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.around, self.checker = around, CollisionChecker(around.geometry.bodies)

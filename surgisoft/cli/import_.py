@@ -127,8 +127,8 @@ def recording_(
         typer.Option(
             "--lerobot",
             metavar="DIR",
-            help="Write the recordings to a new folder as a LeRobotDataset (v3.0), a run an "
-            "episode.",
+            help="Write the recordings to a new folder as a LeRobotDataset (v3.0), one "
+            "episode for each run.",
         ),
     ] = None,
     task: Annotated[
@@ -144,7 +144,7 @@ def recording_(
         typer.Option(
             min=1,
             metavar="N",
-            help="With --lerobot: frames a second; default: the recordings' own rate.",
+            help="With --lerobot: frames per second; default: the recordings' own rate.",
         ),
     ] = None,
 ) -> None:

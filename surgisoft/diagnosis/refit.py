@@ -155,7 +155,7 @@ class Refit:
     reason: str
     """Why it was done."""
     alone_mm: float
-    """Held-out error of the network, trained on as long as the finalists without an effect, mm."""
+    """Held-out error of the network without an effect, trained as long as the finalists, mm."""
     candidates: tuple[RefitCandidate, ...]
     """All effects that were tried, the best first."""
     winner: str | None
@@ -748,7 +748,7 @@ class JointFit:
     model: ArmModel
     """The model with the effects; its validated error is that of the refit."""
     alone: ArmModel
-    """The given model, its network trained on as long without the effects that it lacked."""
+    """The given model, its network trained for as many epochs without the effects it lacked."""
     parameters: tuple[Parameter, ...]
     """The effects' parameters; intervals are not known, so their ends are the values."""
 

@@ -98,7 +98,8 @@ class RefitCriteria:
     tie_of_gain: float = 0.02
     """Difference of two gains, as a share of the better one, up to which they are alike."""
     tie_of_left: float = 0.3
-    """The same as a share of what the better one leaves; the smaller of both counts."""
+    """Difference of two gains, as a share of what the better one leaves, up to which they are
+    alike; the smaller of both limits counts."""
     most_confidence: float = 0.81
     """Most confidence where others do about as well: of 21 ambiguous statements on virtual robots
     17 were right about the first effect."""
@@ -117,7 +118,7 @@ class RefitCandidate:
     heldout_rmse_mm: float
     """Error on the rows that were left out, over all seeds, mm."""
     per_key_point_mm: tuple[float | None, ...]
-    """The same of each key point, base to tip, mm; None where it was never measured."""
+    """Error of each key point on those rows, base to tip, mm; None where it was never measured."""
     seeds_mm: tuple[float, ...]
     """Error of each seed on the part that it left out, mm."""
     rival_mm: float

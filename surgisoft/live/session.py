@@ -72,7 +72,8 @@ to 4 gives 10 to 21."""
 ANOTHER_ARM_SHARE = 0.01
 """Least error over the arm's length that counts as that of another arm [-]."""
 UNVALIDATED_SHARE = 0.05
-"""The same for a model that was never validated [-]."""
+"""Least error over the arm's length that counts as that of another arm where the model was never
+validated [-]."""
 SUSPICIOUS = 2.0
 """Error in the reference over the model's validated error from which on it is warned of."""
 LEAD_IN_S = 60.0

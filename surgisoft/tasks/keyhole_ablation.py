@@ -211,7 +211,7 @@ class KeyholeAblation(RingTask[PortCut]):
         actions: Mapping[str, Tensor],
         fired: Tensor | None = None,
     ) -> TaskState[PortCut]:
-        """As `OneLaserTask.advance`; counts the steps in which a body is at the rim."""
+        """Advance one step, and count the steps in which a body is at the rim."""
         after = super().advance(state, actions, fired)
         near = torch.stack([*self.rims_mm(after).values()]).amin(0) < self.config.rim_mm
         return replace(after, goal=replace(after.goal, at_rim=after.goal.at_rim + near))

@@ -1,4 +1,4 @@
-"""One episode of `circle_ablation`, advanced in compiled loops and kept arrays.
+"""One episode of `circle_ablation`, advanced by compiled loops in preallocated arrays.
 
 `CircleAblation` in a batch of one makes some hundred tensor operations a step, each of which costs
 more than its arithmetic. `LoneRing` gives the same numbers, to rounding, for the one environment of

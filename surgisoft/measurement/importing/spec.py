@@ -324,9 +324,6 @@ class ContextMap:
     """Known mass at the tip, g."""
 
 
-A_FILE = Rule("at least one table [file.NAME]", _not_empty)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImportMap:
     """Content of a map file."""

@@ -39,7 +39,7 @@ from surgisoft.diagnosis.statistics import (
 )
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import Memoryless, known_effects
+from surgisoft.surrogate.effects import Memoryless, Stage, known_effects
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from surgisoft.workers import torch_threads, workers
@@ -262,10 +262,16 @@ def reason_to_refit(problem: Problem) -> str:
     )
 
 
-LINE = "line_lag"
-"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
+LINE: Stage = "line"
+"""Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
 of the wall are the same operator on the actuation: where both do as well and the model's input is a
 command, which has passed a line in any case, the lag is that of the line."""
+
+
+def _of_line(effect: str) -> bool:
+    """Whether an effect acts between the command and the pressure."""
+    kind = known_effects().get(effect)
+    return kind is not None and kind.stage == LINE
 
 
 def can_hide(name: str) -> bool:
@@ -291,7 +297,7 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
             left[name] = "the model has it already, and it was fitted with the network"
         elif kind.stage not in ("line", "material"):
             left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
-        elif name == LINE and problem.model.spec.actuation == "measured":
+        elif kind.stage == LINE and problem.model.spec.actuation == "measured":
             left[name] = (
                 "the model's input is the measured actuation, in which the line's lag is already: "
                 "a lag behind it is one of the wall; the residuals decide about a longer line"
@@ -726,7 +732,7 @@ def _decided(
         shares = win_shares(-np.stack([gains[best.effect], gains[other.effect]]))
         if best.gain - other.gain < tie or shares[0] < ASKED.win_share:
             competing.append(other)
-    line = [score for score in (best, *competing) if score.named and score.effect == LINE]
+    line = [score for score in (best, *competing) if score.named and _of_line(score.effect)]
     of_line = bool(line and competing and split.problem.model.spec.actuation == "commanded")
     if of_line:
         competing = [score for score in (best, *competing) if score is not line[0]]

@@ -20,7 +20,7 @@ from surgisoft.rig.safety import guarded
 
 
 class NamedRig:
-    """A rig by the names that a recording's columns have: p1_kPa, k0_x_mm, temp_C; c1_kPa.
+    """A rig by the names that a recording's columns have: p1_kPa, k0_x_mm; c1_kPa.
 
     A real rig is driven inside its safety limits (`SafeRig`), and vented by `disconnect`.
     """

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 from surgisoft.errors import InputError
 from surgisoft.files import new_file
@@ -29,12 +30,37 @@ def new_recording(
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
+    flush_and_cleanup_orphaned_recordings()  # the last recording's threads, which no one holds now
     with new_file(path) as fresh:
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
-        recording.save(fresh, default_blueprint=blueprint)
+        with _ended_blueprint(blueprint):
+            recording.save(fresh, default_blueprint=blueprint)
         yield recording
         recording.flush()
         recording.disconnect()
+
+
+@contextlib.contextmanager
+def _ended_blueprint(blueprint: rrb.Blueprint) -> Iterator[None]:
+    """End the streams that rerun opens for a layout inside the block.
+
+    rerun-sdk 0.41 keeps the stream in memory, with two threads, until the process ends: a thousand
+    replays of one experiment had four thousand threads.
+    """
+    streams: list[rr.RecordingStream] = []
+    write = blueprint._log_to_stream
+
+    def kept(stream: rr.RecordingStream) -> None:
+        streams.append(stream)
+        write(stream)
+
+    blueprint._log_to_stream = kept  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        del blueprint._log_to_stream
+        for stream in streams:
+            stream.disconnect()
 
 
 class Columns:

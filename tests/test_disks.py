@@ -2,14 +2,21 @@
 
 import multiprocessing
 import os
+import resource
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+import rerun as rr
+import torch
+from torch import nn
 
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, write_atomically
+from surgisoft.files import new_file, new_folder, write_atomically, write_json
+from surgisoft.graphs import write_torch_script
 from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.replay.recording import new_recording
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from tests.diagnosis.synthetic import recording, walk
 
@@ -50,6 +57,60 @@ def test_a_full_disk_leaves_the_old_output(tmp_path):
     if done.returncode == 77 or "unshare" in done.stderr:
         pytest.skip("no mount namespaces here")
     assert done.stdout.split() == ["full", "full", "{}", "old", "a.csv", "arm"], done.stderr
+
+
+def limited(call, path, size: int = 300) -> str:
+    """How a write ends in a process that may make no file of more than `size` bytes."""
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        try:
+            call(path)
+            said = "written"
+        except (InputError, OSError) as error:
+            said = f"one line, {'File too large' in str(error)}"
+        except BaseException as error:
+            said = repr(error)
+        os.write(writing, said.encode())
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    return said if os.waitpid(pid, 0)[1] == 0 else "its process was ended"
+
+
+def a_graph(path):
+    with new_file(path) as fresh:
+        write_torch_script(nn.Linear(9, 9), [torch.zeros(1, 9)], fresh)
+
+
+def a_replay(path):
+    layout = rr.blueprint.Blueprint(rr.blueprint.Spatial3DView(name="the scene"))
+    with new_recording(path, "test", "one", layout) as stream:
+        stream.log("points", rr.Points3D(np.arange(900.0).reshape(-1, 3)))
+
+
+MADE = recording(np.zeros(400), walk(400))
+WRITERS = {
+    "a.csv": lambda path: save_recording(MADE, path, force=True),
+    "a.parquet": lambda path: save_recording(MADE, path, force=True),
+    "arm.pt": a_graph,
+    "a.rrd": a_replay,
+    "a.json": lambda path: write_json(path, list(range(900))),
+}
+"""What writes a file of more than 300 bytes, by the file's name."""
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_write_that_ends_in_the_middle_leaves_the_old_file(tmp_path, name):
+    """As where a quota is used up: half of the file is written, and the next write fails."""
+    path = tmp_path / name
+    path.write_text("old")
+    assert limited(WRITERS[name], path) == "one line, True"
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "old"}
+    assert limited(WRITERS[name], path, 1 << 30) == "written"
+    assert path.stat().st_size > 300
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -26,17 +26,22 @@ STEP = "step"
 def new_recording(
     path: Path, application: str, identity: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """A recording to log to; the file appears when the block ends without an exception."""
+    """A recording to log to; the file appears when the block ends without an exception.
+
+    It is kept in memory until then: rerun-sdk 0.41 waits for ever where its own writing fails, on a
+    full disk for example.
+    """
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
     flush_and_cleanup_orphaned_recordings()  # the last recording's threads, which no one holds now
     with new_file(path) as fresh:
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
+        content = recording.memory_recording()
         with _ended_blueprint(blueprint):
-            recording.save(fresh, default_blueprint=blueprint)
+            recording.send_blueprint(blueprint, make_active=False)
         yield recording
-        recording.flush()
+        fresh.write_bytes(content.drain_as_bytes())
         recording.disconnect()
 
 

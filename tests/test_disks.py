@@ -16,6 +16,7 @@ from surgisoft.errors import InputError
 from surgisoft.files import new_file, new_folder, write_atomically, write_json
 from surgisoft.graphs import write_torch_script
 from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.replay import live_view
 from surgisoft.replay.recording import new_recording
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from tests.diagnosis.synthetic import recording, walk
@@ -111,6 +112,21 @@ def test_a_write_that_ends_in_the_middle_leaves_the_old_file(tmp_path, name):
     assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "old"}
     assert limited(WRITERS[name], path, 1 << 30) == "written"
     assert path.stat().st_size > 300
+
+
+@pytest.mark.parametrize("size", [0, 300])
+def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path, monkeypatch, size):
+    monkeypatch.setattr(live_view, "FLUSH_S", 1.0)
+    path, bench = tmp_path / "a.rrd", live_view.LiveBench(3, 2, "kPa", 70.0, "a bench", False)
+
+    def view(path):
+        with live_view.live_view(bench, file=path):
+            pass
+
+    path.write_text("old")
+    assert limited(view, path, size).startswith("one line")
+    assert path.read_text() == "old"
+    assert limited(view, path, 1 << 30) == "written"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -17,6 +17,8 @@ from pathlib import Path
 
 COVERED = 0.95
 """Goal for branches of what does not draw."""
+MOST = 15
+"""Files that are listed with branches that no test takes."""
 DRAWING = {
     "surgisoft/replay/": "Rerun recordings, the viewer's process, screenshots",
     "surgisoft/report/": "parts, style and charts of the reports",
@@ -74,7 +76,15 @@ def part_of(file: str) -> str:
     return folders[0] if folders else "(files of the package)"
 
 
-def page(files: dict[str, dict], about: str) -> str:
+NOT_MEASURED = """\
+**Not measured:** the bodies of functions under `@compiled`, which numba turns into machine code:
+the interpreter, which counts branches, never runs them. Their tests compare them with other
+calculations: distances, rays and contacts with trimesh and FCL, plants with formulas and
+PyElastica, compiled steps of a model with the same step in torch. What torch exports (TorchScript,
+ONNX) is traced from Python that is measured, and compared with it."""
+
+
+def page(files: dict[str, dict], about_run: str) -> str:
     """The page of the table, from the files of `coverage json`."""
     parts: dict[str, Count] = defaultdict(Count)
     computing, drawing = Count(), Count()
@@ -86,47 +96,49 @@ def page(files: dict[str, dict], about: str) -> str:
             parts[part_of(file)].add(summary)
             untaken = summary["num_branches"] - summary["covered_branches"]
             missed.append((untaken, file, summary))
+    most = sorted(missed, key=lambda row: row[:2], reverse=True)[:MOST]
+    branches = _share(computing.taken, computing.branches)
+    lines = _share(computing.reached, computing.statements)
     goal = "reached" if computing.taken >= COVERED * computing.branches else "not reached"
-    head = "| part | lines run | branches taken | lines not measured |\n|---|---|---|---|"
-    most = "\n".join(
-        f"| `{file}` | {untaken} of {summary['num_branches']} |"
-        for untaken, file, summary in sorted(missed, reverse=True)[:15]
+    return "\n".join(
+        [
+            "# Branch coverage",
+            "",
+            "Printed by `python -m benchmarks.coverage_table` from the data of `make coverage`.",
+            about_run,
+            "",
+            f"**{branches} of the branches of what does not draw are taken** by the tests (goal",
+            f"{100 * COVERED:.0f} %: {goal}); {lines} of its lines are run. A branch is a jump",
+            "that a condition or a loop can take. Processes that tests and commands start are",
+            "measured too; those that a test kills are not.",
+            "",
+            "| part | lines run | branches taken | lines not measured |",
+            "|---|---|---|---|",
+            *(count.row(name) for name, count in sorted(parts.items())),
+            computing.row("**what does not draw**"),
+            drawing.row("what draws"),
+            "",
+            NOT_MEASURED,
+            "",
+            "Branches that no test takes, most first:",
+            "",
+            "| file | branches not taken |",
+            "|---|---|",
+            *(f"| `{file}` | {n} of {about['num_branches']} |" for n, file, about in most),
+            "",
+            "What draws, and is counted apart:",
+            "",
+            *(f"- `{name}`: {what}" for name, what in DRAWING.items()),
+            "",
+        ]
     )
-    reasons = "\n".join(f"- `{name}`: {what}" for name, what in DRAWING.items())
-    return f"""# Branch coverage
-
-Printed by `python -m benchmarks.coverage_table` from the data of `make coverage`. {about}
-
-**{_share(computing.taken, computing.branches)} of the branches of what does not draw are taken** by the tests
-(goal {100 * COVERED:.0f} %: {goal}); {_share(computing.reached, computing.statements)} of its lines are run. A branch is a
-jump that a condition or a loop can take. Processes that tests and commands start are measured too; those that a test kills are not.
-
-{head}
-{chr(10).join(count.row(name) for name, count in sorted(parts.items()))}
-{computing.row("**what does not draw**")}
-{drawing.row("what draws")}
-
-**Not measured:** the bodies of functions under `@compiled`, which numba turns into machine code: the interpreter never runs them. Their
-tests compare them with other calculations: distances, rays and contacts with trimesh and FCL, plants with formulas and PyElastica, compiled
-steps of a model with the same step in torch. What torch exports (TorchScript, ONNX) is traced from Python that is measured, and compared with it.
-
-Branches that no test takes, most first:
-
-| file | branches not taken |
-|---|---|
-{most}
-
-What draws, and is counted apart:
-
-{reasons}
-"""
 
 
 def main() -> int:
     """Parse, read the data, print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.coverage_table")
     parser.add_argument("--json", type=Path, help="what `coverage json` wrote (made here)")
-    parser.add_argument("--about", default="", help="a sentence on the run, behind its date")
+    parser.add_argument("--about", default="", help="sentences on the run, behind its date")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         file = given.json or Path(folder) / "coverage.json"

@@ -2,9 +2,13 @@
 
 import multiprocessing
 import os
+import re
 import resource
 import subprocess
 import sys
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +16,8 @@ import rerun as rr
 import torch
 from torch import nn
 
+import surgisoft
+from surgisoft.agents import run_folder
 from surgisoft.errors import InputError
 from surgisoft.files import new_file, new_folder, write_atomically, write_json
 from surgisoft.graphs import write_torch_script
@@ -179,3 +185,30 @@ def test_a_clock_that_goes_back_changes_nothing_that_is_read(tmp_path):
         os.utime(path, (0, 0))
     assert load_model(tmp_path / "arm").spec == default_arm().spec
     assert load_recording(tmp_path / "a.csv").samples == 9
+
+
+def test_a_clock_that_jumps_decides_nothing():
+    """Times are those of the monotonic clock; the wall clock gives names, dates and guesses."""
+    package = Path(surgisoft.__file__).parent
+    calendar = re.compile(r"time\.time(_ns)?\(|datetime\.(utc)?now|\.(to)?today\(")
+    found = {
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if calendar.search(path.read_text())
+    }
+    assert found == {
+        "agents/run_folder.py",  # name of a new run's folder, which need not be free; its date
+        "cli/progress.py",  # when a command will have ended
+    }
+
+
+def test_two_runs_of_one_second_get_two_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder, "datetime", SimpleNamespace(now=lambda: datetime(2026, 1, 1)))
+    names = []
+    for _ in range(3):
+        names.append(run_folder.default_folder("reach"))
+        names[-1].mkdir(parents=True)
+    assert [path.name for path in names] == [
+        f"reach-20260101-000000{end}" for end in ("", "-1", "-2")
+    ]

@@ -21,7 +21,7 @@ from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
-from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
+from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
@@ -138,7 +138,7 @@ class Amendment:
     """The error on the held-out rows."""
     alone: Fall
     """What the effects do on the held-out rows: with the network left as it was; where both were
-    fitted together, compared with the network trained on as long without the effects."""
+    fitted together, compared with the network trained for as many epochs without the effects."""
     training: Fall
     """The error on the training rows, to which the parameters were fitted."""
     retuned: bool
@@ -195,11 +195,13 @@ class Amendment:
         if self._seen_before:
             return (
                 f"{self.alone.sentence}, fitted together with the network, compared with the "
-                "network alone, trained on as long from the same weights; the given model, which "
-                f"had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
+                "network alone, trained for as many epochs from the same weights; the given "
+                f"model, which had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
                 f"{self.held_out.before:.3f} mm there"
             )
-        network = f"the network alone, trained on as long, reaches {self.alone.before:.3f} mm"
+        network = (
+            f"the network alone, trained for as many epochs, reaches {self.alone.before:.3f} mm"
+        )
         if self.held_out.claimed and not self.alone.claimed:
             return (
                 f"no fall of the error is claimed for the effects: {network}, and with them "
@@ -261,8 +263,10 @@ def amend(
     paired difference (`pairs`), so that the network's error does not enter; paired: as for
     `diagnose`.
     refit: `always` fits the whole network together with the
-    effects, `auto` does where a network may have imitated them (`surgisoft.diagnosis.refit`) and
-    held-out runs reward it, `never` does not; refit_progress and processes as for `diagnose`.
+    effects, `never` does not, `auto` does where a network may have imitated them
+    (`surgisoft.diagnosis.refit`) and the joint fit leaves less on left-out rows than the network
+    alone, and than the effects fitted to the network as it is; refit_progress and processes as for
+    `diagnose`.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -287,13 +291,24 @@ def amend(
     reason = refit_reason(problem, refit) if both is None else ""
     if refit == "always" and (both is not None or not retune_network):
         raise InputError(
-            "a refit changes the network, and a change since BEFORE is not one of the network: "
-            "expected --refit always without --before and without --keep-network"
+            "--refit always trains the network too, which --keep-network forbids, and which "
+            "--before rules out, because only the change since then is explained; leave out "
+            "--refit always, or leave out the other two"
         )
     if reason and (refit == "always" or (retune_network and all(map(can_hide, names)))):
         judged = refit_effects(
             problem, reason, together=names, progress=refit_progress, processes=processes
         )
+    if judged is not None and judged.winner is not None and refit == "auto":
+        joint_mm = judged.candidates[0].heldout_rmse_mm
+        plain_mm = apart_mm(problem, names)
+        if plain_mm is not None and plain_mm <= joint_mm:
+            judged = None
+            notes = (
+                *notes,
+                f"on rows left out in turn the network as it is leaves {plain_mm:.3f} mm with the "
+                f"effects, fitted together with them {joint_mm:.3f} mm: it stays as it is",
+            )
     if judged is not None and (refit == "always" or judged.winner is not None):
         joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
         better, retuned, parameters = joint.model, False, joint.parameters

@@ -17,7 +17,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import open_model, refuse_predictions
-from surgisoft.diagnosis.refit import JointFit, fit_together
+from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
@@ -147,7 +147,7 @@ def improve(
     fitted together with the whole network.
     """
     if most_effects < 1:
-        raise InputError(f"at most {most_effects} effects: expected 1 or more")
+        raise InputError(f"largest number of effects is {most_effects}, expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
     refuse_predictions(model)
@@ -166,7 +166,7 @@ def improve(
         rounds.append(done)
         tell(done)
 
-    going = True
+    going, trained = True, False  # whether the network was trained on these rows
     while going and len(added) < most_effects:
         found = diagnose(
             models[-1],
@@ -186,6 +186,9 @@ def improve(
             before = problem.with_model(models[-1])
             fitted: Fitted | JointFit
             together = found.refit is not None and found.refit.winner == name
+            if found.refit is not None and together and refit == "auto" and not trained:
+                plain_mm = apart_mm(before, [*added, name])
+                together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
             if found.refit is not None and together:
                 validated = found.refit.of(name)
                 fitted = fit_together(before, [*added, name], validated, progress=refit_progress)
@@ -212,6 +215,7 @@ def improve(
             models.append(fitted.model)
             parameters = fitted.parameters
             if isinstance(fitted, JointFit):
+                trained = True
                 known = fitted.model.training_residuals
                 discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
                 problem = replace(problem, discrepancy_mm=discrepancy)
@@ -222,7 +226,10 @@ def improve(
     tuned = retune(models[-1], problem)
     if added and tuned.kept:
         after = fall_of(problem, problem.with_model(tuned.model)).after
-        why = f"held-out motion rewards a re-tuned network by {100 * tuned.gain:.0f} %"
+        why = (
+            "a re-tuned network lowers the squared error on held-out motion by "
+            f"{100 * tuned.gain:.0f} %"
+        )
         models.append(tuned.model)
         note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
     if models[-1] is not model:
@@ -285,11 +292,11 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
 def _idle(name: str, fall: Fall) -> str:
     """Why an effect that was fitted together with the network is not added; empty if it may be.
 
-    fall: from the network trained on as long without the effect to the network with it.
+    fall: from the network trained for as many epochs without the effect to the network with it.
     """
     if fall.claimed:
         return ""
-    return f"the network alone, trained on as long as with {name}, lowers the error as far"
+    return f"the network alone, trained for as many epochs as with {name}, lowers the error as far"
 
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:

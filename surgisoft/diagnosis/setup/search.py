@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
 
 from surgisoft.diagnosis.setup.alignment import (
     HANDED,
@@ -635,6 +634,8 @@ def _first_order(values: np.ndarray, step_s: float, tau_s: float) -> np.ndarray:
     keep = np.exp(-ratio)
     new = 1.0 - (1.0 - keep) / ratio
     old = 1.0 - keep - new
+    from scipy.signal import lfilter  # a tenth of a second, which few searches need
+
     start = values[:1] * (1.0 - new)
     return lfilter([new, old], [1.0, -keep], values, axis=0, zi=start)[0]
 

@@ -143,42 +143,49 @@ class Sample:
 
 def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample:
     """About `rows` rows of the recordings, evenly thinned; a recurrent network sees every row."""
+    return samples_of(model, recordings, (rows,))[0]
+
+
+def samples_of(
+    model: ArmModel, recordings: list[Recording], sizes: Sequence[int]
+) -> tuple[Sample, ...]:
+    """Samples of the recordings of about so many rows each, see `sample_of`."""
     whole = history_of(recordings, model.spec.actuation)
-    count = int(whole.valid.sum())
-    step = 1 if model.remembers else max(1, round(count / rows))
+    lengths = whole.valid.sum(1).tolist()
     training = ~held_out_rows(recordings)
     measured = np.concatenate([recording.key_points_mm for recording in recordings])
-    measured = np.where(training[:, None, None], measured, np.nan)
+    measured[~training] = np.nan
     seen = np.isfinite(measured).all(2).any(1)
-    block = blocks(whole, seen, step, least_blocks=1)
-    times, points, at, kept = [], [], [], []
-    begin = 0
-    for run in range(whole.runs):
-        length = int(whole.valid[run].sum())
-        inside = slice(begin, begin + length)
-        t_s = whole.t_s[run, :length].numpy()
-        times.append(t_s)
-        points.append(measured[inside])
-        at.append(t_s[::step])
-        kept.append(block[inside][::step])
-        begin += length
-    return Sample(
-        model=model,
-        history=History(
+    ends = np.cumsum(lengths)[:-1]
+    times = tuple(whole.t_s[run, :length].numpy() for run, length in enumerate(lengths))
+    points = tuple(np.split(measured, ends))
+    timed = all(recording.kind == "continuous" for recording in recordings)
+    samples = []
+    for rows in sizes:
+        step = 1 if model.remembers else max(1, round(len(measured) / rows))
+        block = blocks(whole, seen, step, least_blocks=1)
+        thinned = replace(
+            whole,
             t_s=whole.t_s[:, ::step],
             pressure=whole.pressure[:, ::step],
             key_points=whole.key_points[:, ::step],
             valid=whole.valid[:, ::step],
-            noise=whole.noise,
             temperature_C=None if whole.temperature_C is None else whole.temperature_C[:, ::step],
-            stood=whole.stood,
-        ),
-        times=tuple(times),
-        points=tuple(points),
-        at=tuple(at),
-        block=np.concatenate(kept),
-        timed=all(recording.kind == "continuous" for recording in recordings),
-    )
+            noise_mm=None,
+            predicted=None,
+        )
+        samples.append(
+            Sample(
+                model=model,
+                history=thinned,
+                times=times,
+                points=points,
+                at=tuple(each[::step] for each in times),
+                block=np.concatenate([part[::step] for part in np.split(block, ends)]),
+                timed=timed,
+            )
+        )
+    return tuple(samples)
 
 
 def recorded_actuation(recordings: list[Recording], model: ArmModel) -> np.ndarray:

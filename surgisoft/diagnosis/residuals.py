@@ -251,6 +251,8 @@ class ResidualTable:
             noise, source = _differences_noise(training, self.run)
             floor = _floor_of(noise, source)
         shown = self.held_out if part == "held_out" else ~self.held_out
+        if np.isnan(self.measured_mm[~shown]).all():
+            return replace(self, noise_mm=noise, floor=floor)
         points = self.history.key_points.clone()
         points[self.history.valid] = points[self.history.valid].masked_fill(
             ~torch.from_numpy(shown)[:, None, None], torch.nan

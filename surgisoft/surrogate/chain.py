@@ -273,11 +273,23 @@ def _followed(
         memory = start[own]
         for step in range(0, steps, long):
             place = own, slice(step, min(step + long, steps))
-            parts = (context.dt_s, context.t_s, context.temperature_C, context.pressure)
-            there = Context(*(part if part is None else part[place] for part in parts))
-            followed = effect.scan(memory, signal[place], there)
+            followed = effect.scan(memory, signal[place], _at(context, place))
             yield place, followed
             memory = followed[:, -1]
+
+
+def _at(context: Context, place: tuple[slice, slice]) -> Context:
+    """The context (R, T) of some steps of some runs."""
+
+    def part(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor[place]
+
+    return Context(
+        context.dt_s[place],
+        part(context.t_s),
+        part(context.temperature_C),
+        part(context.pressure),
+    )
 
 
 def memory_along(effect: Effect, start: Tensor, signal: Tensor, context: Context) -> Tensor:

@@ -106,11 +106,15 @@ class Sample:
 
     def predicted(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
         """(A, S, n, 3) predicted key points, mm, if the channels drove the chambers so."""
+        return self.predicted_single(arrangements).astype(float)
+
+    def predicted_single(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
+        """What `predicted` gives in single precision, in which models compute."""
         history, cases = self.history, len(arrangements)
 
         def each(tensor: torch.Tensor) -> torch.Tensor:
             """(A R, ...) a tensor (R, ...) for every arrangement."""
-            return tensor.repeat(cases, *[1] * (tensor.ndim - 1))
+            return tensor if cases == 1 else tensor.repeat(cases, *[1] * (tensor.ndim - 1))
 
         def arranged(tensor: torch.Tensor) -> torch.Tensor:
             """(A R, ..., m) actuation (R, ..., m) of the chambers in every arrangement."""
@@ -123,15 +127,15 @@ class Sample:
         wide = History(
             t_s=each(history.t_s),
             pressure=arranged(history.pressure),
-            key_points=each(history.key_points),
+            key_points=each(history.key_points[:, :, :0]),  # no prediction depends on them
             valid=each(history.valid),
             noise=history.noise,
             temperature_C=None if history.temperature_C is None else each(history.temperature_C),
             stood=None if history.stood is None else arranged(history.stood),
         )
         with torch.no_grad():
-            points = wide.rows(self.model.predict(wide)).double().numpy()
-        points = np.where(np.isfinite(points), points, 0.0)
+            points = wide.rows(self.model.predict(wide)).numpy()
+        points[~np.isfinite(points)] = 0.0
         return points.reshape(cases, -1, *points.shape[1:])
 
     def without(self, lost: np.ndarray) -> "Sample":
@@ -201,7 +205,10 @@ def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.nd
     after = np.clip(np.searchsorted(times, at - 1e-9), 1, len(times) - 1)
     share = (at - times[after - 1]) / (times[after] - times[after - 1])
     share = np.where(np.abs(share - np.round(share)) < 1e-6, np.round(share), share)
-    first, second = points[after - 1], points[after]
+    first, second = (
+        points[after - 1].astype(float, copy=False),
+        points[after].astype(float, copy=False),
+    )
     part = share[:, None, None]
     # A row that is met exactly does not need its neighbour, which may be missing.
     found = np.where(part == 0, first, np.where(part == 1, second, first + part * (second - first)))

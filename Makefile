@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test fast lint docs fuzz mutants kills sbom tutorials clean
+.PHONY: demo test fast coverage lint docs fuzz mutants kills sbom tutorials clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -36,6 +36,12 @@ test: $(STAMP)  ## the whole suite
 
 fast: $(STAMP)  ## the tests that are not marked slow
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m fast
+
+coverage: $(STAMP)  ## branches that the suite takes, by part, as docs/results/coverage.md
+	rm -rf .coverage && mkdir .coverage
+	$(BIN)/python -m coverage run -m pytest -n 2 -q
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m benchmarks.coverage_table > docs/results/coverage.md
 
 lint: $(STAMP)  ## style, format, types
 	$(BIN)/ruff check .

@@ -191,6 +191,14 @@ def decision(
         int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
     ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
+    without_truth: Annotated[
+        bool,
+        typer.Option(
+            "--without-truth",
+            help="Every case of a known effect takes part once more, without that effect among the "
+            "candidates: as one of an unknown effect.",
+        ),
+    ] = False,
     processes: Processes = 2,
     work: Work = Path("runs/benchmark-decision"),
     asset: Annotated[
@@ -208,7 +216,7 @@ def decision(
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with _kept("decision", work) as report:
         some, aside, values = run(
-            plan, count, seed, cases or [], work, processes, report, judge or []
+            plan, count, seed, cases or [], work, processes, report, judge or [], without_truth
         )
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")

@@ -10,13 +10,13 @@ from benchmarks.decision.evidence_log import Labelled, append, read
 from benchmarks.decision.fit import (
     PRIORS,
     case_weights,
+    costs_of,
     curve_of,
     fit,
     fit_one,
     log_losses,
     model_of,
     sample,
-    wrong_unknown_of,
 )
 from benchmarks.decision.own_rig import ROUND, Plan, draw
 from benchmarks.decision.table import (
@@ -26,6 +26,7 @@ from benchmarks.decision.table import (
     goals,
     left_out,
     markdown,
+    neighbours,
     rate,
 )
 from surgisoft.diagnosis.decision import (
@@ -176,8 +177,59 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
             effects = {f"effect {place}": (1.0 - chance) / 5 for place in range(5)}
         rest = 1.0 - unknown - sum(effects.values())
         predicted.append((case(number), Probabilities(rest, 0.0, unknown, effects, 0.0, ())))
-    assert wrong_unknown_of(predicted, {}) == -cost
-    assert wrong_unknown_of(predicted[2:], {}) == -0.25
+    assert costs_of(predicted, {}).wrong_unknown == -cost
+    assert costs_of(predicted[2:], {}).wrong_unknown == -0.25
+
+
+@pytest.mark.parametrize(
+    ("wrong", "needless", "costs"),
+    [
+        (0.0, 0.0, (0.5, 0.5)),
+        (0.55, 0.0, (1.5, 0.5)),
+        (0.0, 0.7, (0.5, 3.0)),
+        (0.55, 0.45, (1.5, 0.5)),
+    ],
+)
+def test_wrong_names_cost_as_much_as_keeps_them_rare(wrong, needless, costs):
+    """One in five known effects would be called another with a probability of `wrong`, one of a
+    set of two with 0.05 more, and one in two unchanged arms be given a name with one of `needless`;
+    a name of probability p is given where p > cost (1 - p)."""
+    predicted = []
+    for number in range(10):
+        sure = wrong if number < 2 and wrong else 0.99
+        names = {"drift" if sure < 0.9 else "creep": sure}
+        names |= {f"other {place}": (1.0 - sure) / 9 for place in range(9)}
+        predicted.append((case(number), Probabilities(0.0, 0.0, 0.0, names, 0.0, ())))
+    for number in range(10):
+        chance = needless if number < 5 else 0.0
+        clean = case(number, label="clean", truth=(), size=0.0)
+        names = {"creep": chance}
+        predicted.append((clean, Probabilities(1 - chance, 0.0, 0.0, names, 0.0, ())))
+    found = costs_of(predicted, {})
+    assert (-found.wrong_name, -found.needless_name) == costs
+
+
+def test_cases_without_their_truth_have_the_stated_weight():
+    """Real cases keep a mean weight of 1 together with them: 10 + 0.3 x 10 = 13 in all."""
+    twins = [replace(one, label="unknown", left_out=("creep",)) for one in some_cases(count=10)]
+    some = sample("known", [case(n) for n in range(10)] + twins)
+    weights = case_weights("known", some, 0.3)
+    assert weights[:10] == pytest.approx(10 * [1.0])
+    assert weights[10:] == pytest.approx(0.3 * weights[:1].repeat(len(weights) - 10))
+    assert len(weights) == 10 + sum(one.size >= 0.5 for one in twins)
+
+
+def test_the_table_counts_cases_without_their_truth_apart():
+    some = [
+        said("unknown_effect", (), label="unknown", truth=("leak",)),
+        said("unknown_effect", (), label="unknown", left_out=("creep",)),
+        said("identified", ("drift",), label="unknown", left_out=("creep",)),
+    ]
+    lines = {line.split("|")[1].strip(): line for line in goals({"all": some}).splitlines()}
+    assert "100 % (1 of 1" in lines["unknown called unknown"]
+    assert "50 % (1 of 2" in lines["a known effect that was no candidate: called unknown"]
+    assert "50 % (1 of 2" in lines["a known effect that was no candidate: another one named"]
+    assert "| creep | 2 | 1 | drift 1 |" in neighbours(some)
 
 
 def test_a_source_is_judged_without_its_own_cases(monkeypatch):
@@ -193,9 +245,11 @@ def test_a_source_is_judged_without_its_own_cases(monkeypatch):
     assert all({one.case.source for one in some} == {name} for name, some in found.items())
 
 
-def said(kind, effects, sure=0.9, **about):
+def said(kind, effects, sure=0.9, left_out=(), **about):
     chances = Probabilities(0.0, 0.0, 0.0, dict.fromkeys(effects, sure), 0.0, ())
-    return Judged(case(0, **about), Decision(kind, effects, sure, chances))
+    return Judged(
+        replace(case(0, **about), left_out=left_out), Decision(kind, effects, sure, chances)
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
+    CHOSEN_COSTS,
     FEATURES,
     Curve,
     DecisionModel,
@@ -255,7 +256,8 @@ def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():
     assert found.probabilities.effects["creep"] == pytest.approx(0.5, abs=0.01)
 
 
-weights = st.lists(st.floats(0.0, 5.0), min_size=12, max_size=12)
+MOST_FEATURES = max(map(len, FEATURES.values()))
+weights = st.lists(st.floats(0.0, 5.0), min_size=MOST_FEATURES, max_size=MOST_FEATURES)
 
 
 @settings(max_examples=60, deadline=None)
@@ -352,9 +354,9 @@ def test_an_asset_of_the_first_schema_still_opens(tmp_path):
     for name, features in FEATURES.items():
         for feature in features:
             if feature.since > 1:
-                del values["models"][name]["weights"][feature.name]
-    for key in ("calibration", "wrong_unknown"):
-        del values[key]
+                values["models"][name]["weights"].pop(feature.name, None)
+    for key in ("calibration", *CHOSEN_COSTS):
+        values.pop(key, None)
     values |= {"schema": 1}
     old = tmp_path / "decision.json"
     old.write_text(json.dumps(values | {"sha256": content_hash(values)}))

@@ -516,6 +516,14 @@ def cases(
     only: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
     ] = None,
+    without_truth: Annotated[
+        bool,
+        typer.Option(
+            "--without-truth",
+            help="Every case of a known effect once more, without that effect among the "
+            "candidates: the right answer is `unknown_effect` then.",
+        ),
+    ] = False,
     processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
@@ -529,11 +537,14 @@ def cases(
     some = [case for case in found if only is None or only in str(case.place)]
     if not some:
         raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
+    if without_truth:
+        some += [twin for case in some if (twin := case.without_truth)]
     with _kept("cases", folder) as report:
         judged = run(some, processes, report)
     if json_file:
         write_json(json_file, to_json(judged))
     command = "surgisoft benchmark cases DIR" + (f" --only {only}" if only else "")
+    command += " --without-truth" if without_truth else ""
     _show("Cases with a known truth", command, markdown(judged), output)
 
 

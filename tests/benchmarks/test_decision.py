@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.decision.evidence_log import Labelled, append, read
+from benchmarks.decision.evidence_log import Labelled, append, posed_on, read, without_truth
 from benchmarks.decision.fit import (
     PRIORS,
     case_weights,
@@ -38,6 +38,8 @@ from surgisoft.diagnosis.decision import (
     content_hash,
     features_of,
 )
+from surgisoft.diagnosis.diagnose import diagnose
+from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_decision import ALONE, CREEP, GOOD, LAG
 
 NOTHING = replace(GOOD, effects=(replace(CREEP, gain=0.02, log_gain=0.01, z=0.0),), proposals=())
@@ -187,7 +189,7 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
         (0.0, 0.0, (0.5, 0.5)),
         (0.55, 0.0, (1.5, 0.5)),
         (0.0, 0.7, (0.5, 3.0)),
-        (0.55, 0.45, (1.5, 0.5)),
+        (0.55, 0.45, (1.5, 1.0)),
     ],
 )
 def test_wrong_names_cost_as_much_as_keeps_them_rare(wrong, needless, costs):
@@ -315,3 +317,16 @@ def test_rounds_of_cases_have_the_shares_that_are_stated():
     assert sum(asked != case.robot for case, asked in drawn) == 4
     assert len({case.take for case, _ in drawn}) == len(drawn)
     assert draw(Plan([1, 2, 3], [1]), 7, 5) == drawn[:7]
+
+
+def test_without_its_truth_a_case_is_diagnosed_as_without_the_effect():
+    """The effect is no candidate, alone, in pairs or relaxed: as `diagnose --without` finds it."""
+    recorded = recording(np.linspace(0.0, 1.0, 500), walk(500))
+    posed = posed_on(still_model(), [recorded])
+    one = replace(case(1, truth=("drift",)), evidence=posed.evidence())
+    twin = without_truth(one, posed)
+    assert (twin.label, twin.left_out, twin.robot) == ("unknown", ("drift",), one.robot)
+    found = diagnose(still_model(), [recorded], without=["drift"], setup_tests=False)
+    assert twin.evidence == found.statistics
+    assert one.evidence.proposals[0].effects == ("drift",)
+    assert without_truth(twin, posed) is None

@@ -64,13 +64,11 @@ CURVE_PENALTY = 1.0
 """Ridge penalty on constant and log slope of a calibration, in cases: a weak pull to no change."""
 TWIN_WEIGHTS = (0.0, 0.1, 0.3, 1.0)
 """Weights that are tried of a case whose truth was no candidate, in units of a real case."""
-NAME_COSTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+NAME_COSTS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 """Costs of a wrong and of a needless name that are tried, in units of what a right one gains."""
-MOST_WRONG = 0.05
-"""Most cases of known effects, as a share of each source, whose result may be wrong names."""
-MOST_NEEDLESS = 0.1
-"""Most cases in which no effect of the list is missing, as a share of each source, whose result may
-name one."""
+NAMED_LOST = 0.03
+"""Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
+wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""
 UNKNOWN_COSTS = (0.25, 0.5, 1.0, 2.0)
 """Costs of a wrong "unknown" that are tried, in units of what a right one is worth."""
 MOST_CALLED_UNKNOWN = 0.05
@@ -316,17 +314,15 @@ def curve_of(count: int, predicted: Predicted) -> Curve:
 
 
 def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
-    """The costs of wrong results: the least that keep each kind of wrong result rare.
+    """The costs of wrong results, from cases of robots that were left out.
 
-    First those of a wrong name and of a needless one: together the least with which at most
-    `MOST_WRONG` of the cases of known effects get a wrong name, and at most `MOST_NEEDLESS` of
-    those in which no effect of the list is missing get any. Then the least cost of a wrong
-    "unknown" with which at most `MOST_CALLED_UNKNOWN` of known effects and unchanged arms are
-    called unknown. Shares are means over the sources.
+    First those of a wrong name and of a needless one: with which the fewest names are wrong, and at
+    most `NAMED_LOST` fewer known effects are named than with the costs of `Worth`. Of equal ones
+    the least. Then the least cost of a wrong "unknown" with which at most `MOST_CALLED_UNKNOWN` of
+    known effects and unchanged arms are called unknown. Shares are means over the sources.
     """
     some = [(case, calibrated(chances, curves)) for case, chances in predicted]
     known = [one for one in some if one[0].label == "known" and one[0].size >= WEAK]
-    others = [one for one in some if one[0].label != "known"]
     kept = [one for one in some if one[0].label in ("known", "clean")]
 
     def share(of: Predicted, worth: Worth, hit: Callable[[Labelled, Decision], bool]) -> float:
@@ -336,14 +332,13 @@ def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
             rates.append(np.mean([hit(*one) for one in own]))
         return float(np.mean(rates)) if rates else 0.0
 
-    pairs = sorted(itertools.product(NAME_COSTS, repeat=2), key=lambda each: (sum(each), each))
-    worth = WORTH
-    for wrong, needless in pairs:
+    least = share(known, WORTH, names_truth) - NAMED_LOST
+    tried = []
+    for wrong, needless in itertools.product(NAME_COSTS, repeat=2):
         worth = replace(WORTH, wrong_name=-wrong, needless_name=-needless)
-        if share(known, worth, _names_wrongly) > MOST_WRONG:
-            continue
-        if share(others, worth, lambda case, found: found.kind in NAMING) <= MOST_NEEDLESS:
-            break
+        if share(known, worth, names_truth) >= least:
+            tried.append((share(some, worth, names_wrongly), wrong + needless, worth))
+    worth = min(tried, key=lambda each: each[:2])[2]
     for cost in UNKNOWN_COSTS:
         worth = replace(worth, wrong_unknown=-cost)
         called = share(kept, worth, lambda case, found: found.kind == "unknown_effect")
@@ -352,11 +347,16 @@ def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
     return worth
 
 
-def _names_wrongly(case: Labelled, found: Decision) -> bool:
+def names_truth(case: Labelled, found: Decision) -> bool:
+    """Whether a result names a missing effect, alone, as one of two, or in a set of two."""
+    return found.kind in NAMING and bool(set(found.effects) & set(case.truth))
+
+
+def names_wrongly(case: Labelled, found: Decision) -> bool:
     """Whether a result names effects none of which is missing, or two of which one is not."""
     if found.kind not in NAMING:
         return False
-    hit = [name in case.truth for name in found.effects]
+    hit = [case.label == "known" and name in case.truth for name in found.effects]
     return not (all(hit) if found.kind == "several" else any(hit))
 
 

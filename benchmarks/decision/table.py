@@ -9,7 +9,15 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.decision.evidence_log import Labelled
-from benchmarks.decision.fit import NAMING, OFF, WEAK, fit, model_of
+from benchmarks.decision.fit import (
+    NAMING,
+    OFF,
+    WEAK,
+    fit,
+    model_of,
+    names_truth,
+    names_wrongly,
+)
 from surgisoft.diagnosis.criteria import Worth
 from surgisoft.diagnosis.decision import CHOSEN_COSTS, Decision, DecisionModel, decide
 
@@ -36,10 +44,9 @@ class Judged:
     def right(self) -> bool:
         """Whether the statement is right: the named effect is missing, one of the set, both of two;
         something unknown; nothing, or too little to be seen."""
-        kind, effects, case = self.decision.kind, self.decision.effects, self.case
+        kind, case = self.decision.kind, self.case
         if kind in NAMING:
-            hit = [name in case.truth for name in effects]
-            return case.label == "known" and (all(hit) if kind == "several" else any(hit))
+            return not names_wrongly(case, self.decision)
         if kind == "unknown_effect":
             return case.label == "unknown"
         return case.label not in ("known", "unknown") or case.size < WEAK
@@ -52,7 +59,7 @@ class Judged:
     @property
     def names_truth(self) -> bool:
         """Whether the result names the missing effect, alone, as one of two, or in a set of two."""
-        return bool(set(self.decision.effects) & set(self.case.truth))
+        return names_truth(self.case, self.decision)
 
 
 def judged(

@@ -184,29 +184,31 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "needless", "costs"),
+    ("wrong", "right", "needless", "costs"),
     [
-        (0.0, 0.0, (0.5, 0.5)),
-        (0.55, 0.0, (1.5, 0.5)),
-        (0.0, 0.7, (0.5, 3.0)),
-        (0.55, 0.45, (1.5, 1.0)),
+        (0, 0, 0, (0.5, 0.5)),
+        (2, 0, 0, (1.5, 0.5)),
+        (2, 1, 0, (1.5, 0.5)),
+        (2, 2, 0, (0.5, 0.5)),
+        (0, 0, 5, (0.5, 3.0)),
+        (2, 1, 5, (1.5, 3.0)),
     ],
 )
-def test_wrong_names_cost_as_much_as_keeps_them_rare(wrong, needless, costs):
-    """One in five known effects would be called another with a probability of `wrong`, one of a
-    set of two with 0.05 more, and one in two unchanged arms be given a name with one of `needless`;
-    a name of probability p is given where p > cost (1 - p)."""
+def test_the_fewest_wrong_names_that_cost_few_right_ones(wrong, right, needless, costs):
+    """Of 40 known effects some would be named wrongly, and some rightly, with a probability of
+    0.53, and some of ten unchanged arms be given a name with 0.7. A name of probability p is given
+    where p > cost (1 - p), and a fortieth of the right ones may be lost for it, but not two."""
     predicted = []
-    for number in range(10):
-        sure = wrong if number < 2 and wrong else 0.99
-        names = {"drift" if sure < 0.9 else "creep": sure}
+    for number in range(40):
+        sure = 0.99 if number >= wrong + right else 0.53
+        names = {"drift" if number < wrong else "creep": sure}
         names |= {f"other {place}": (1.0 - sure) / 9 for place in range(9)}
         predicted.append((case(number), Probabilities(0.0, 0.0, 0.0, names, 0.0, ())))
     for number in range(10):
-        chance = needless if number < 5 else 0.0
+        chance = 0.7 if number < needless else 0.0
         clean = case(number, label="clean", truth=(), size=0.0)
-        names = {"creep": chance}
-        predicted.append((clean, Probabilities(1 - chance, 0.0, 0.0, names, 0.0, ())))
+        chances = Probabilities(1 - chance, 0.0, 0.0, {"creep": chance}, 0.0, ())
+        predicted.append((clean, chances))
     found = costs_of(predicted, {})
     assert (-found.wrong_name, -found.needless_name) == costs
 
@@ -321,12 +323,13 @@ def test_rounds_of_cases_have_the_shares_that_are_stated():
 
 def test_without_its_truth_a_case_is_diagnosed_as_without_the_effect():
     """The effect is no candidate, alone, in pairs or relaxed: as `diagnose --without` finds it."""
-    recorded = recording(np.linspace(0.0, 1.0, 500), walk(500))
+    recorded = recording(np.linspace(0.0, 1.0, 240), walk(240))
     posed = posed_on(still_model(), [recorded])
-    one = replace(case(1, truth=("drift",)), evidence=posed.evidence())
+    one = case(1, truth=("drift",))
     twin = without_truth(one, posed)
     assert (twin.label, twin.left_out, twin.robot) == ("unknown", ("drift",), one.robot)
     found = diagnose(still_model(), [recorded], without=["drift"], setup_tests=False)
     assert twin.evidence == found.statistics
-    assert one.evidence.proposals[0].effects == ("drift",)
+    names = {each.name for each in posed.tried}
+    assert {each.effect for each in twin.evidence.effects} == names - {"drift"} < names
     assert without_truth(twin, posed) is None

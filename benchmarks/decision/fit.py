@@ -64,8 +64,9 @@ CURVE_PENALTY = 1.0
 """Ridge penalty on constant and log slope of a calibration, in cases: a weak pull to no change."""
 TWIN_WEIGHTS = (0.0, 0.1, 0.3, 1.0)
 """Weights that are tried of a case whose truth was no candidate, in units of a real case."""
-NAME_COSTS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""Costs of a wrong and of a needless name that are tried, in units of what a right one gains."""
+NAME_COSTS = (1.0, 1.5, 2.0, 3.0, 4.0)
+"""Costs of a wrong and of a needless name that are tried, in units of what a right one gains: no
+less than that."""
 NAMED_LOST = 0.03
 """Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
 wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""

@@ -148,8 +148,12 @@ def _free_better(evidence: Evidence) -> float:
 
 
 def _break(evidence: Evidence) -> float:
-    """What one break explains beyond any function of the actuation, its past and the time."""
-    return lack_of_fit(evidence.break_gain, evidence.break_log_gain)
+    """Log gain of one break over the black box, or over the best proposal where that is better.
+
+    An effect that sets in fast and fades is no function that the black box knows: where the effect
+    itself explains it, there is no break.
+    """
+    return _between(evidence.break_log_gain + min(_free_better(evidence), 0.0), 0.0, 1.0)
 
 
 def _form_of_left(evidence: Evidence) -> float:
@@ -354,8 +358,7 @@ MISSING = (
         "break",
         +1,
         _break,
-        "what one break in time explains of what a black box with memory leaves (root of gain x "
-        "log gain)",
+        "log gain of one break in time over a black box with memory, or over the best proposal",
         since=3,
     ),
     Feature(
@@ -416,8 +419,7 @@ KNOWN = (
         "break",
         -1,
         _break,
-        "what one break in time explains of what a black box with memory leaves (root of gain x "
-        "log gain)",
+        "log gain of one break in time over a black box with memory, or over the best proposal",
         since=3,
     ),
     Feature(
@@ -569,8 +571,7 @@ NETWORK = (
         "break",
         -1,
         _break,
-        "what one break in time explains of what a black box with memory leaves (root of gain x "
-        "log gain)",
+        "log gain of one break in time over a black box with memory, or over the best proposal",
         since=3,
     ),
     Feature(

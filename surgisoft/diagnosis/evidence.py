@@ -16,7 +16,7 @@ from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
 from surgisoft.diagnosis.statistics import block_sums, studentised
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-VERSION = 1
+VERSION = 2
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
 COLLINEAR_RIDGE = 1e-6
@@ -151,11 +151,8 @@ class Evidence:
     """Whether the paired difference of two sets of recordings is explained."""
     free_log_gain: float = 0.0
     """Log gain of the free black box over the model discrepancy of its validated size."""
-    break_gain: float = 0.0
-    """Share of the error above the floor that the free black box leaves and that one break explains
-    (`beyond_history`)."""
     break_log_gain: float = 0.0
-    """Log gain of the break over the free black box."""
+    """Log gain of one break over the free black box (`beyond_history`)."""
     line: float = 0.0
     """Share of what the free black box leaves above the noise in one line of its spectrum that is
     none of the actuation or the predicted motion."""
@@ -197,7 +194,6 @@ def evidence_of(found: Findings) -> Evidence:
     above = selection.explainable(raw, [free])
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
     beyond = beyond_history(problem, box.features)
-    broken = beyond.losses.sum() - beyond.break_losses.sum()
     stated = problem.discrepancy_mm**2 + problem.noise_mm**2
     validated = float((seen.sum(0) * stated).sum())
     return Evidence(
@@ -218,7 +214,6 @@ def evidence_of(found: Findings) -> Evidence:
         proposals=tuple(_proposal(found, each, free) for each in range(len(found.proposals))),
         paired=problem.table.paired_discrepancy_mm is not None,
         free_log_gain=float(selection.log_ratio(null, free).mean()),
-        break_gain=_share(broken, selection.excess(beyond.losses)),
         break_log_gain=float(selection.log_ratio(beyond.losses, beyond.break_losses).mean()),
         line=beyond.line,
     )

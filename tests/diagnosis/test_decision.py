@@ -321,9 +321,7 @@ def test_where_an_effect_explains_it_there_is_no_break(free, broken):
     names = [feature.name for feature in FEATURES["known"]]
     worse = replace(ALONE, left_log_free=free + 1.0)
     best = replace(ALONE, left_log_free=free)
-    evidence = replace(
-        GOOD, proposals=(worse, best), free_log_gain=1.8, break_gain=0.6, break_log_gain=0.7
-    )
+    evidence = replace(GOOD, proposals=(worse, best), free_log_gain=1.8, break_log_gain=0.7)
     row = dict(zip(names, features_of("known", evidence), strict=True))
     assert row["free_better"] == pytest.approx(free)
     assert row["break"] == pytest.approx(broken)

@@ -49,6 +49,13 @@ def importers(known: dict[str, Path]) -> dict[str, set[str]]:
     return result
 
 
+def circles(users: dict[str, set[str]]) -> list[list[str]]:
+    """Sets of modules that import each other, from `importers`; each sorted by name."""
+    graph = networkx.DiGraph((user, name) for name, found in users.items() for user in found)
+    graph.remove_nodes_from([PACKAGE])
+    return [sorted(c) for c in networkx.strongly_connected_components(graph) if len(c) > 1]
+
+
 def main(root: Path) -> None:
     """Print one line for each count."""
     known = modules(root)
@@ -60,18 +67,16 @@ def main(root: Path) -> None:
         if len(users[name]) == 1 and path.name != "__init__.py"
     }
     listed = [n for n, user in single.items() if user.removeprefix(f"{PACKAGE}.") in REGISTRIES]
-    graph = networkx.DiGraph((user, name) for name in known for user in users[name])
-    graph.remove_nodes_from([PACKAGE])
-    circles = [c for c in networkx.strongly_connected_components(graph) if len(c) > 1]
+    found = circles(users)
     print(f"modules: {len(known)}, lines: {sum(lines.values())}, longest: {max(lines.values())}")
     print(f"modules below 60 lines: {sum(count < 60 for count in lines.values())}")
     print(
         f"modules with a single importer: {len(single)} ({sum(lines[n] for n in single)} lines), "
         f"{len(listed)} of them listed by a registry"
     )
-    print(f"import circles: {len(circles)}")
-    for circle in circles:
-        print("  " + ", ".join(sorted(circle)))
+    print(f"import circles: {len(found)}")
+    for circle in found:
+        print("  " + ", ".join(circle))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
 """Imports run one way, and each outside library is spoken to in one place."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+from benchmarks.structure import circles, importers, modules
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "surgisoft"
@@ -149,6 +152,7 @@ ONLY_IN = {
 }
 
 
+@cache
 def _imports(path: Path) -> set[str]:
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -229,6 +233,22 @@ def test_an_import_that_runs_up_is_found(tmp_path, monkeypatch):
         "part/low.py imports surgisoft.part.high",
         "part/low.py imports surgisoft.part.high.x",
     ]
+
+
+def test_no_modules_import_each_other():
+    """Circles by imports in functions, or for types only, count as well."""
+    assert circles(importers(modules(ROOT))) == []
+
+
+def test_a_circle_for_types_is_found(tmp_path):
+    folder = tmp_path / "surgisoft"
+    folder.mkdir()
+    (folder / "a.py").write_text("def f():\n    from surgisoft.b import g\n")
+    late = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from surgisoft.a import f\n"
+    (folder / "b.py").write_text(late)
+    (folder / "c.py").write_text("import surgisoft.a\n")
+    found = circles(importers(modules(tmp_path)))
+    assert found == [["surgisoft.a", "surgisoft.b"]]
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.name)

@@ -14,7 +14,7 @@ ERRORS = (
     "*error* is that of the given model, of the training rows of the recordings after the change. "
     "*held out*, *amended* and *with the truth* are of the held-out quarter: without any effect, "
     "with the named ones and with the true ones; where these were fitted together with the "
-    "network, *held out* is the network alone, trained on as long."
+    "network, *held out* is the network alone, trained for as many epochs."
 )
 """What the columns of errors say."""
 NAMED_GOAL = 0.9

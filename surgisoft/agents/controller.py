@@ -201,7 +201,10 @@ class ControllerGraph(nn.Module):
         self.arms: dict[str, MeasuredArm] = {}
         for name, arm in world.arms.items():
             if not isinstance(arm, ModelArm):
-                raise InputError(f"arm '{name}' is on a rig, expected the simulated task")
+                raise InputError(
+                    f"arm '{name}' is on a rig, expected a simulated arm; build the task without a "
+                    "rig and export that"
+                )
             self.arms[name] = MeasuredArm(arm, gains, self.control_s)
         world.arms = dict(self.arms)
         if world.scene is not None:

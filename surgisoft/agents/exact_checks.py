@@ -75,9 +75,9 @@ SURE_FROM_MM = 0.1
 difference between both engines near contact that `tests/scene/test_distance.py` allows. What the
 batched geometry calls 5 mm or more is a lower bound, see `batched.EXACT_WITHIN_MM`."""
 BEAMS_TOGETHER = 256
-"""So many beams that wait for FCL are followed together (a count): closed forms cost less so."""
+"""Beams that wait for FCL and are checked together (a count): batches make closed forms cheaper."""
 AUDIT_EVERY = 64
-"""Of the instants that need no FCL every so many is given to it all the same (a count)."""
+"""One in so many of the instants that need no FCL is given to it anyway, as an audit (a count)."""
 
 
 @dataclass
@@ -129,7 +129,8 @@ class ExactChecks:
         around = task.world.scene
         if around is None:
             raise InputError(
-                f"task {task.name}: its world is empty, expected bodies to check against"
+                f"task {task.name} has no scene, so the exact collision checker has no bodies to "
+                "check against; use --no-exact-checks"
             )
         self.dt_s, self.radii = task.world.config.dt_s, around.geometry.radii_mm
         self.around, self.checker = around, CollisionChecker(around.geometry.bodies)

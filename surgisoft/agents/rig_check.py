@@ -41,7 +41,10 @@ class _LoggedRig:
     def __init__(self, build: BuildRig, config: RigConfig, trial: int):
         rig = build(config, trial)
         if not is_simulated(rig):
-            raise InputError("a controller is checked on simulated rigs, which can be driven twice")
+            raise InputError(
+                "the check drives the rig twice from the same start, which a real rig cannot do; "
+                "expected a simulated rig"
+            )
         self.rig: SimulatedRig = rig
         self.made = (config, trial)
         self.commands: list[np.ndarray] = []

@@ -64,7 +64,7 @@ class EvaluationRequest:
     """Seed of the episodes, equal for each policy."""
     rig: RigConfig | None = None
     """The arms are on these rigs; None: in simulation."""
-    referee: bool = True
+    exact_checks: bool = True
     """Whether FCL checks contact, clearance and beam, where there is a scene."""
     arm: str | Path | None = None
     """Arm model of all arms; None: the configuration's."""
@@ -88,7 +88,7 @@ class EvaluationRequest:
             check_policy(name)
         runs = [RunFolder(name) for name in self.policies if name not in POLICIES]
         if self.task is None and not runs:
-            raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
+            raise InputError(f"--task is missing; expected one of {', '.join(sorted(TASKS))}")
         task = self.task or runs[0].config["task"]
         brought = [run for run in runs if run.config["task"] == task]
         for run in runs:
@@ -237,7 +237,7 @@ def _evaluated(
             policy,
             request.episodes,
             request.seed,
-            request.referee,
+            request.exact_checks,
             batch=1 if measured else BATCH,
             progress=tell,
             watch=logs.get(name),

@@ -60,6 +60,8 @@ MANY = {
 
 
 OLD_NAMES = {
+    "--no-referee": "--no-exact-checks",
+    "--referee": "--exact-checks",
     "--reference": "--before",
     "--specimen": "--robot-seed",
     "--take": "--trial",

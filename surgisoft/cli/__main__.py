@@ -1,4 +1,4 @@
-"""`python -m surgisoft.cli`, the name of before for `python -m surgisoft`."""
+"""`python -m surgisoft.cli`, the former name of `python -m surgisoft`."""
 
 from surgisoft.cli import main
 

@@ -10,7 +10,14 @@ import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import check_model, warn
-from surgisoft.cli.options import SEED_MAX, Force, Hidden, NewRecording, Preflight
+from surgisoft.cli.options import (
+    SEED_MAX,
+    EffectFiles,
+    Force,
+    Hidden,
+    NewRecording,
+    Preflight,
+)
 from surgisoft.cli.options import Rig as RigOption
 from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
@@ -113,6 +120,7 @@ def collect(
             "--dry-run", help="On a real rig: show what would be sent, send and write nothing."
         ),
     ] = False,
+    effect_files: EffectFiles = None,
     force: Force = False,
     list_hidden: Annotated[
         bool,

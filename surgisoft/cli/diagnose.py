@@ -66,7 +66,7 @@ def diagnose(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Write the recordings with the fault of their set-up mended to this new folder.",
+            help="Correct the set-up fault in the recordings and write them to this new folder.",
         ),
     ] = None,
     setup_tests: Annotated[

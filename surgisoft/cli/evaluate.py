@@ -55,7 +55,7 @@ def evaluate(
         ),
     ] = None,
     rig: RigsOfArms = None,
-    referee: Annotated[
+    exact_checks: Annotated[
         bool,
         typer.Option(
             help="Check contact, clearance and beam with FCL, the exact collision checker, where "
@@ -116,7 +116,7 @@ def evaluate(
             episodes=episodes,
             seed=seed,
             rig=rigs,
-            referee=referee,
+            exact_checks=exact_checks,
             arm=arm,
             scene=scene,
             config=of_task,

@@ -2,14 +2,17 @@
 
 import textwrap
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surgisoft.cli import app
 from surgisoft.cli.inputs import check_model, read_recordings, warn
-from surgisoft.cli.options import Force, Recordings
+from surgisoft.cli.options import EffectFiles, Force, Recordings
 from surgisoft.errors import InputError
+
+if TYPE_CHECKING:
+    from surgisoft.surrogate.model import ArmModel
 
 
 @app.command("import")
@@ -47,6 +50,7 @@ def import_(
             help="Model of the arm: the set-up is tested against it, as `diagnose` does.",
         ),
     ] = None,
+    effect_files: EffectFiles = None,
 ) -> None:
     """Import a laboratory's files as recordings; a map states columns, units and frames.
 
@@ -68,8 +72,12 @@ def import_(
     from surgisoft.measurement.recordings.lerobot import is_dataset
     from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
 
+    arm = None
     if model:
         check_model(model)
+        from surgisoft.surrogate.checkpoint import load_model
+
+        arm = load_model(model)
     to_file = bool(output.suffix[1:].isalpha() and not output.is_dir())
     if to_file and output.suffix not in (".csv", ".parquet"):
         raise InputError(f"{output}: suffix '{output.suffix}', expected .csv, .parquet or a folder")
@@ -98,21 +106,19 @@ def import_(
         first, *rest = summary(part.recording)
         about = first.partition(": ")[2]
         print(f"{'would write' if dry_run else 'wrote'} {target}: {about}", *rest, sep="\n")
-    if model:
-        _test_setup(model, [part.recording for part in parts])
+    if arm:
+        _test_setup(arm, str(model), [part.recording for part in parts])
 
 
-def _test_setup(model: Path, recordings: list) -> None:
-    """Print what a model shows to be wrong with the set-up of recordings."""
+def _test_setup(arm: "ArmModel", name: str, recordings: list) -> None:
+    """Print what a model shows to be wrong with the set-up of recordings; name: of the model."""
     from surgisoft.diagnosis.setup import find_setup_faults
     from surgisoft.measurement.histories import check_fits
-    from surgisoft.surrogate.checkpoint import load_model
 
-    arm = load_model(model)
     check_fits(arm.spec, recordings, sized=False)
     found = find_setup_faults(arm, recordings)
     if found is None:
-        print(f"set-up: no fault that {model} shows")
+        print(f"set-up: no fault that {name} shows")
         return
     warn(f"set-up: {found.sentence}")
     print("to mend it, in a map that reads the recording (docs/diagnosis.md, set-up faults):")
@@ -127,8 +133,8 @@ def recording_(
         typer.Option(
             "--lerobot",
             metavar="DIR",
-            help="Write the recordings to a new folder as a LeRobotDataset (v3.0), a run an "
-            "episode.",
+            help="Write the recordings to a new folder as a LeRobotDataset (v3.0), one "
+            "episode for each run.",
         ),
     ] = None,
     task: Annotated[
@@ -144,7 +150,7 @@ def recording_(
         typer.Option(
             min=1,
             metavar="N",
-            help="With --lerobot: frames a second; default: the recordings' own rate.",
+            help="With --lerobot: frames per second; default: the recordings' own rate.",
         ),
     ] = None,
 ) -> None:

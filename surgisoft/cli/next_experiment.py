@@ -34,7 +34,7 @@ def next_experiment(
     model: AnyModel,
     recordings: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="REC", help="Recordings so far; may be left out."),
+        typer.Argument(metavar="REC", help="Recordings made so far (optional)."),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="SCHEDULE.csv", help="New schedule file.")

@@ -147,7 +147,7 @@ Credibility = Annotated[
         "--credibility",
         metavar="CONTEXT.toml",
         help="Also write a credibility report (HTML and JSON) in the terms of ASME V&V 40 and V&V "
-        "20. The file states question of interest, context of use, model risk and limits "
+        "20. The file states the question of interest, context of use, model risk and limits "
         "(docs/credibility.md).",
     ),
 ]

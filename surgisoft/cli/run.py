@@ -101,7 +101,9 @@ def run(
     observer_gain: ObserverGain = None,
     any_model: Annotated[
         bool,
-        typer.Option("--any-model", help="Go on although the model seems to be of another arm."),
+        typer.Option(
+            "--any-model", help="Continue even if the model seems to belong to another arm."
+        ),
     ] = False,
     seed: Annotated[
         int, typer.Option(min=0, max=SEED_MAX, help="Seed of the goals and of random schedules.")

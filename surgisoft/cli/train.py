@@ -102,8 +102,8 @@ def train(
             metavar="fast|randomised|robust|paper",
             help="fast (default); randomised: with camera noise, mounts and gains that differ "
             "between episodes, and a state observer; robust: for robots that differ from the "
-            "model, with effects out of the library and an observer that learns online; or the "
-            "hyper-parameters of the paper.",
+            "model, with random effects in every episode and an observer that learns online; "
+            "paper: the hyper-parameters of the paper.",
         ),
     ] = None,
     steps: Annotated[
@@ -118,7 +118,7 @@ def train(
         typer.Option(
             min=1,
             help="Number of episodes that are simulated in parallel; default: by the task, fewer "
-            "in a short training, which so keeps its number of updates.",
+            "in a short training, so that the number of updates stays the same.",
         ),
     ] = None,
     seed: Annotated[

@@ -44,7 +44,7 @@ class Limits:
     error_mm: Limit | None = None
     """Largest comparison error plus validation uncertainty of every key point, mm."""
     tip_error_mm: Limit | None = None
-    """The same for the last key point alone, mm."""
+    """Largest comparison error plus validation uncertainty of the last key point alone, mm."""
     area_mm: Limit | None = None
     """Largest area metric of every key point, mm."""
     applicable: Share | None = None

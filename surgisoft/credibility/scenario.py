@@ -72,7 +72,10 @@ def stored_episodes(scenario: Scenario) -> dict[str, EpisodeLog]:
         if path.is_dir() and (path / "logs").is_dir():
             logs = sorted((path / "logs").glob("*.npz"))
             if not logs:
-                raise InputError(f"{path}: results without a stored episode (logs/*.npz)")
+                raise InputError(
+                    f"{path}: the results hold no stored episode, expected logs/*.npz; run the "
+                    "experiment again"
+                )
             found |= {f"{path.name}/{log.stem}": load_episode(log) for log in logs}
         elif path.suffix == ".npz":
             found[path.stem] = load_episode(path)

@@ -1,4 +1,4 @@
-"""The demonstration: what the package does, in five steps on what it brings along.
+"""The demonstration: what the package does, in five steps on files of its own.
 
 Two trained policies cut a ring around a lesion. Then the virtual rig records an arm that creeps,
 the model of the package is compared with the recording, the missing effect is named, and the model

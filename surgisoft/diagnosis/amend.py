@@ -138,7 +138,7 @@ class Amendment:
     """The error on the held-out rows."""
     alone: Fall
     """What the effects do on the held-out rows: with the network left as it was; where both were
-    fitted together, compared with the network trained on as long without the effects."""
+    fitted together, compared with the network trained for as many epochs without the effects."""
     training: Fall
     """The error on the training rows, to which the parameters were fitted."""
     retuned: bool
@@ -195,11 +195,13 @@ class Amendment:
         if self._seen_before:
             return (
                 f"{self.alone.sentence}, fitted together with the network, compared with the "
-                "network alone, trained on as long from the same weights; the given model, which "
-                f"had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
+                "network alone, trained for as many epochs from the same weights; the given "
+                f"model, which had been fitted to {self.held_out.in_fit:.0%} of these rows, has "
                 f"{self.held_out.before:.3f} mm there"
             )
-        network = f"the network alone, trained on as long, reaches {self.alone.before:.3f} mm"
+        network = (
+            f"the network alone, trained for as many epochs, reaches {self.alone.before:.3f} mm"
+        )
         if self.held_out.claimed and not self.alone.claimed:
             return (
                 f"no fall of the error is claimed for the effects: {network}, and with them "
@@ -287,8 +289,9 @@ def amend(
     reason = refit_reason(problem, refit) if both is None else ""
     if refit == "always" and (both is not None or not retune_network):
         raise InputError(
-            "a refit changes the network, and a change since BEFORE is not one of the network: "
-            "expected --refit always without --before and without --keep-network"
+            "--refit always trains the network too, which --keep-network forbids, and which "
+            "--before rules out, because only the change since then is explained; leave out "
+            "--refit always, or leave out the other two"
         )
     if reason and (refit == "always" or (retune_network and all(map(can_hide, names)))):
         judged = refit_effects(

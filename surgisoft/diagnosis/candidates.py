@@ -44,9 +44,7 @@ from surgisoft.surrogate.effects import (
     known_effects,
 )
 from surgisoft.surrogate.effects.beam import Beam, cross, displaced
-from surgisoft.surrogate.effects.gain_mismatch import GainMismatch
 from surgisoft.surrogate.effects.inertia import Inertia
-from surgisoft.surrogate.effects.payload import Payload
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 
@@ -259,33 +257,34 @@ def measured_candidates(problem: Problem, names: Sequence[str] | None = None) ->
     body = problem.table.body_before_mm
     if body is None:
         return []
-    facts, answer = facts_of(problem), []
-    fresh = [name for name in names or known_effects() if name not in problem.model.effects]
-    if "gain_mismatch" in fresh:
-        answer.append(_gain(problem, facts, body))
-    if "payload" in fresh:
-        answer += _loads(problem, facts, body)
+    known, facts, answer = known_effects(), facts_of(problem), []
+    fresh = [name for name in names or known if name not in problem.model.effects]
+    by_way: dict[str, list[str]] = {"gain": [], "load": []}
+    for name in fresh:
+        by_way.setdefault(hypothesis_of(known[name]).measured_body, []).append(name)
+    for name in by_way["gain"]:
+        answer.append(_gain(problem, name, known[name](facts), body))
+    for name in by_way["load"]:
+        answer += _loads(problem, name, known[name](facts), body)
     return answer
 
 
-def _gain(problem: Problem, facts: ArmFacts, body: np.ndarray) -> Candidate:
+def _gain(problem: Problem, name: str, effect: Effect, body: np.ndarray) -> Candidate:
     """One gain of all chambers: a linear arm's whole motion grows by it, whatever moves it."""
     motion = body[problem.index.numpy()] - problem.table.rest_mm
-    effect = GainMismatch(facts)
     spread = np.ones((problem.model.spec.chambers, 1))
-    return Candidate("gain_mismatch", effect, motion[..., None], spread=spread)
+    return Candidate(name, effect, motion[..., None], spread=spread)
 
 
-def _loads(problem: Problem, facts: ArmFacts, body: np.ndarray) -> list[Candidate]:
+def _loads(problem: Problem, name: str, effect: Effect, body: np.ndarray) -> list[Candidate]:
     """A load at rest on the measured body, and in motion for each mode."""
-    history = problem.history
+    history, facts = problem.history, effect.facts
     shape = (*history.valid.shape, *body.shape[1:])
     points = torch.zeros(shape, dtype=torch.float32)
     points[history.valid] = torch.from_numpy(body).float()
     # Rows of padding repeat the last one.
-    effect = Payload(facts)
     still = effect.sensitivities(points, points.new_zeros(*shape[:2], 0))
-    answer = [Candidate("payload", effect, _rows(problem, still), removable=True)]
+    answer = [Candidate(name, effect, _rows(problem, still), removable=True)]
     if facts.gravity is None or not problem.table.timed.any():
         return answer
     beam = Beam.through(facts.rest_mm)
@@ -299,7 +298,7 @@ def _loads(problem: Problem, facts: ArmFacts, body: np.ndarray) -> list[Candidat
             _, acceleration = mode.follow(facts, points.flatten(2), history.dt_s)
             force = -acceleration.view(shape) / STANDARD_GRAVITY_MM_S2
             sensitivities = _rows(problem, moved + _pulled(beam, points, force))
-            answer.append(Candidate("payload", Payload(facts), sensitivities, removable=True))
+            answer.append(Candidate(name, type(effect)(facts), sensitivities, removable=True))
     return answer
 
 

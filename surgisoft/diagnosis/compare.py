@@ -219,7 +219,10 @@ def compare(
         check_fits(model.spec, recordings)
     whole = residual_table(model, recordings)
     if np.isnan(whole.only(part).measured_mm).all():
-        raise InputError("no key point was measured in any row of the recordings")
+        raise InputError(
+            "no key point was measured in any row of the recordings, expected at least one; check "
+            "their columns k0_x_mm ..."
+        )
     both = None
     changed: tuple[AxisShare, ...] = ()
     if before is not None:

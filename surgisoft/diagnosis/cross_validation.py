@@ -123,8 +123,11 @@ class Split:
         return int((self.block < len(self.fold)).sum())
 
     def turned(self, field: np.ndarray, known: np.ndarray | None = None) -> list[np.ndarray]:
-        """For each fold (F, n, 3, C) products of the static part's basis and a field (rows, n, 3,
-        C), over the fitted rows; known: (S - rows, n, 3) its first column on the other ones."""
+        """Products of the static part's basis and a field (rows, n, 3, C), fold by fold.
+
+        Returns (F, n, 3, C) over the fitted rows of each fold. known: (S - rows, n, 3) the field's
+        first column on the rows that are never held out.
+        """
         flat = field.reshape(self.rows, -1)
         parts = [self.features[rows].T @ flat[rows] for rows in self.held]
         parts = [part.reshape(-1, *field.shape[1:]) for part in parts]
@@ -142,7 +145,7 @@ class Split:
         return answer
 
     def shrunk(self, turned: np.ndarray, number: int, level: int) -> np.ndarray:
-        """The same of a fold over the ridge of a level: the static part's coefficients."""
+        """Coefficients of a fold's static part: products as of `turned` over a level's ridge."""
         answer = np.empty_like(turned)
         for basis in self.bases[number]:
             ridge = self.ridges[level, basis.points]
@@ -184,7 +187,7 @@ class CrossValidation:
 
     @classmethod
     def on(cls, split: Split, sensitivities: np.ndarray) -> "CrossValidation":
-        """The same with sensitivities (rows, n, 3, K) on a split."""
+        """The cross-validation of sensitivities (rows, n, 3, K) on a split."""
         first = split.residual[: split.rows, ..., None]
         both = np.concatenate([first, _masked(split, sensitivities)], axis=3)
         known = split.residual[split.rows :]
@@ -194,7 +197,7 @@ class CrossValidation:
         return cls(split, both, grams, held_out, turned)
 
     def extended(self, sensitivities: np.ndarray) -> "CrossValidation":
-        """The same with further sensitivities (rows, n, 3, K') behind those that it has."""
+        """This cross-validation with further sensitivities (rows, n, 3, K') after its own."""
         more = _masked(self.split, sensitivities)
         both = np.concatenate([self.fields, more], axis=3)
         turned = self.split.turned(more)

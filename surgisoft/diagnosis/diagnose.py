@@ -282,8 +282,9 @@ def diagnose(
     reason = refit_reason(problem, refit)
     if both is not None and refit == "always":
         raise InputError(
-            "a change since recordings from before is not one that a network was fitted to: "
-            "expected --refit always without --before"
+            "--refit always looks for effects that the network has learned to imitate, but with "
+            "--before only the change since then is explained, which the network never saw; "
+            "leave out one of the two"
         )
     found, not_testable = findings_of(problem, report, without)
     result = replace(result_of(found), not_testable=not_testable)

@@ -1,4 +1,4 @@
-"""The term that is always there: the surrogate itself is off.
+"""Model discrepancy: the surrogate's own error, a term of every fit.
 
 A network that is slightly wrong looks like physics. Kennedy & O'Hagan (2001) therefore give the
 difference between model and reality a Gaussian process of its own, and Brynjarsdottir & O'Hagan

@@ -19,7 +19,7 @@ from surgisoft.diagnosis.statistics import block_interval, block_sums, cross_val
 LAG_S = 0.5
 """Low pass whose distance from the actuation is the axis `lag`, s; one of `TIMES_S`."""
 PAST_S = 15.0
-"""The same for the axis `past actuation`, s."""
+"""Low pass whose distance from the actuation is the axis `past actuation`, s; one of `TIMES_S`."""
 REVERSAL_WAY_SHARES = (0.05, 0.2, 0.6)
 """Ways after a reversal on which its trace may die out, shares of a chamber's range."""
 DWELL_TIMES_S = (1.0, 4.0, 16.0)
@@ -293,7 +293,7 @@ class AxisShare:
     static: bool
     """Whether it was evaluated alone, not beyond the actuation."""
     profiles: tuple[Profile, ...] = ()
-    """The same over the values of each column."""
+    """Error and bias over the values of each column."""
 
     @property
     def clear(self) -> bool:

@@ -147,7 +147,7 @@ def improve(
     fitted together with the whole network.
     """
     if most_effects < 1:
-        raise InputError(f"at most {most_effects} effects: expected 1 or more")
+        raise InputError(f"largest number of effects is {most_effects}, expected 1 or more")
     begin = time.perf_counter()
     tell = progress or (lambda done: None)
     refuse_predictions(model)
@@ -222,7 +222,10 @@ def improve(
     tuned = retune(models[-1], problem)
     if added and tuned.kept:
         after = fall_of(problem, problem.with_model(tuned.model)).after
-        why = f"held-out motion rewards a re-tuned network by {100 * tuned.gain:.0f} %"
+        why = (
+            "a re-tuned network lowers the squared error on held-out motion by "
+            f"{100 * tuned.gain:.0f} %"
+        )
         models.append(tuned.model)
         note(Round("surrogate_undertrained", why, NETWORK, (), None, after))
     if models[-1] is not model:
@@ -285,11 +288,11 @@ def _doubt(name: str, fall: Fall, parameters: tuple[Parameter, ...]) -> str:
 def _idle(name: str, fall: Fall) -> str:
     """Why an effect that was fitted together with the network is not added; empty if it may be.
 
-    fall: from the network trained on as long without the effect to the network with it.
+    fall: from the network trained for as many epochs without the effect to the network with it.
     """
     if fall.claimed:
         return ""
-    return f"the network alone, trained on as long as with {name}, lowers the error as far"
+    return f"the network alone, trained for as many epochs as with {name}, lowers the error as far"
 
 
 def _step(current: Round, name: str, found: Diagnosis, error_mm: float) -> Round:

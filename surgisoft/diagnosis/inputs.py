@@ -1,4 +1,4 @@
-"""The inputs of every command: a model, recordings, and the identification problem they pose."""
+"""The inputs of every command: a model, recordings, the identification problem built from them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

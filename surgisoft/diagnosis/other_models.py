@@ -225,7 +225,7 @@ def notes_of(model: ArmModel) -> list[str]:
         )
     if isinstance(network, PredictedNetwork) and not has_slope(model):
         notes.append(
-            f"{network.name}: a function of the actuation and its past gives back "
+            f"{network.name}: a function of the actuation and its past reproduces "
             f"{100 * network.reproduced:.0f} % of the predicted motion, expected at least "
             f"{100 * LEAST_REPRODUCED:.0f} %: effects on the actuation and the set-up of its "
             "channels cannot be judged from predictions; give the model as a callable"
@@ -241,7 +241,9 @@ def polynomial_of(recordings: Sequence[Recording], spec: ArmSpec, name: str) -> 
     """
     history = history_of(list(recordings), spec.actuation)
     if history.predicted is None:
-        raise InputError(f"{name}: no predictions beside the recordings; name their files")
+        raise InputError(
+            f"{name}: the recordings have no predicted key points; name the files of predictions"
+        )
     target = history.rows(history.predicted).double().numpy()
     step = max(1, -(-len(target) // FIT_ROWS))
     block = blocks(history, np.full(len(target), True), step, least_blocks=1)
@@ -270,7 +272,9 @@ def polynomial_of(recordings: Sequence[Recording], spec: ArmSpec, name: str) -> 
             if best is None or left < best[0]:
                 best = (left, degree, ridge)
     if best is None:
-        raise InputError(f"{name}: no rows of predictions")
+        raise InputError(
+            f"{name}: no rows of predictions, expected one for each row of the recordings"
+        )
     left, degree, ridge = best
     exponents = powers(spec.chambers, degree)
     solved = _ridge(_columns(x, past, exponents), y, ridge)[: len(exponents)]

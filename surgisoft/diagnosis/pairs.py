@@ -58,8 +58,8 @@ ALIKE = MOTION_ALIKE / 2
 (root mean square over the past, any chamber): the one up to which two blocks show the same motion.
 The difference that remains is corrected by the model."""
 EXACT = ALIKE / 10
-"""The same in exact repeats, as of one protocol by its commands: the model's correction is then too
-small for its error to matter."""
+"""Largest difference of the actuation, as a share of its range, in exact repeats, as of one
+protocol by its commands: the model's correction is then too small for its error to matter."""
 ALIKE_NOISES = 4.0
 """Or: so many standard deviations of the actuation's noise in both recordings."""
 ALIKE_NOW = 2.0
@@ -957,14 +957,6 @@ class BeforeAfter:
             after_mm=self.pairs.after_mm[rows],
             explained_mm=explained_mm,
         )
-
-    def with_held_out_pairs(self) -> "BeforeAfter":
-        """These recordings; through the model where too few held-out rows have a partner."""
-        shown = np.isfinite(self.plain.measured_mm).all(2).any(1) & self.plain.held_out
-        both = shown & self.pairs.paired
-        if not self.used or both.sum() >= LEAST_SHARE * shown.sum():
-            return self
-        return replace(self, table=self.plain, used=False)
 
     @property
     def change(self) -> Change:

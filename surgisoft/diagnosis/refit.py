@@ -39,7 +39,7 @@ from surgisoft.diagnosis.statistics import (
 )
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.progress import Progress, silent
-from surgisoft.surrogate.effects import Memoryless, known_effects
+from surgisoft.surrogate.effects import Memoryless, Stage, known_effects
 from surgisoft.surrogate.model import ArmModel, Validation
 from surgisoft.surrogate.training import Data, JointTraining, train_jointly
 from surgisoft.workers import torch_threads, workers
@@ -98,7 +98,8 @@ class RefitCriteria:
     tie_of_gain: float = 0.02
     """Difference of two gains, as a share of the better one, up to which they are alike."""
     tie_of_left: float = 0.3
-    """The same as a share of what the better one leaves; the smaller of both counts."""
+    """Difference of two gains, as a share of what the better one leaves, up to which they are
+    alike; the smaller of both limits counts."""
     most_confidence: float = 0.81
     """Most confidence where others do about as well: of 21 ambiguous statements on virtual robots
     17 were right about the first effect."""
@@ -117,7 +118,7 @@ class RefitCandidate:
     heldout_rmse_mm: float
     """Error on the rows that were left out, over all seeds, mm."""
     per_key_point_mm: tuple[float | None, ...]
-    """The same of each key point, base to tip, mm; None where it was never measured."""
+    """Error of each key point on those rows, base to tip, mm; None where it was never measured."""
     seeds_mm: tuple[float, ...]
     """Error of each seed on the part that it left out, mm."""
     rival_mm: float
@@ -155,7 +156,7 @@ class Refit:
     reason: str
     """Why it was done."""
     alone_mm: float
-    """Held-out error of the network, trained on as long as the finalists without an effect, mm."""
+    """Held-out error of the network without an effect, trained as long as the finalists, mm."""
     candidates: tuple[RefitCandidate, ...]
     """All effects that were tried, the best first."""
     winner: str | None
@@ -261,10 +262,16 @@ def reason_to_refit(problem: Problem) -> str:
     )
 
 
-LINE = "line_lag"
-"""Effect between a command and the pressure of a chamber. A first-order lag of the pressure and one
+LINE: Stage = "line"
+"""Stage between a command and the pressure of a chamber. A first-order lag of the pressure and one
 of the wall are the same operator on the actuation: where both do as well and the model's input is a
 command, which has passed a line in any case, the lag is that of the line."""
+
+
+def _of_line(effect: str) -> bool:
+    """Whether an effect acts between the command and the pressure."""
+    kind = known_effects().get(effect)
+    return kind is not None and kind.stage == LINE
 
 
 def can_hide(name: str) -> bool:
@@ -290,7 +297,7 @@ def hideable(problem: Problem, without: Iterable[str] = ()) -> tuple[list[str], 
             left[name] = "the model has it already, and it was fitted with the network"
         elif kind.stage not in ("line", "material"):
             left[name] = f"acts on the {kind.stage}, behind the network: the residuals decide"
-        elif name == LINE and problem.model.spec.actuation == "measured":
+        elif kind.stage == LINE and problem.model.spec.actuation == "measured":
             left[name] = (
                 "the model's input is the measured actuation, in which the line's lag is already: "
                 "a lag behind it is one of the wall; the residuals decide about a longer line"
@@ -725,7 +732,7 @@ def _decided(
         shares = win_shares(-np.stack([gains[best.effect], gains[other.effect]]))
         if best.gain - other.gain < tie or shares[0] < ASKED.win_share:
             competing.append(other)
-    line = [score for score in (best, *competing) if score.named and score.effect == LINE]
+    line = [score for score in (best, *competing) if score.named and _of_line(score.effect)]
     of_line = bool(line and competing and split.problem.model.spec.actuation == "commanded")
     if of_line:
         competing = [score for score in (best, *competing) if score is not line[0]]
@@ -748,7 +755,7 @@ class JointFit:
     model: ArmModel
     """The model with the effects; its validated error is that of the refit."""
     alone: ArmModel
-    """The given model, its network trained on as long without the effects that it lacked."""
+    """The given model, its network trained for as many epochs without the effects it lacked."""
     parameters: tuple[Parameter, ...]
     """The effects' parameters; intervals are not known, so their ends are the values."""
 

@@ -397,10 +397,10 @@ class Sealed:
         """The table of the training rows with the held-out rows in it, for `final_check`.
 
         Noise and all that a table of the training rows says of errors stay. A second call raises
-        ValueError: what was looked at twice was chosen by.
+        ValueError: data that were looked at before a choice are no longer held-out data.
         """
         if self._key_points_mm is None:
-            raise ValueError("the held-out rows were opened before; one check is all they are for")
+            raise ValueError("the held-out rows were used before; they allow one evaluation only")
         whole = np.concatenate(self._key_points_mm)
         measured = np.where(table.held_out[:, None, None], whole, table.measured_mm)
         self._key_points_mm = None

@@ -518,7 +518,7 @@ def exchanged(selection: ModelSelection, named: list[Score]) -> list[Score]:
 
 
 def _in_order(selection: ModelSelection, named: list[Score]) -> list[Score]:
-    """The same effects, the one that would be missed most first, each on top of those before."""
+    """The named effects, most important first, each on top of those before it."""
     if len(named) < 2:
         return named
 

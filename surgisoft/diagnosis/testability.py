@@ -23,7 +23,7 @@ all; at the plausible end of its amplitudes less than what stands out from the n
 the model's predictions change with the actuation."""
 
 REASONS = {
-    "no_motion": "steady-state samples cannot show what is over when the arm has stopped; record "
+    "no_motion": "steady-state samples cannot show what ends when the arm stops; record "
     "it in motion",
     "no_reversals": "without inner reversals of the actuation its loops are a function of the "
     "actuation; record ramps that turn back at different levels",

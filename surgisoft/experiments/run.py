@@ -99,7 +99,9 @@ def open_results(spec: Experiment, folder: Path, resume: bool = False, force: bo
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         if not there:
-            raise InputError(f"{folder}: already there and no results; choose another folder")
+            raise InputError(
+                f"{folder}: exists and holds no results of an experiment; choose another folder"
+            )
         if not force:
             raise InputError(
                 f"{folder}: results are already there; --resume continues them, "

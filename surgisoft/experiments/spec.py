@@ -24,8 +24,8 @@ from surgisoft.config import (
 )
 from surgisoft.errors import InputError
 from surgisoft.scene.spec import SCENES, Length, Point
-from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.registry import TASKS, spec_of, with_present_names
+from surgisoft.tasks.spec import TaskSpec
 
 FORMAT = 1
 """Version of the file's format."""

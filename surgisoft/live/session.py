@@ -72,7 +72,8 @@ to 4 gives 10 to 21."""
 ANOTHER_ARM_SHARE = 0.01
 """Least error over the arm's length that counts as that of another arm [-]."""
 UNVALIDATED_SHARE = 0.05
-"""The same for a model that was never validated [-]."""
+"""Least error over the arm's length that counts as that of another arm where the model was never
+validated [-]."""
 SUSPICIOUS = 2.0
 """Error in the reference over the model's validated error from which on it is warned of."""
 LEAD_IN_S = 60.0
@@ -469,7 +470,7 @@ class _Session:
             if config is None and task == folder.config["task"]:
                 config = folder.plan().task_config
         if task is None:
-            raise InputError(f"--task is missing: one of {', '.join(sorted(TASKS))}")
+            raise InputError(f"--task is missing; expected one of {', '.join(sorted(TASKS))}")
         if len(spec_of(task).agents) != 1:
             raise InputError(
                 f"task '{task}' has the arms {', '.join(spec_of(task).agents)}, and a rig has one; "
@@ -722,9 +723,9 @@ class _Session:
         rmse = self.model.validation.rmse_mm
         if rmse is not None and detector.reference_mm > SUSPICIOUS * rmse:
             self.on_warning(
-                f"the model's error in the reference is {detector.reference_mm:.3f} mm, validated "
-                f"were {rmse:.3f} mm: the arm had changed before, or the model is that of another "
-                "arm; later changes are found, this one is not"
+                f"the model's error in the reference is {detector.reference_mm:.3f} mm, its "
+                f"validated error {rmse:.3f} mm: the arm had changed before, or the model is that "
+                "of another arm; later changes are found, this one is not"
             )
 
     # Ending ------------------------------------------------------------------------------------

@@ -350,18 +350,25 @@ def main(arguments: list[str] | None = None) -> int:
         "with a simulated rig behind them.",
     )
     parser.add_argument(
-        "--rig", default="virtual", metavar="NAME[:option=value,...]", help="simulated rig"
-    )
-    parser.add_argument("--speed", type=float, default=1.0, help="factor on real time")
-    parser.add_argument(
-        "--mocap", choices=("json", "natnet3", "natnet4"), default="json", help="the stream"
+        "--rig", default="virtual", metavar="NAME[:option=value,...]", help="the simulated rig"
     )
     parser.add_argument(
-        "--mocap-port", type=int, default=0, metavar="PORT", help="its port (0: a free one)"
+        "--speed", type=float, default=1.0, help="how many times faster than real time"
     )
     parser.add_argument(
-        "--link", metavar="PATH", help="also make the port known by this name (a symbolic link)"
+        "--mocap",
+        choices=("json", "natnet3", "natnet4"),
+        default="json",
+        help="format of the motion capture stream",
     )
+    parser.add_argument(
+        "--mocap-port",
+        type=int,
+        default=0,
+        metavar="PORT",
+        help="UDP port of the stream (0: a free one)",
+    )
+    parser.add_argument("--link", metavar="PATH", help="symbolic link to make to the serial port")
     given = parser.parse_args(arguments)
     version = {"json": None, "natnet3": (3, 1), "natnet4": (4, 1)}[given.mocap]
     over = threading.Event()

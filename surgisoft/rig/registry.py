@@ -345,7 +345,7 @@ def _object(name: str) -> Any:
         ) from error
     for part in path.split("."):
         if not hasattr(found, part):
-            raise InputError(f"rig '{name}': '{module_name}' has no '{path}'")
+            raise InputError(f"rig '{name}': '{module_name}' has no '{path}'; correct the name")
         found = getattr(found, part)
     return found
 

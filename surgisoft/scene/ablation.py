@@ -430,7 +430,8 @@ def _sweep_to(
 ):
     """One environment's sweep since the last place of its beam, as in `AblationMap.advance`.
 
-    point, aim (1, 3); writes began, ended, middle (1, 3) and energy (1,), and renews what is last.
+    point, aim (1, 3); writes began, ended, middle (1, 3) and energy (1,), and
+    sets last_point, last_aim and last_on to the present.
     """
     total = np.float32(0.0)
     for i in range(3):

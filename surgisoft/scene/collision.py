@@ -635,7 +635,7 @@ class GuidedChecker:
     compiled search first finds the segments that come nearest, so that FCL is asked about these and
     not about whole arms; it is not asked about what lies beyond the horizon, nor about bodies that
     a beam does not come near. Where FCL's distance differs from that of the search by more than
-    `GUIDE_SLACK_MM` FCL measures whole arms. The referee of evaluations is not guided.
+    `GUIDE_SLACK_MM` FCL measures whole arms. The exact checks of evaluations are not guided.
     """
 
     def __init__(

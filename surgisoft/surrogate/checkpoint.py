@@ -277,7 +277,9 @@ def _check_size(
     numbers = [n for n in arguments.values() if isinstance(n, int)]
     layers = arguments.get("hidden", [])
     if max(numbers, default=0) > MOST_UNITS or len(layers) > len(weights):
-        raise InputError(f"{folder}: the network of config.json is not that of the weights")
+        raise InputError(
+            f"{folder}: the network of config.json is not that of the weights; fit the model again"
+        )
     with torch.device("meta"):
         expected = network(low, high, **arguments).state_dict()
     found = {name.removeprefix("network."): value.shape for name, value in weights.items()}

@@ -411,14 +411,18 @@ def _check(train: History, valid: History | None, spec: ArmSpec, config: FitConf
     if config.prior not in PRIORS:
         raise unknown_name("prior mean", config.prior, PRIORS)
     if config.prior != "none" and config.network != "haw_nn":
-        raise InputError(f"a prior mean needs the network haw_nn, not {config.network}")
+        raise InputError(
+            f"a prior mean needs the network haw_nn, not {config.network}; change one of the two"
+        )
     if config.inputs not in INPUTS:
         raise unknown_name("inputs", config.inputs, INPUTS)
     known = known_effects()
     if not 1 <= config.members <= MOST_MEMBERS:
         raise InputError(f"{config.members} members, expected 1 to {MOST_MEMBERS}")
     if config.members > 1 and config.network != "haw_nn":
-        raise InputError(f"an ensemble needs the network haw_nn, not {config.network}")
+        raise InputError(
+            f"an ensemble needs the network haw_nn, not {config.network}; change one of the two"
+        )
     for name in config.effects:
         if name == AUTO:
             continue

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, clearance
+from surgisoft.tasks.base import Signal, TaskState, clearance
 from surgisoft.tasks.laser_supervision import completed, laser_experiment
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -28,6 +28,7 @@ from surgisoft.tasks.laser_work import (
     dose,
 )
 from surgisoft.tasks.observations import Block, ObservationBlocks
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.supervision import Condition
 from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from surgisoft.errors import InputError
 from surgisoft.tasks.observations import OBSERVATION_LIMIT, ObservationBlocks
-from surgisoft.tasks.supervision import BEAMLESS, ExperimentTask
 from surgisoft.tasks.world.pytree import TensorDataclass, rows, with_rows
 from surgisoft.tasks.world.random_streams import Stream, streams
 from surgisoft.tasks.world.scene import BatchClearance, SceneState
@@ -168,27 +167,6 @@ class LoneEpisode(Protocol):
     @property
     def state(self) -> TaskState:
         """A copy of the present state."""
-
-
-@dataclass(frozen=True)
-class TaskSpec:
-    """Registry entry of a task: how to build it, and its defaults."""
-
-    build: Any
-    """Function that builds the task: build(config, device) -> Task."""
-    config: Any
-    """Default configuration: a frozen dataclass."""
-    agents: tuple[str, ...]
-    """Names of the task's agents."""
-    preset: Mapping[str, Any] = field(default_factory=dict)
-    """Fields of `agents.presets.Preset` in which the task's `fast` preset differs."""
-    training_steps: int | None = None
-    """Environment steps of a training run with the `fast` preset; None: the paper's 20 million."""
-    experiment: ExperimentTask = BEAMLESS
-    """What experiments need to know of it."""
-    success_rule: Callable[[Any], str] | None = None
-    """(config) -> what an episode needs to be a success, in words; None: the task has no success.
-    """
 
 
 def term_names(weights: Any) -> list[str]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import unknown_name
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState
+from surgisoft.tasks.base import Signal, TaskState
 from surgisoft.tasks.laser_supervision import laser_experiment
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -25,6 +25,7 @@ from surgisoft.tasks.laser_work import (
     check_config,
 )
 from surgisoft.tasks.observations import Block, ObservationBlocks
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.respiration import OrganMotion, Respiration

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from surgisoft.tasks.base import TaskSpec, TaskState
+from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -20,6 +20,7 @@ from surgisoft.tasks.laser_work import (
     check_config,
 )
 from surgisoft.tasks.lone_ring import LoneRing
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.random_streams import Stream
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState
+from surgisoft.tasks.base import TaskState
 from surgisoft.tasks.laser_supervision import laser_experiment
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -24,6 +24,7 @@ from surgisoft.tasks.laser_work import (
     RouteTask,
     check_config,
 )
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.routes import RouteProgress, draw_route, route_steps
 from surgisoft.tasks.world.random_streams import Stream
 from surgisoft.tasks.world.treatment import ContourPlan, ContourSpec

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, check_weights, clearance, weighted
+from surgisoft.tasks.base import Signal, TaskState, check_weights, clearance, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, joined
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.waypoints import (
     WaypointSequence,
     draw_sequence,

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskSpec, TaskState, clearance
+from surgisoft.tasks.base import FEED_SIGNAL, Signal, TaskState, clearance
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT
 from surgisoft.tasks.laser_work import (
     AGENTS,
@@ -30,6 +30,7 @@ from surgisoft.tasks.laser_work import (
     check_config,
 )
 from surgisoft.tasks.observations import Block, ObservationBlocks
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import RingCut, draw_cut
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import Stream
@@ -210,7 +211,7 @@ class KeyholeAblation(RingTask[PortCut]):
         actions: Mapping[str, Tensor],
         fired: Tensor | None = None,
     ) -> TaskState[PortCut]:
-        """As `OneLaserTask.advance`; counts the steps in which a body is at the rim."""
+        """Advance one step, and count the steps in which a body is at the rim."""
         after = super().advance(state, actions, fired)
         near = torch.stack([*self.rims_mm(after).values()]).amin(0) < self.config.rim_mm
         return replace(after, goal=replace(after.goal, at_rim=after.goal.at_rim + near))

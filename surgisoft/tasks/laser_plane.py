@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.track import level_world, points_at_start
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.world import WorldConfig

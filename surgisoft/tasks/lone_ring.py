@@ -1,4 +1,4 @@
-"""One episode of `circle_ablation`, advanced in compiled loops and kept arrays.
+"""One episode of `circle_ablation`, advanced by compiled loops in preallocated arrays.
 
 `CircleAblation` in a batch of one makes some hundred tensor operations a step, each of which costs
 more than its arithmetic. `LoneRing` gives the same numbers, to rounding, for the one environment of
@@ -10,19 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from surgisoft.compiled import compiled
 from surgisoft.tasks.base import TaskState
-from surgisoft.tasks.laser_work import ENDOSCOPE, LASER
+from surgisoft.tasks.laser_work import ENDOSCOPE, LASER, RingTask
 from surgisoft.tasks.observations import OBSERVATION_LIMIT
+from surgisoft.tasks.trajectories.closed_path import RingCut
 from surgisoft.tasks.world.world import LoneWorld
-
-if TYPE_CHECKING:
-    from surgisoft.tasks.circle_ablation import CircleAblation
 
 SHAPE_MM, APART_MM = 50.0, 50.0
 """Scales of the blocks `shape` and `apart`, see `observations.SHAPE` and `laser_work.APART`."""
@@ -35,7 +32,7 @@ TERMS = ("far", "aim", "fine", "cut", "contact", "look", "view")
 class LoneRing:
     """One episode of `circle_ablation`: what the adapter of a single environment asks for."""
 
-    def __init__(self, task: CircleAblation, state: TaskState, world: LoneWorld):
+    def __init__(self, task: RingTask[RingCut], state: TaskState, world: LoneWorld):
         self.task, self.world, self._goal = task, world, state.goal
         config, spec = task.config, task.spec
         lesion = state.world.scene.lesion
@@ -95,7 +92,7 @@ class LoneRing:
         self._find()
 
     @classmethod
-    def of(cls, task: CircleAblation, state: TaskState) -> LoneRing | None:
+    def of(cls, task: RingTask[RingCut], state: TaskState) -> LoneRing | None:
         """The episode of a state of one environment; None where only the task can advance it."""
         world = LoneWorld.of(task.world, state.world)
         return None if world is None else cls(task, state, world)

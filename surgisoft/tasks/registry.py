@@ -17,13 +17,14 @@ import torch
 from surgisoft.config import Where, from_table, merged, read_toml, to_table
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.tasks.area_ablation import AREA_ABLATION
-from surgisoft.tasks.base import DocumentedTask, Task, TaskSpec
+from surgisoft.tasks.base import DocumentedTask, Task
 from surgisoft.tasks.breathing_ablation import BREATHING_ABLATION
 from surgisoft.tasks.circle_ablation import CIRCLE_ABLATION
 from surgisoft.tasks.contour_ablation import CONTOUR_ABLATION
 from surgisoft.tasks.keyhole import KEYHOLE
 from surgisoft.tasks.keyhole_ablation import KEYHOLE_ABLATION
 from surgisoft.tasks.laser_plane import LASER_PLANE
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.track import TRACK_CIRCLE, TRACK_SQUARE
 from surgisoft.tasks.track_body import TRACK_BODY
 from surgisoft.tasks.two_laser_ring import TWO_LASER_RING

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from surgisoft.tasks.base import Task, TaskState
 from surgisoft.tasks.inverse_kinematics import Pointing
-
-if TYPE_CHECKING:
-    from surgisoft.tasks.base import Task, TaskState
 
 Row = dict[str, Any]
 """One episode's results: name -> number or text; None where a number does not apply."""

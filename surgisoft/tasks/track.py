@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from surgisoft.tasks.base import TaskSpec
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS, Follow, FollowConfig
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.world.arm import Randomisation
 from surgisoft.tasks.world.random_streams import streams
 from surgisoft.tasks.world.world import World, WorldConfig, named_arm, single_arm_world

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import TaskSpec, TaskState, check_weights, weighted
+from surgisoft.tasks.base import TaskState, check_weights, weighted
 from surgisoft.tasks.inverse_kinematics import action_towards
 from surgisoft.tasks.observations import (
     Block,
@@ -22,6 +22,7 @@ from surgisoft.tasks.observations import (
     pressure_blocks,
 )
 from surgisoft.tasks.path_following import FOLLOW_PRESET, FOLLOW_STEPS
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.track import level_world
 from surgisoft.tasks.world.arm import Arm
 from surgisoft.tasks.world.random_streams import Stream

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.errors import InputError
-from surgisoft.tasks.base import Signal, TaskSpec, TaskState, clearance, term_names, weighted
+from surgisoft.tasks.base import Signal, TaskState, clearance, term_names, weighted
 from surgisoft.tasks.laser_supervision import LASER_EXPERIMENT, LaserSupervision
 from surgisoft.tasks.laser_work import (
     BEAM_ERROR,
@@ -35,6 +35,7 @@ from surgisoft.tasks.laser_work import (
     view,
 )
 from surgisoft.tasks.observations import TIME, Block, ObservationBlocks, body_blocks, numbered
+from surgisoft.tasks.spec import TaskSpec
 from surgisoft.tasks.trajectories.closed_path import draw_traversal, point_on_closed
 from surgisoft.tasks.world.arm import ArmPart
 from surgisoft.tasks.world.random_streams import Stream

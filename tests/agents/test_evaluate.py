@@ -82,7 +82,7 @@ def test_each_measure_has_its_summary():
         np.testing.assert_allclose(table[name], values, rtol=1e-6, err_msg=name)
 
 
-def test_the_referee_overrules_the_batched_path():
+def test_the_exact_checker_overrules_the_batched_path():
     played = ablation_rollout(
         success=[[0.0, 0.0, 1.0], [0.0, 1.0, NAN]],
         clearance_mm=[[5.0, 2.0, 3.0], [4.0, 6.0, NAN]],

@@ -1,4 +1,4 @@
-"""The referee on contacts that are provoked, and on bodies whose distances are known."""
+"""Exact checks of contacts that are provoked, and of bodies whose distances are known."""
 
 from dataclasses import replace
 
@@ -39,11 +39,11 @@ def at(state, line_mm):
 
 
 def looked_at(task, *states):
-    referee = ExactChecks(task)
+    watch = ExactChecks(task)
     live = torch.ones(1, dtype=torch.bool)
     for state in states:
-        referee(Instant(torch.tensor([7]), state, None, None, live))
-    (check,) = referee.checks()
+        watch(Instant(torch.tensor([7]), state, None, None, live))
+    (check,) = watch.checks()
     return check
 
 
@@ -190,7 +190,7 @@ def test_fcl_audits_what_it_need_not_see(task, monkeypatch):
     assert check.contact_differs >= 3
 
 
-def test_nothing_around_needs_no_referee():
+def test_nothing_around_needs_no_exact_checks():
     assert not has_obstacles(make_task("track_circle"))
 
 

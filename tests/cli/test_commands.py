@@ -199,7 +199,8 @@ def test_old_names_of_options_still_work_and_are_not_shown(tmp_path, capsys):
     assert "--observer-gain" in capsys.readouterr().err
     shown = {name for _, option in _options() for name in option.opts}
     assert {"--robot-seed", "--trial", "--observer-gain"} <= shown
-    assert not {"--specimen", "--take", "--trust"} & shown
+    assert not {"--specimen", "--take", "--trust", "--referee"} & shown
+    assert spread(["evaluate", "scripted", "--no-referee"])[-1] == "--no-exact-checks"
     # A study has options of its own.
     assert spread(["benchmark", "x", "--specimen", "1"])[2] == "--specimen"
 

@@ -11,6 +11,7 @@ from surgisoft.cli import run, with_commands
 from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import make_protocol
 from surgisoft.measurement.recordings import save_recording
+from surgisoft.measurement.recordings.lerobot import save_lerobot
 from surgisoft.rig import VirtualRig
 from surgisoft.scene.meshio import write_ply
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
@@ -43,8 +44,6 @@ policy = "scripted"
 
 NO_MODEL = {
     "demo": "shows the default arm",
-    "collect": "makes a recording of the virtual rig",
-    "import": "reads raw files",
     "recording": "reads recordings",
     "rig list": "lists rigs and their options",
     "replay": "shows what was recorded",
@@ -53,6 +52,9 @@ NO_MODEL = {
 """Commands that open no arm model, and why."""
 
 COMMANDS = {
+    "collect": "collect few.csv --rig tests.rig.own_rig:OwnRig:port=x "
+    "--arm arm --preflight -o few.parquet",
+    "import": "import dataset -o imported.parquet --model arm",
     "compare": "compare arm bench.parquet",
     "diagnose": "diagnose arm bench.parquet",
     "amend": "amend arm --effect creep --data bench.parquet -o amended --anyway",
@@ -91,6 +93,8 @@ def lab(tmp_path_factory):
     rig = VirtualRig(0, take=7)
     recording = rig.record(make_protocol("mixed", rig.limits, 1200, seed=2))[0]
     save_recording(recording, folder / "bench.parquet")
+    save_lerobot([recording], folder / "dataset", "Drive the soft arm.", None)
+    (folder / "few.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,0,0,0\n1,5,0,0\n")
     write_ply(ball(60.0, 2), folder / "ball.ply")
     shutil.copytree(ROOT / "scenes" / "phantom_liver", folder / "scene")
     scene = (folder / "scene" / "scene.toml").read_text()

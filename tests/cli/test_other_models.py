@@ -69,7 +69,7 @@ BAD = {
     "compare default bench.parquet --model-error 0.5": "only with a callable",
     "compare my_arm.py:arm bench.parquet --model-error -1": "more than 0 mm",
     "amend lab.csv --effect creep --data bench.parquet -o new": "cannot be amended",
-    "next-experiment lab.csv -o new.csv": "belong to recordings",
+    "next-experiment lab.csv -o new.csv": "predictions are given without recordings",
     "amend my_arm.py:arm --effect creep --data bench.parquet -o new --refit always": "no network",
     "train --task track_circle --arm bad.py:flat -o new": "does not state its range",
 }

@@ -114,7 +114,10 @@ def test_a_reader_that_names_more_columns_than_its_cells_have(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("broken", "reader 'broken' of npy_reader:BROKEN: is no Reader; expected an instance"),
+        (
+            "broken",
+            "reader 'broken' of npy_reader:BROKEN: is a str, expected an instance of Reader",
+        ),
         ("absent", "reader 'absent' of npy_reader_absent:READER: cannot be loaded"),
         ("npz", f"expected one of auto, {', '.join(READERS)}, npy, broken, absent"),
     ],

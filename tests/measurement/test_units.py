@@ -2,8 +2,8 @@
 
 import pytest
 
-from surgisoft.measurement.importing.units import SECONDS_PER, factor
 from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.measurement.units import SECONDS_PER, factor
 
 VALUES = [
     ("in", "mm", 25.4),

@@ -214,8 +214,14 @@ def test_without_the_body_of_the_frame_nothing_is_known(tmp_path):
     (tmp_path / "bench.toml").write_text(MAP)
     read = KeyPoints(load_bench_map(tmp_path / "bench.toml"))
     lost = frame_of({"tip": [1, 2, 3], "m1": [0, 0, 1], "m2": [0, 1, 0], "m3": [1, 0, 0]})
-    lost.bodies["base"] = Body(np.full(3, np.nan), STILL)
-    assert np.isnan(read(lost)).all()
+    unknown = np.full(3, np.nan)
+    for place, turn in (
+        (unknown, STILL),
+        (np.zeros(3), np.zeros(4)),
+        (np.zeros(3), STILL * np.nan),
+    ):
+        lost.bodies["base"] = Body(place, turn)
+        assert np.isnan(read(lost)).all()
     with pytest.raises(InputError, match=r"no 'm1' among the streamed names \(base, tip\)"):
         read.require(frame_of({"tip": [1, 2, 3]}))
 

@@ -437,43 +437,10 @@ class Isolability:
     minutes: float
     """Length of the schedule, minutes."""
 
-    @property
-    def log_evidence_per_minute(self) -> np.ndarray:
-        """(E, E) nats a minute of the schedule."""
-        return self.log_evidence / max(self.minutes, 1e-9)
-
     def pair(self, a: str, b: str) -> float:
         """Expected chance to tell two effects apart, whichever of them is true: the lesser one."""
         i, j = self.names.index(a), self.names.index(b)
         return float(min(self.confidence[i, j], self.confidence[j, i]))
-
-
-def ambiguous_sets(result: Isolability, sure: float = SURE) -> list[tuple[str, ...]]:
-    """The sets of effects that a schedule cannot tell apart: each effect with all its competing
-    effects.
-
-    Two effects are competing effects where the chance to tell them apart stays below `sure`; a set
-    is the largest one in which each two are.
-    """
-    near = np.minimum(result.confidence, result.confidence.T) < sure
-    np.fill_diagonal(near, False)
-    cliques: list[set[int]] = []
-    _cliques(near, set(), set(range(len(near))), set(), cliques)
-    answer = [tuple(result.names[k] for k in sorted(each)) for each in cliques if len(each) > 1]
-    return sorted(answer, key=lambda names: (-len(names), names))
-
-
-def _cliques(near, chosen: set, open_: set, done: set, answer: list) -> None:
-    """Largest sets in which all are near each other (Bron & Kerbosch 1973, with a pivot)."""
-    if not open_ and not done:
-        answer.append(set(chosen))
-        return
-    pivot = max(open_ | done, key=lambda k: int(near[k, list(open_)].sum()) if open_ else 0)
-    for k in [k for k in open_ if not near[pivot, k]]:
-        neighbours = set(np.flatnonzero(near[k]).tolist())
-        _cliques(near, chosen | {k}, open_ & neighbours, done & neighbours, answer)
-        open_ = open_ - {k}
-        done = done | {k}
 
 
 def isolability(

@@ -664,7 +664,8 @@ def next_experiment(
     if not given:
         if is_predictions_file(model) or predictions is not None:
             raise InputError(
-                "predictions belong to recordings: expected the recordings that they were made for"
+                "predictions are given without recordings; expected the recordings that they were "
+                "made for"
             )
         if callable(model) and not isinstance(model, ArmModel):
             model = arm_by_itself(given_callable(model))

@@ -54,13 +54,13 @@ class Parameter:
     low: float | list
     """Lower end of the 95 % interval, shaped as the value."""
     high: float | list
-    """Upper end of it."""
+    """Upper end of the 95 % interval, shaped as the value."""
     unit: str
     """Unit; empty for a share."""
     plausible: bool
     """Whether the value lies in its plausible range."""
     plausible_range: tuple[float, float]
-    """That range."""
+    """Lowest and highest plausible value."""
     source: str
     """Where the range comes from."""
 

@@ -1,4 +1,4 @@
-"""Re-tune the network's last layer with the effects in place, as far as held-out motion rewards it.
+"""Re-tune the network's last layer behind the effects where that lowers the held-out error.
 
 A network that was fitted without an effect has taken some of it for its own shape. The last layer
 is linear, so its best change D is a ridge regression in the activations h of the layer before,

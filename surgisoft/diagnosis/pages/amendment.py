@@ -37,8 +37,6 @@ HOW = (
     "Intervals are 95 %, from a bootstrap of blocks of time, because consecutive rows have "
     "correlated errors."
 )
-OUTSIDE = ": outside"
-"""Mark of a value outside its plausible range."""
 POINTS = 600
 """Points of a line in a chart."""
 

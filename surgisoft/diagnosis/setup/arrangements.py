@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from surgisoft.diagnosis.setup.sample import Arrangement, Sample
-from surgisoft.measurement.importing.units import other_units
+from surgisoft.measurement.units import other_units
 from surgisoft.surrogate.arm import ArmSpec
 from surgisoft.surrogate.history import pack
 from surgisoft.surrogate.model import ArmModel

@@ -9,9 +9,9 @@ import tomli_w
 from surgisoft.diagnosis.setup.channels import frozen_points
 from surgisoft.diagnosis.setup.sample import Arrangement
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.rows import without_frozen
 from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.columns import MM_PER
+from surgisoft.measurement.recordings.quality import without_frozen
 
 LEAST_ALIKE = 0.05
 """By how much better a mended command must follow the mended measurement than the one as recorded,

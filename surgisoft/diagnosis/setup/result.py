@@ -53,7 +53,7 @@ class SetupResult:
     mending: str
     """Lines of the import's map that mend it, or what else to do."""
     alternative_mendings: tuple[str, ...]
-    """The same for each alternative."""
+    """Lines of the import's map that mend it, or what else to do, by each alternative."""
     how_to_tell: str
     """How to find out which explanation is right; empty where there is one."""
     before_mm: float

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.residuals import blocks, folds, held_out_rows
-from surgisoft.measurement.histories import actuation_of, history_of
+from surgisoft.measurement.histories import history_of
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
@@ -179,11 +179,6 @@ def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample
         block=np.concatenate(kept),
         timed=all(recording.kind == "continuous" for recording in recordings),
     )
-
-
-def recorded_actuation(recordings: list[Recording], model: ArmModel) -> np.ndarray:
-    """(N, m) actuation of all rows as the model takes it, in the recordings' unit."""
-    return np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings])
 
 
 def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.ndarray:

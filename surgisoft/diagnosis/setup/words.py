@@ -14,8 +14,8 @@ from surgisoft.diagnosis.setup.search import Fitted, Kind
 NEAR_AXIS_RAD = 0.1
 """An axis of rotation is named x, y or z up to this angle, rad."""
 LEAST_SHIFT_SD, LEAST_SHIFT_MM = 3.0, 0.5
-"""A shift of the frame is told beside a turn from so many standard errors on, and from so many mm
-on: less is no part of the fault."""
+"""Least shift of a turned frame that is reported as part of the fault: in standard errors, and in
+mm."""
 UNIT_NAMES = {10.0: "cm", 1000.0: "m", 25.4: "inches"}
 """Names of units of length by their millimetres."""
 
@@ -189,8 +189,8 @@ def _mirrored_and_turned(rotation: np.ndarray) -> str:
     turn = rotation @ np.diag([-1.0, 1.0, 1.0])
     axis = _axis(turn)
     return (
-        f"mirrored (the sign of one axis is wrong), beside x turned by "
-        f"{np.degrees(float(angle(turn))):.1f} deg about {_axis_name(axis)}"
+        f"mirrored (the sign of one axis is wrong; with x as that axis it is also turned by "
+        f"{np.degrees(float(angle(turn))):.1f} deg about {_axis_name(axis)})"
     )
 
 

@@ -9,7 +9,7 @@ from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import Column, FileRole, RawTable
 from surgisoft.measurement.importing.rotation import between
 from surgisoft.measurement.importing.spec import ImportMap
-from surgisoft.measurement.importing.units import SECONDS_PER
+from surgisoft.measurement.units import SECONDS_PER
 
 SAME_TIME_S = 1e-6
 """Times that differ by no more are the same [s]."""

@@ -30,8 +30,6 @@ from surgisoft.measurement.importing.rows import (
     point_numbers,
     run_numbers,
     tidy,
-    without_frozen,
-    without_spikes,
 )
 from surgisoft.measurement.importing.spec import (
     ActuationMap,
@@ -39,10 +37,11 @@ from surgisoft.measurement.importing.spec import (
     ImportMap,
 )
 from surgisoft.measurement.importing.timing import timing_notes
-from surgisoft.measurement.importing.units import factor
 from surgisoft.measurement.recordings import Recording
 from surgisoft.measurement.recordings.lerobot import load_lerobot
 from surgisoft.measurement.recordings.log import read_log
+from surgisoft.measurement.recordings.quality import without_frozen, without_spikes
+from surgisoft.measurement.units import factor
 
 _ENDINGS = (".gz", ".bz2", ".xz", ".csv", ".tsv", ".txt", ".dat", ".log", ".parquet")
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from surgisoft.config import POSITIVE, Rule, at_least, one_of
 from surgisoft.errors import InputError
-from surgisoft.measurement.importing.units import SECONDS_PER
 from surgisoft.measurement.tables import LARGEST, Cells, label, too_large
+from surgisoft.measurement.units import SECONDS_PER
 
 A_COLUMN = Rule(
     "a column's name or its number, counted from 1",

@@ -15,8 +15,6 @@ from surgisoft.measurement.importing.align import (
     without_holds,
 )
 from surgisoft.measurement.importing.spec import ImportMap
-from surgisoft.measurement.recordings import Recording
-from surgisoft.measurement.recordings.quality import frozen_channels, spikes
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,30 +203,3 @@ def _averaged(draft: Draft, notes: list[str]) -> Draft:
         commanded=None if draft.commanded is None else mean(draft.commanded),
         context=mean(draft.context),
     )
-
-
-def without_frozen(recording: Recording) -> tuple[Recording, list[str]]:
-    """The recording without the rows that repeat a frozen reading; the first of them stays."""
-    keep = np.ones(recording.samples, bool)
-    notes = []
-    for members, stretch in frozen_channels(recording):
-        keep[stretch.start + 1 : stretch.stop] = False
-        names = ", ".join(f"p{i + 1}" for i in members)
-        notes.append(
-            f"{names} frozen at {recording.t_s[stretch.start]:.3f} s of run "
-            f"{recording.run[stretch.start]}: {stretch.stop - stretch.start - 1} rows left out"
-        )
-    by_row = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
-    values = {name: getattr(recording, name) for name in (*by_row, "predicted_mm")}
-    return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None}), notes
-
-
-def without_spikes(recording: Recording) -> tuple[Recording, list[str]]:
-    """The recording with a key point missing where it jumps away and back within a few rows."""
-    away = spikes(recording)
-    if not away.any():
-        return recording, []
-    points = np.where(away[..., None], np.nan, recording.key_points_mm)
-    counts = ", ".join(f"k{j} {n}" for j, n in enumerate(away.sum(axis=0).tolist()) if n)
-    notes = [f"spikes of key points count as missing: {counts} of {len(away)} rows"]
-    return replace(recording, key_points_mm=points), notes

@@ -29,10 +29,10 @@ from surgisoft.measurement.importing.raw import TIME_UNIT, Column, FileRole
 from surgisoft.measurement.importing.readers import ADVICE, AUTO, NOT_READ, formats, reader
 from surgisoft.measurement.importing.ready_maps import READY_MAPS
 from surgisoft.measurement.importing.rotation import parse_rotation
-from surgisoft.measurement.importing.units import check_conversion
 from surgisoft.measurement.recordings import ArmInfo
 from surgisoft.measurement.recordings.columns import MM_PER
 from surgisoft.measurement.recordings.sidecar import GravityTable, RecordingTable, Sidecar
+from surgisoft.measurement.units import check_conversion
 
 
 def _not_empty(value: Any) -> bool:
@@ -322,9 +322,6 @@ class ContextMap:
     """Temperature of the room, degrees Celsius."""
     payload_g: Annotated[float | ContextSource, A_CONTEXT] | None = None
     """Known mass at the tip, g."""
-
-
-A_FILE = Rule("at least one table [file.NAME]", _not_empty)
 
 
 @dataclass(frozen=True, kw_only=True)

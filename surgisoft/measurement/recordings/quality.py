@@ -1,4 +1,4 @@
-"""Data-quality warnings of a recording: channels that froze and jumps in the marker data.
+"""Data quality of a recording: channels that froze and jumps in the marker data, found and removed.
 
 A frozen signal repeats one value bit for bit, for longer than it ever does otherwise, while other
 signals change. A jump is one step of a key point that neither the rows around it, nor the other
@@ -7,7 +7,7 @@ key point of theirs is compared with a smooth function of the actuation instead 
 before.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -441,3 +441,30 @@ def _about(recording: Recording) -> list[str]:
     }
     known = [f"{name} {value}" for name, value in stated.items() if value]
     return [f"  {'; '.join(known)}"] if known else []
+
+
+def without_frozen(recording: Recording) -> tuple[Recording, list[str]]:
+    """The recording without the rows that repeat a frozen reading; the first of them stays."""
+    keep = np.ones(recording.samples, bool)
+    notes = []
+    for members, stretch in frozen_channels(recording):
+        keep[stretch.start + 1 : stretch.stop] = False
+        names = ", ".join(f"p{i + 1}" for i in members)
+        notes.append(
+            f"{names} frozen at {recording.t_s[stretch.start]:.3f} s of run "
+            f"{recording.run[stretch.start]}: {stretch.stop - stretch.start - 1} rows left out"
+        )
+    by_row = ("t_s", "measured", "key_points_mm", "commanded", "run", "temp_C", "payload_g")
+    values = {name: getattr(recording, name) for name in (*by_row, "predicted_mm")}
+    return replace(recording, **{k: v[keep] for k, v in values.items() if v is not None}), notes
+
+
+def without_spikes(recording: Recording) -> tuple[Recording, list[str]]:
+    """The recording with a key point missing where it jumps away and back within a few rows."""
+    away = spikes(recording)
+    if not away.any():
+        return recording, []
+    points = np.where(away[..., None], np.nan, recording.key_points_mm)
+    counts = ", ".join(f"k{j} {n}" for j, n in enumerate(away.sum(axis=0).tolist()) if n)
+    notes = [f"spikes of key points count as missing: {counts} of {len(away)} rows"]
+    return replace(recording, key_points_mm=points), notes

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from surgisoft.config import Rule, from_table, read_toml
 from surgisoft.errors import InputError
@@ -144,7 +145,10 @@ class KeyPoints:
             body = frame.bodies.get(fixed.body)
             if body is None or not np.isfinite(body.position_mm).all():
                 return np.full_like(points, np.nan)
-            points = (points - body.position_mm) @ _matrix(body.rotation)
+            if not np.square(body.rotation).sum() > 0.0:  # also without an orientation: NaN
+                return np.full_like(points, np.nan)
+            turn = Rotation.from_quat(body.rotation).as_matrix()
+            points = (points - body.position_mm) @ turn
         return (points - np.array(fixed.origin_mm)) @ fixed.rotation
 
     def _unswapped(self, found: np.ndarray) -> np.ndarray:
@@ -161,15 +165,3 @@ class KeyPoints:
         if whole:
             self._last = ordered
         return ordered
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of a quaternion x, y, z, w of any length but 0."""
-    x, y, z, w = quaternion / max(float(np.linalg.norm(quaternion)), 1e-12)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

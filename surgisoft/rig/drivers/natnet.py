@@ -38,8 +38,6 @@ COMMAND_PORT = 1510
 """Port on which a server takes requests."""
 CONNECT, SERVERINFO, REQUEST_MODELDEF, MODELDEF, FRAMEOFDATA, KEEPALIVE = 0, 1, 4, 5, 7, 10
 """Kinds of messages."""
-UNRECOGNIZED = 100
-"""Kind of the answer to a request that the server does not know."""
 NAME_BYTES = 256
 """Length of names in SERVERINFO [bytes]."""
 TRACKED = 0x01

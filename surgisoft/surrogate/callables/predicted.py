@@ -41,7 +41,7 @@ class PredictedNetwork(nn.Module):
 
         low, high: (m,) range in the arm's unit; exponents: (F, m) of each term; coefficients:
         (F, n, 3) in mm; reproduced: share (0..1) of the squared motion that was predicted which P,
-        with the past of the actuation beside it, gives back on blocks left out of its fit.
+        with the past of the actuation beside it, reproduces on blocks left out of its fit.
         """
         super().__init__()
         self.name, self.key_points, self.reproduced = name, coefficients.shape[1], reproduced

@@ -7,6 +7,7 @@ default; `hypothesis_of` then also reads the class attributes that older user-de
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 from torch import Tensor
 
@@ -21,6 +22,10 @@ def all_together(some: list[Effect]) -> list[list[int]]:
 def no_combinations(some: list[Effect]) -> list[list[int]]:
     """No combination, for an effect of which several candidates at once make no sense."""
     return []
+
+
+MeasuredBody = Literal["", "gain", "load"]
+"""Ways in which an effect may act on a measured body, see `Hypothesis.measured_body`."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,10 @@ class Hypothesis:
     empty: the effect is no such load."""
     tip_mass: str = ""
     """Amplitude by which a mass at the tip acts, for an effect that is a load along gravity."""
+    measured_body: MeasuredBody = ""
+    """What the effect does to a body that was measured before a change: `gain` scales its whole
+    motion, `load` pulls it along gravity, at rest and in motion. Empty: it is tried on the
+    predicted body only."""
 
     def candidates(self, facts: ArmFacts, points: Tensor) -> list[Effect]:
         """Effects of zero amplitude to try on an arm whose model lacks the effect.

@@ -98,4 +98,5 @@ HYPOTHESIS = Hypothesis(
     absent_in="bare_tip",
     own_weight="body_sag",
     tip_mass="tip_sag",
+    measured_body="load",
 )

@@ -6,7 +6,6 @@ and a batch of N environments gives what N batches of one give. World frame, mm,
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -159,12 +158,6 @@ class World:
             )
             for name, mounted in arms.items()
         }
-
-    def with_arms(self, arms: Mapping[str, Arm]) -> World:
-        """Copy of the world with other arms, for example arms on the virtual rig."""
-        world = copy.copy(self)
-        world.arms = dict(arms)
-        return world
 
     def start(self, stream: Stream) -> WorldState:
         """Start an episode of the world for each of the (B,) random number streams."""

@@ -75,10 +75,14 @@ def reader(name: str) -> Reader:
         found = entry.load()
     except Exception as error:
         raise InputError(
-            f"reader '{name}' of {entry.value}: cannot be loaded ({type(error).__name__}: {error})"
+            f"reader '{name}' of {entry.value}: cannot be loaded "
+            f"({type(error).__name__}: {error}); correct or remove that package"
         ) from error
     if not isinstance(found, Reader):
-        raise InputError(f"reader '{name}' of {entry.value}: is no Reader; expected an instance")
+        raise InputError(
+            f"reader '{name}' of {entry.value}: is a {type(found).__name__}, expected an instance "
+            "of Reader (docs/recordings.md)"
+        )
     return found
 
 

@@ -35,7 +35,7 @@ def _read(path: Path, _: FileRole) -> RawTable:
             "pip install 'surgisoft[lab]'"
         )
     if not _is_c3d(path):
-        raise InputError(f"{path}: its first bytes are not those of a C3D file")
+        raise InputError(f"{path}: its first bytes are not those of a C3D file; export it again")
     facts, (values,) = unpacked(read_apart(__name__, path, "a C3D file"))
     cells = Arrays(path, facts["names"], values)
     return RawTable(
@@ -55,7 +55,7 @@ def as_bytes(path: Path) -> bytes:
     points = np.asarray(content["data"]["points"], np.float64)  # (4, n, T)
     frames = points.shape[2]
     if not frames:
-        raise InputError(f"{path}: no frame in it")
+        raise InputError(f"{path}: holds no frame, expected at least one; export it again")
     rate = float(content["header"]["points"]["frame_rate"])
     if not rate > 0.0:
         raise InputError(f"{path}: frame rate {rate:g} Hz, expected more than 0")

@@ -99,7 +99,7 @@ class Coupling(Memoryless):
         return [
             Quantity("linear_share", value_of(self.linear), "", -0.3, 0.5, wall),
             Quantity(f"{self._second}_share", value_of(second), "", -0.3, 0.5, wall),
-            Quantity("total_share", total, "", -0.2, 0.5, wall),
+            Quantity("total_share", total, "", 0.0, 0.5, "neighbours take push and give none"),
         ]
 
 

@@ -11,6 +11,12 @@ with B = 1 where one chamber alone is fully loaded; of four chambers, which stan
 ones bend nothing, and B^2 = (x_1 - x_3)^2 + (x_2 - x_4)^2. A mixes the
 chambers' loads into those of wall fibres (`fibre_matrix`): a chamber that bends the arm shortens
 the wall on the other side.
+
+In a symmetric section bending and stretch are apart, and each has a nonlinear law of its own (the
+moment-curvature law of a nonlinear beam, Antman 2005, ch. 4): with b the bending and e the stretch
+by the loads (`bend_and_stretch`),
+
+    x_eff = x - own e h(e^2) - bend b h(B^2).
 """
 
 import torch
@@ -26,7 +32,7 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.hypothesis import Hypothesis
-from surgisoft.surrogate.effects.wall_fibres import WallFibres, fibres_tried
+from surgisoft.surrogate.effects.wall_fibres import WallFibres, bend_and_stretch, walls_tried
 
 GRID = (0.1, 2.0, 5.0)
 """Steepnesses k that identification tries: nearly cubic, and exponential."""
@@ -40,40 +46,44 @@ class Stiffening(WallFibres, Memoryless):
     stage = "material"
 
     def __init__(
-        self, facts: ArmFacts, steepness: float = 1.0, others: float = 0.0, ring: bool = False
+        self,
+        facts: ArmFacts,
+        steepness: float = 1.0,
+        others: float = 0.0,
+        ring: bool = False,
+        section: bool = False,
     ):
         """steepness: k of the exponential; towards 0 a cubic spring.
 
-        others, ring: the mixture of the wall fibres' loads (`fibre_matrix`).
+        others, ring: the mixture of the wall fibres' loads (`fibre_matrix`); section: bending and
+        stretch of the section in their place.
         """
         super().__init__(facts)
         self.own = amplitude(1)
         self.bend = amplitude(1)
         self.log_steepness = logarithm(steepness)
-        self.set_fibres(others, ring)
+        self.set_fibres(others, ring, section)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
-        """`own` (1,) by each fibre's load and `bend` (1,) by the arm's bending."""
+        """`own` (1,) by each fibre's load, or the stretch, and `bend` (1,) by the arm's bending."""
         return {"own": self.own, "bend": self.bend}
 
     def _lost(self, signal: Tensor) -> tuple[Tensor, Tensor]:
         """Two (..., m) shifts of the actuation at amplitude one: `own` and `bend`."""
         x, k = self.load(signal), self.log_steepness.exp()
-        m = x.shape[-1]
-        if m == 4:
-            bend = (x[..., :2] - x[..., 2:]).square().sum(-1, keepdim=True)
-        else:
-            away = x - x.mean(-1, keepdim=True)
-            bend = away.square().sum(-1, keepdim=True) * m / max(m - 1, 1)
+        bend, size, stretch = bend_and_stretch(x)
 
         def lost(load: Tensor, q: Tensor) -> Tensor:
             # A recording beyond the fitted range must not blow up.
             return -load * torch.expm1(k * q.clamp(max=4.0)) / torch.expm1(k)
 
+        if self.section:
+            own = lost(stretch, stretch.square()).expand_as(x)
+            return self.reach * own, self.reach * lost(bend, size)
         fibres = self.fibres
         u = x @ fibres.T
         own = lost(u, u.square()) @ fibres
-        return self.reach * own, self.reach * lost(x, bend)
+        return self.reach * own, self.reach * lost(x, size)
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Effective actuation (..., m) from actuation (..., m)."""
@@ -84,12 +94,17 @@ class Stiffening(WallFibres, Memoryless):
         """(2, ..., m) change of the actuation by each amplitude: closed form."""
         return torch.stack(self._lost(signal)).detach()
 
+    def config(self) -> dict:
+        """Whether the fibres stand in a ring, or bending and stretch are in their place."""
+        return {**super().config(), "section": self.section}
+
     def quantities(self) -> list[Quantity]:
         """Shares of push lost at full load, the steepness and the fibres' mixture."""
         rubber = "wide: a rest of the push is left"
         total = float((self.own + self.bend).detach())
-        return [
-            Quantity("own_share", value_of(self.own), "", -0.5, 0.9, rubber),
+        own = "stretch_share" if self.section else "own_share"
+        quantities = [
+            Quantity(own, value_of(self.own), "", -0.5, 0.9, rubber),
             Quantity("bend_share", value_of(self.bend), "", -0.5, 0.9, rubber),
             Quantity(
                 "total_share",
@@ -100,13 +115,16 @@ class Stiffening(WallFibres, Memoryless):
                 "a wall that stiffens takes push and leaves some",
             ),
             Quantity("steepness", value_of(self.log_steepness.exp()), "", 0.005, 12.0, rubber),
-            Quantity("others_share", value_of(self.others), "", -1.0, 1.0, "a mixture of shares"),
         ]
+        if self.section:
+            return quantities
+        mixed = "a mixture of shares"
+        return [*quantities, Quantity("others_share", value_of(self.others), "", -1.0, 1.0, mixed)]
 
 
 def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
-    fibres = fibres_tried(len(facts.low), OTHERS)
-    return [Stiffening(facts, steepness, *some) for steepness in GRID for some in fibres]
+    walls = walls_tried(len(facts.low), OTHERS)
+    return [Stiffening(facts, steepness, *some) for steepness in GRID for some in walls]
 
 
 HYPOTHESIS = Hypothesis(Stiffening, _grid)

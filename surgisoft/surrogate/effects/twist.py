@@ -8,6 +8,13 @@ with the chambers' mean load l (Connolly, Walsh & Bertoldi 2017, fibre-reinforce
 
 with t the tangent of the bent centreline r(s) of length L. On a straight arm the effect is
 invisible.
+
+The bending by the chambers turns with the body, the one by its own weight does not: the moment of
+weight keeps its direction in space, whatever wall it acts on (Love 1927, ch. XVIII, equilibrium of
+a rod under forces at rest). To first order in the bending its part of the displacement, that of the
+shape r_0 at rest times the share `hanging` of it that weight has bent, is missing:
+
+    q = p + int theta x dr - hanging int theta_0 x dr_0,      theta_0 = (...) (r_0(s) - r_0(0)) / L.
 """
 
 import torch
@@ -22,7 +29,11 @@ from surgisoft.surrogate.effects.base import (
     value_of,
 )
 from surgisoft.surrogate.effects.beam import Beam, displaced
-from surgisoft.surrogate.effects.hypothesis import Hypothesis
+from surgisoft.surrogate.effects.hypothesis import Hypothesis, no_combinations
+
+LEAST_BENT = 0.01
+"""Displacement of a key point of the arm at rest by a twist of 1 rad, as a share of its length,
+from which identification asks whether weight bends the arm."""
 
 
 class Twist(Effect):
@@ -31,10 +42,13 @@ class Twist(Effect):
     places: Tensor
     chords: Tensor
     collect: Tensor
+    at_rest: Tensor
+    hanging: nn.Parameter | None
 
     stage = "body"
 
-    def __init__(self, facts: ArmFacts):
+    def __init__(self, facts: ArmFacts, hanging: float | None = None):
+        """hanging: share of the bending at rest that weight causes; None: no such share."""
         super().__init__(facts)
         beam = Beam.through(facts.rest_mm)
         self.linear = amplitude(1)
@@ -42,6 +56,10 @@ class Twist(Effect):
         self.register_buffer("places", beam.places / beam.length_mm, persistent=False)
         self.register_buffer("chords", beam.chords, persistent=False)
         self.register_buffer("collect", beam.collect, persistent=False)
+        share = None if hanging is None else nn.Parameter(torch.tensor([float(hanging)]))
+        self.register_parameter("hanging", share)
+        at_rest = self._moved(facts.rest_mm.to(self.places))
+        self.register_buffer("at_rest", at_rest, persistent=False)
 
     def amplitudes(self) -> dict[str, nn.Parameter]:
         """Twist of the tip against the base at full load, rad."""
@@ -63,10 +81,15 @@ class Twist(Effect):
             return memory.unsqueeze(1).expand(*signal.shape[:2], 1)
         return self.load(context.pressure).mean(-1, keepdim=True)
 
-    def _turned(self, points: Tensor) -> Tensor:
-        """(..., n, 3) displacement, mm, by a twist of 1 rad from base to tip."""
+    def _moved(self, points: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, where all of the body turns by 1 rad from base to tip."""
         p = points.mT.contiguous()
         return displaced(p @ self.places, p @ self.chords, self.collect)
+
+    def _turned(self, points: Tensor) -> Tensor:
+        """(..., n, 3) displacement, mm, by a twist of 1 rad from base to tip."""
+        moved = self._moved(points)
+        return moved if self.hanging is None else moved - self.hanging * self.at_rest
 
     def apply(self, signal: Tensor, memory: Tensor) -> Tensor:
         """Twisted key points (..., n, 3), mm, from the mean load (..., 1)."""
@@ -80,16 +103,29 @@ class Twist(Effect):
             return torch.stack([load * turned, load * load.abs() * turned])
 
     def config(self) -> dict:
-        """No arguments: tensors hold everything."""
-        return {}
+        """The share that weight bends at rest, where there is one."""
+        return {"hanging": None if self.hanging is None else value_of(self.hanging)}
 
     def quantities(self) -> list[Quantity]:
         """Twist of the tip at full load, its linear and quadratic part, rad."""
         fibres = "arms that are meant to bend, not to twist (Connolly et al. 2017)"
-        return [
+        twist = [
             Quantity("linear_rad", value_of(self.linear), "rad", -1.0, 1.0, fibres),
             Quantity("quadratic_rad", value_of(self.quadratic), "rad", -1.0, 1.0, fibres),
         ]
+        if self.hanging is None:
+            return twist
+        bent = "0: bent as cast, 1: bent by weight; beyond 1 as cast against its weight"
+        return [*twist, Quantity("hanging_share", value_of(self.hanging), "", 0.0, 1.5, bent)]
 
 
-HYPOTHESIS = Hypothesis(Twist)
+def _grid(facts: ArmFacts, points: Tensor) -> list[Effect]:
+    """A body that is bent at rest as it was cast, and one that weight bends."""
+    hanging = Twist(facts, hanging=1.0)
+    length = float(Beam.through(facts.rest_mm).length_mm)
+    bent = bool(hanging.at_rest.abs().max() > LEAST_BENT * length)
+    return [Twist(facts), *([hanging] if bent else [])]
+
+
+# A body is bent at rest in one way.
+HYPOTHESIS = Hypothesis(Twist, _grid, combinations=no_combinations)

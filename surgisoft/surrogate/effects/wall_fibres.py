@@ -26,10 +26,18 @@ class WallFibres(Effect, ABC):
     """Version 1 had one fibre along each chamber; 2 also has a ring of fibres and redefines
     `others`."""
 
-    def set_fibres(self, others: float, ring: bool) -> None:
-        """Add the parameter of the mixture; the arguments are those of `fibre_matrix`."""
-        self.ring = bool(ring)
-        self.others = nn.Parameter(torch.tensor([float(others)]))
+    others: nn.Parameter
+    """(1,) share of the other chambers; None of a section."""
+
+    def set_fibres(self, others: float, ring: bool, section: bool = False) -> None:
+        """Add the parameter of the mixture; others and ring are those of `fibre_matrix`.
+
+        section: the wall as a whole, which bends and stretches (`bend_and_stretch`), in place of
+        single fibres.
+        """
+        self.ring, self.section = bool(ring), bool(section)
+        shared = None if section else nn.Parameter(torch.tensor([float(others)]))
+        self.register_parameter("others", shared)
 
     @property
     def fibres(self) -> Tensor:
@@ -78,6 +86,30 @@ def fibre_matrix(others: Tensor, chambers: int, ring: bool = False) -> Tensor:
     bent = torch.cos(step[:, None] - step[None, ::2])
     most = m * torch.maximum(math.sqrt(2.0) * common.abs(), (1 - common).abs() / math.sqrt(2.0))
     return (common + (1 - common) * bent) / most
+
+
+def bend_and_stretch(load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(bending (..., m), its square (..., 1), stretch (..., 1)) by the loads (..., m) of a ring.
+
+    A symmetric section decouples the two (Euler-Bernoulli): the mean load stretches, what chambers
+    have beyond it, or beyond the one across in a ring of four, bends. The square is 1 where one
+    chamber alone is fully loaded.
+    """
+    m, stretch = load.shape[-1], load.mean(-1, keepdim=True)
+    if m == 4:
+        bend = (load - load.roll(2, dims=-1)) / 2
+        return bend, 2 * bend.square().sum(-1, keepdim=True), stretch
+    bend = load - stretch
+    return bend, bend.square().sum(-1, keepdim=True) * m / max(m - 1, 1), stretch
+
+
+def walls_tried(chambers: int, others: float) -> list[tuple[float, bool, bool]]:
+    """(share of the others, ring, section) of the walls that identification tries on an arm.
+
+    Those of `fibres_tried`, and the section of an arm whose chambers stand in a ring.
+    """
+    fibres = [(*some, False) for some in fibres_tried(chambers, others)]
+    return [*fibres, (0.0, False, True)] if chambers in RINGS else fibres
 
 
 def fibres_tried(chambers: int, others: float) -> list[tuple[float, bool]]:

@@ -188,6 +188,38 @@ def test_stiffening_takes_its_share_at_full_load_and_starts_as_a_cubic():
     assert torch.allclose(alike, torch.ones(1, 3))
 
 
+def test_a_section_stiffens_in_bending_and_in_stretch_apart():
+    """Cubic laws by hand: the mean load e loses own e^3, what is beyond it bend b B^2."""
+    stiff = make_effect("stiffening", RANGE, steepness=0.001, section=True)
+    stiff = with_strength(stiff, own=0.2, bend=0.1)
+    alone, alike = run(stiff, [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    stretch = (1 - 0.2 / 9) / 3
+    assert torch.allclose(alone, stretch + 0.9 * torch.tensor([2.0, -1.0, -1.0]) / 3, atol=1e-4)
+    assert torch.allclose(alike, torch.full((3,), 0.8), atol=1e-4)
+
+
+def test_a_section_softens_in_bending_below_its_largest_bending_only():
+    soft = make_effect("softening", RANGE, width=0.2, growth=0.1, section=True)
+    soft = with_strength(soft, own=0.2)
+    first, alike, again = run(soft, [[1.0, 0.0, 0.0], [0.5, 0.5, 0.5], [0.0, 0.5, 0.0]])
+    assert first.tolist() == [1.0, 0.0, 0.0]
+    assert torch.allclose(alike, torch.full((3,), 0.5))
+    # Bending of one half: the energy is 1 / 4 and was 1.
+    more = 0.2 * (1 - math.exp(-0.75 / (0.2 + 0.1)))
+    bend = torch.tensor([-1.0, 2.0, -1.0]) / 6
+    assert torch.allclose(again, torch.tensor([0.0, 0.5, 0.0]) + more * bend, atol=1e-5)
+
+
+def test_chambers_across_in_a_section_of_four_bend_by_their_difference():
+    four = ArmFacts(torch.zeros(4), torch.full((4,), 50.0), torch.zeros(4), torch.zeros(1, 3))
+    stiff = make_effect("stiffening", four, steepness=0.001, section=True)
+    x = torch.tensor([[[50.0, 0.0, 50.0, 0.0], [50.0, 25.0, 0.0, 0.0]]])
+    lost = (x - with_strength(stiff, bend=0.1).apply(x, x.new_zeros(1, 2, 0)))[0] / 50
+    assert lost[0].tolist() == pytest.approx([0.0, 0.0, 0.0, 0.0])
+    # Half the differences across, 0.5 and 0.25, whose square counts 1.25 in all.
+    assert lost[1].tolist() == pytest.approx([0.0625, 0.03125, -0.0625, -0.03125], abs=1e-4)
+
+
 def test_opposed_chambers_of_four_bend_nothing_and_neighbours_add_up():
     """Losses of a nearly cubic spring: 0.1 x B^2 with B^2 = 0, and 1.25 for loads of 1 and 0.5."""
     four = ArmFacts(torch.zeros(4), torch.full((4,), 50.0), torch.zeros(4), torch.zeros(1, 3))
@@ -396,6 +428,19 @@ def test_twist_moves_a_bent_arm_out_of_its_plane_by_the_area_under_it():
     assert abs(float(answer[-1, 1])) == pytest.approx(0.1 * 2 * area / twist_length(), rel=0.01)
     assert float(answer[:, [0, 2]].abs().max()) < 1e-4
     assert torch.allclose(pose(twist, STRAIGHT_13, torch.ones(1, 1)), STRAIGHT_13)
+
+
+def test_what_weight_bends_keeps_its_plane_when_the_body_is_twisted():
+    """At rest a hanging share of 1 leaves the arm where it is; a straightened arm goes beyond."""
+    twist = with_strength(make_effect("twist", arm(QUARTER), hanging=1.0), linear=0.1)
+    assert torch.allclose(pose(twist, QUARTER, torch.ones(1, 1)), QUARTER, atol=1e-4)
+    cast = with_strength(make_effect("twist", arm(QUARTER)), linear=0.1)
+    moved = pose(cast, QUARTER, torch.ones(1, 1)) - QUARTER
+    answer = pose(twist, STRAIGHT_13, torch.ones(1, 1))
+    assert torch.allclose(answer, STRAIGHT_13 - moved, atol=1e-4)
+    tried = hypothesis_of(known_effects()["twist"]).candidates
+    assert [e.config()["hanging"] for e in tried(arm(QUARTER), QUARTER[None])] == [None, 1.0]
+    assert len(tried(arm(STRAIGHT_13), QUARTER[None])) == 1
 
 
 STRAIGHT_13 = torch.outer(torch.linspace(0, 60, 13), torch.tensor([0.0, 0.0, 1.0]))

@@ -35,8 +35,9 @@ LEAST_PERIODS = 4.0
 OVERSAMPLED = 2
 """Points of the spectrum for each of its independent ones: a line between two points would lose
 half of its power, and loses a fifth."""
-LEAST_LEFT = 0.02
-"""Least share of the squared remainder that counts as more than noise."""
+LEAST_ABOVE = 0.25
+"""Least share of the squared remainder that counts as above the noise: how large the noise is, is
+not known better, and of next to nothing any line is all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +147,7 @@ def strongest_line(problem: Problem, remainder: np.ndarray) -> float:
         return 0.0
     power = float(np.square(remainder - remainder.mean(0), dtype=float).sum(1).mean())
     noise = float(np.square(problem.noise_mm).sum())
-    above = max(power - noise, LEAST_LEFT * power, 1e-30)
+    above = max(power - noise, LEAST_ABOVE * power, 1e-30)
     own = spectrum.power(remainder) / above
     others = np.zeros_like(own)
     predicted = problem.predicted.reshape(len(remainder), -1)

@@ -69,3 +69,4 @@ def test_a_breath_is_a_line_and_a_periodic_actuation_is_none():
         still_model(), [recording(0.5 * np.cos(2 * np.pi * 0.21 * time), np.stack([wave, wave], 1))]
     )
     assert beyond_history(driven, driven.pressure).line < 0.2
+    assert beyond_history(*posed(np.zeros(ROWS))).line < 0.2

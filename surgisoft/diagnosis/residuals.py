@@ -498,8 +498,27 @@ class Problem:
         """The fitted rows of a (R, T, ...) tensor."""
         return self.history.rows(tensor)[self.index]
 
+    def without_blocks(self, out: np.ndarray) -> "Problem":
+        """The problem without the blocks of time where out (B,) bool is set."""
+        row, number = ~out[self.block], np.cumsum(~out) - 1
+        owner = self.block_of_row
+        kept = (owner >= 0) & ~out[owner]
+        return replace(
+            self,
+            index=self.index[torch.from_numpy(row)],
+            pressure=self.pressure[row],
+            direction=self.direction[row],
+            measured=self.measured[row],
+            predicted=self.predicted[row],
+            time_s=self.time_s[row],
+            block=number[self.block[row]],
+            block_of_row=np.where(kept, number[owner], -1),
+            motion=np.unique(self.motion[~out], return_inverse=True)[1],
+            fold=self.fold[~out],
+        )
+
     def with_model(self, model: ArmModel) -> "Problem":
-        """The same rows under another model of the same arm."""
+        """These rows under another model of the same arm."""
         with torch.no_grad():
             predicted = self.rows(model.predict(self.history)).double().numpy()
         return replace(self, model=model, predicted=predicted)

@@ -13,6 +13,7 @@ import datetime
 import hashlib
 import itertools
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -119,14 +120,21 @@ def case_weights(name: str, some: Sequence, twin: float = 1.0) -> np.ndarray:
     Every source has the same sum, unless it has few cases. Where PRIORS has the model, the
     statement is true for that share of every source; cases of a source that has one kind only have
     the share of that kind. twin: weight of a case whose truth was no candidate, in units of a real
-    one.
+    one. Such cases share the weight of the real ones of their source for which the statement is as
+    right, so they do not change how often anything holds.
     """
     prior = PRIORS.get(name)
     kinds = [(case.source, prior is None or bool(right)) for _, right, case in some]
+    alike = [(case.source, bool(np.any(right))) for _, right, case in some]
     units = np.array([twin if case.left_out else 1.0 for _, _, case in some])
-    number: dict[tuple[str, bool], float] = {}
+    real, both = Counter[tuple[str, bool]](), dict.fromkeys(alike, 0.0)
+    for group, unit, (_, _, case) in zip(alike, units, some, strict=True):
+        real[group] += not case.left_out
+        both[group] += unit
+    units = units * [real[g] / both[g] if real[g] and both[g] else 1.0 for g in alike]
+    number = dict.fromkeys(kinds, 0.0)
     for kind, unit in zip(kinds, units, strict=True):
-        number[kind] = number.get(kind, 0.0) + unit
+        number[kind] += unit
     sources = len({source for source, _ in kinds})
     share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
     each = [share[kind[1]] * units.sum() / sources / max(number[kind], 1e-9) for kind in kinds]

@@ -156,14 +156,6 @@ def _break(evidence: Evidence) -> float:
     return _between(evidence.break_log_gain + min(_free_better(evidence), 0.0), 0.0, 1.0)
 
 
-def _form_of_left(evidence: Evidence) -> float:
-    """Share of what the last proposal leaves that its relaxed forms explain, at most 1."""
-    if not evidence.proposals:
-        return 0.0
-    last = evidence.proposals[-1]
-    return _between(last.form_gain / (_left_by(last) + FORM_SHARE), 0.0, 1.0)
-
-
 def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
     """Geometric mean of gain and log gain of relaxed forms, each at most 1; 0 where either falls.
 
@@ -400,20 +392,6 @@ KNOWN = (
         +1,
         lambda e: _z(e.effects[0].z) if e.effects else 0.0,
         "normal quantile of the best effect's family-wise p-value",
-    ),
-    Feature(
-        "free_better",
-        -1,
-        _free_better,
-        "log gain of a black box with memory, held to no size, over the best proposal",
-        since=3,
-    ),
-    Feature(
-        "form_of_left",
-        -1,
-        _form_of_left,
-        "share of what the last proposal leaves that its relaxed forms explain",
-        since=3,
     ),
     Feature(
         "break",

@@ -55,10 +55,12 @@ WEAK = 0.5
 cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
-PRIORS = {"two": 0.3}
-"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated:
-how many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in
-one source and a quarter in another. The other models take the sources' shares."""
+PRIORS = {"two": 0.3, "known": 0.5}
+"""Shares of cases of which a statement is true, in the fit of its model. Stated: how many pairs and
+unknown effects were drawn for a source says nothing of real arms. Pairs were a tenth of the cases
+in one source and a quarter in another; unknown effects are a fifth, and with half of the weight
+they count as much as known ones do. The other models take the sources' shares, and so do the curves
+that calibrate names."""
 ROBOT_FOLDS = 5
 """Groups of robots that are left out in turn inside the cases of a fit."""
 CURVE_PENALTY = 1.0

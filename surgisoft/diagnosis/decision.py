@@ -143,8 +143,7 @@ def _box_better(evidence: Evidence) -> float:
 
 def _free_better(evidence: Evidence) -> float:
     """Log gain of the free black box over the best proposal."""
-    some = [each.left_log_free for each in evidence.proposals]
-    return _between(min([evidence.free_log_gain, *some]), -1.0, 2.0)
+    return min([evidence.free_log_gain, *(each.left_log_free for each in evidence.proposals)])
 
 
 def _break(evidence: Evidence) -> float:
@@ -154,6 +153,14 @@ def _break(evidence: Evidence) -> float:
     itself explains it, there is no break.
     """
     return _between(evidence.break_log_gain + min(_free_better(evidence), 0.0), 0.0, 1.0)
+
+
+def _line(evidence: Evidence) -> float:
+    """Share in one line, by as much as the best proposal leaves no less than the black box does.
+
+    A line that an effect of the list explains, such as a user-defined one, is none.
+    """
+    return _between(evidence.line * math.exp(min(_free_better(evidence), 0.0)), 0.0, 1.0)
 
 
 def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
@@ -356,7 +363,7 @@ MISSING = (
     Feature(
         "line",
         +1,
-        lambda e: _between(e.line, 0.0, 1.0),
+        _line,
         "share of what a black box with memory leaves in one line of its spectrum",
         since=3,
     ),
@@ -403,7 +410,7 @@ KNOWN = (
     Feature(
         "line",
         -1,
-        lambda e: _between(e.line, 0.0, 1.0),
+        _line,
         "share of what a black box with memory leaves in one line of its spectrum",
         since=3,
     ),
@@ -555,7 +562,7 @@ NETWORK = (
     Feature(
         "line",
         -1,
-        lambda e: _between(e.line, 0.0, 1.0),
+        _line,
         "share of what a black box with memory leaves in one line of its spectrum",
         since=3,
     ),

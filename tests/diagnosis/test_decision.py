@@ -315,15 +315,21 @@ def test_a_second_effect_that_mends_the_form_of_the_first_says_nothing_of_two():
     assert chances[0] < chances[1]
 
 
-@pytest.mark.parametrize(("free", "broken"), [(0.5, 0.7), (-0.3, 0.4), (-0.9, 0.0)])
-def test_where_an_effect_explains_it_there_is_no_break(free, broken):
-    """A break that gains 0.7 over a black box gains as much less over what is better than that."""
+@pytest.mark.parametrize(
+    ("free", "broken", "line"), [(0.5, 0.7, 0.8), (-math.log(2.0), 0.7 - math.log(2.0), 0.4)]
+)
+def test_where_an_effect_explains_them_there_is_no_break_and_no_line(free, broken, line):
+    """A break that gains 0.7 over a black box gains as much less over what is better than that.
+    Where an effect leaves half of what the black box does, half of the line is explained."""
     names = [feature.name for feature in FEATURES["known"]]
     worse = replace(ALONE, left_log_free=free + 1.0)
     best = replace(ALONE, left_log_free=free)
-    evidence = replace(GOOD, proposals=(worse, best), free_log_gain=1.8, break_log_gain=0.7)
+    evidence = replace(
+        GOOD, proposals=(worse, best), free_log_gain=1.8, break_log_gain=0.7, line=0.8
+    )
     row = dict(zip(names, features_of("known", evidence), strict=True))
     assert row["break"] == pytest.approx(broken)
+    assert row["line"] == pytest.approx(line)
 
 
 def test_the_weights_in_force_have_the_signs_of_their_features():

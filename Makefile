@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test fast lint docs fuzz mutants kills sbom tutorials clean
+.PHONY: demo test fast coverage lint docs fuzz mutants kills sbom tutorials clean
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -37,6 +37,12 @@ test: $(STAMP)  ## the whole suite
 fast: $(STAMP)  ## the tests that are not marked slow
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m fast
 
+coverage: $(STAMP)  ## branches that the suite takes, by part, as docs/results/coverage.md
+	rm -rf .coverage && mkdir .coverage
+	$(BIN)/python -m coverage run -m pytest -n 2 -q
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m benchmarks.coverage_table > docs/results/coverage.md
+
 lint: $(STAMP)  ## style, format, types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -62,7 +68,7 @@ docs: $(DOCS_STAMP)  ## the documentation site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Read it with: $(BIN)/python -m http.server --directory site"
 
-tutorials: $(STAMP)  ## run every block of code of the tutorials (ten minutes)
+tutorials: $(STAMP)  ## run every block of code of the tutorials, and the guides' Python
 	$(BIN)/python docs/run_tutorials.py
 
 clean:

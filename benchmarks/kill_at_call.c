@@ -1,8 +1,11 @@
 /* Preloaded by benchmarks/kills.py: counts the calls of the C library that change files, and ends
-   the process by SIGKILL before a chosen one, or in the middle of it where it is a write. Libraries
-   in C, C++ and Rust are counted like Python. Build: cc -shared -fPIC -O1 -o FILE kill_at_call.c -ldl */
+   the process by SIGKILL before a chosen one, or in the middle of it where it is a write; or lets
+   calls fail from a chosen one on, as on a disk whose quota is used up, or that is read-only from
+   then on. Libraries in C, C++ and Rust are counted like Python.
+   Build: cc -shared -fPIC -O1 -o FILE kill_at_call.c -ldl */
 #define _GNU_SOURCE
 #include <dlfcn.h>
+#include <errno.h>
 #include <fcntl.h>
 #include <signal.h>
 #include <stdarg.h>
@@ -13,23 +16,40 @@
 #include <unistd.h>
 
 static volatile long seen, chosen;
-static volatile int torn;
+static volatile int torn, error, every;
 
 /* Begin to count; at: number of the call before which the process ends, 0 for none; tear: whether a
    write is done by half first. */
-void kill_arm(long at, int tear) { seen = 0; chosen = at; torn = tear; }
+void kill_arm(long at, int tear) { seen = 0; chosen = at; torn = tear; error = 0; }
+
+/* Begin to count; from call `at` on calls fail with the error number `code`, a write after half of
+   it; all: whether also calls that take no room fail (renaming, removing). */
+void fail_arm(long at, int code, int all) { seen = 0; chosen = at; error = code; every = all; }
 
 long kill_seen(void) { return seen; }
 
 static void die(void) { kill(getpid(), SIGKILL); for (;;) pause(); }
 
-/* Count a call; whether a write has to be torn. */
-static int step(int is_write) {
+/* Count a call: 0, it is done; 1, a write is done by half; -1, it fails. */
+static int step(int is_write, int takes_room) {
     long now = __sync_add_and_fetch(&seen, 1);
-    if (!chosen || now != chosen) return 0;
+    if (!chosen) return 0;
+    if (error) {
+        if (now < chosen || !(takes_room || every)) return 0;
+        if (is_write && now == chosen) return 1;
+        errno = error;
+        return -1;
+    }
+    if (now != chosen) return 0;
     if (torn && is_write) return 1;
     die();
     return 0;
+}
+
+/* End in the middle of a write, of which `done` bytes were written. */
+static ssize_t half(ssize_t done) {
+    if (!error) die();
+    return done;
 }
 
 static int is_file(int fd) {
@@ -43,28 +63,28 @@ static int is_file(int fd) {
 
 ssize_t write(int fd, const void *data, size_t size) {
     REAL(ssize_t, "write", int, const void *, size_t);
-    if (is_file(fd) && step(size > 1)) { real(fd, data, size / 2); die(); }
-    return real(fd, data, size);
+    int how = is_file(fd) ? step(size > 1, 1) : 0;
+    return how < 0 ? -1 : how ? half(real(fd, data, size / 2)) : real(fd, data, size);
 }
 
 ssize_t pwrite64(int fd, const void *data, size_t size, off64_t at) {
     REAL(ssize_t, "pwrite64", int, const void *, size_t, off64_t);
-    if (is_file(fd) && step(size > 1)) { real(fd, data, size / 2, at); die(); }
-    return real(fd, data, size, at);
+    int how = is_file(fd) ? step(size > 1, 1) : 0;
+    return how < 0 ? -1 : how ? half(real(fd, data, size / 2, at)) : real(fd, data, size, at);
 }
 
 ssize_t pwrite(int fd, const void *data, size_t size, off_t at) { return pwrite64(fd, data, size, at); }
 
 ssize_t writev(int fd, const struct iovec *parts, int count) {
     REAL(ssize_t, "writev", int, const struct iovec *, int);
-    if (is_file(fd) && step(count > 1)) { real(fd, parts, count / 2); die(); }
-    return real(fd, parts, count);
+    int how = is_file(fd) ? step(count > 1, 1) : 0;
+    return how < 0 ? -1 : how ? half(real(fd, parts, count / 2)) : real(fd, parts, count);
 }
 
 ssize_t sendfile64(int to, int from, off64_t *at, size_t size) {
     REAL(ssize_t, "sendfile64", int, int, off64_t *, size_t);
-    if (is_file(to) && step(size > 1)) { real(to, from, at, size / 2); die(); }
-    return real(to, from, at, size);
+    int how = is_file(to) ? step(size > 1, 1) : 0;
+    return how < 0 ? -1 : how ? half(real(to, from, at, size / 2)) : real(to, from, at, size);
 }
 
 ssize_t sendfile(int to, int from, off_t *at, size_t size) { return sendfile64(to, from, at, size); }
@@ -72,7 +92,7 @@ ssize_t sendfile(int to, int from, off_t *at, size_t size) { return sendfile64(t
 #define MODE(flags) \
     mode_t mode = 0; \
     if ((flags & O_CREAT) || (flags & O_TMPFILE) == O_TMPFILE) { va_list more; va_start(more, flags); mode = va_arg(more, mode_t); va_end(more); } \
-    if (flags & (O_CREAT | O_TRUNC)) step(0)
+    if ((flags & (O_CREAT | O_TRUNC)) && step(0, flags & O_CREAT) < 0) return -1
 
 int open64(const char *path, int flags, ...) {
     MODE(flags);
@@ -98,19 +118,19 @@ int openat(int folder, const char *path, int flags, ...) {
     return real(folder, path, flags, mode);
 }
 
-#define COUNTED(name, declared, types, given) \
-    int name declared { REAL(int, #name, types); step(0); return real given; }
+#define COUNTED(name, declared, types, given, takes_room) \
+    int name declared { REAL(int, #name, types); return step(0, takes_room) < 0 ? -1 : real given; }
 #define T(...) __VA_ARGS__
 
-COUNTED(rename, (const char *a, const char *b), T(const char *, const char *), (a, b))
-COUNTED(renameat, (int f, const char *a, int g, const char *b), T(int, const char *, int, const char *), (f, a, g, b))
-COUNTED(link, (const char *a, const char *b), T(const char *, const char *), (a, b))
-COUNTED(symlink, (const char *a, const char *b), T(const char *, const char *), (a, b))
-COUNTED(unlink, (const char *a), T(const char *), (a))
-COUNTED(unlinkat, (int f, const char *a, int g), T(int, const char *, int), (f, a, g))
-COUNTED(rmdir, (const char *a), T(const char *), (a))
-COUNTED(mkdir, (const char *a, mode_t m), T(const char *, mode_t), (a, m))
-COUNTED(mkdirat, (int f, const char *a, mode_t m), T(int, const char *, mode_t), (f, a, m))
-COUNTED(ftruncate64, (int f, off64_t n), T(int, off64_t), (f, n))
-COUNTED(truncate64, (const char *a, off64_t n), T(const char *, off64_t), (a, n))
-COUNTED(chmod, (const char *a, mode_t m), T(const char *, mode_t), (a, m))
+COUNTED(rename, (const char *a, const char *b), T(const char *, const char *), (a, b), 0)
+COUNTED(renameat, (int f, const char *a, int g, const char *b), T(int, const char *, int, const char *), (f, a, g, b), 0)
+COUNTED(link, (const char *a, const char *b), T(const char *, const char *), (a, b), 1)
+COUNTED(symlink, (const char *a, const char *b), T(const char *, const char *), (a, b), 1)
+COUNTED(unlink, (const char *a), T(const char *), (a), 0)
+COUNTED(unlinkat, (int f, const char *a, int g), T(int, const char *, int), (f, a, g), 0)
+COUNTED(rmdir, (const char *a), T(const char *), (a), 0)
+COUNTED(mkdir, (const char *a, mode_t m), T(const char *, mode_t), (a, m), 1)
+COUNTED(mkdirat, (int f, const char *a, mode_t m), T(int, const char *, mode_t), (f, a, m), 1)
+COUNTED(ftruncate64, (int f, off64_t n), T(int, off64_t), (f, n), 0)
+COUNTED(truncate64, (const char *a, off64_t n), T(const char *, off64_t), (a, n), 0)
+COUNTED(chmod, (const char *a, mode_t m), T(const char *, mode_t), (a, m), 0)

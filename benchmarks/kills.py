@@ -7,11 +7,17 @@ counts them, whichever language calls), in the middle of a chosen write, or afte
 Then its output must be the old one, the new one or absent, and readable. An interrupted training is
 resumed and must end with the weights of an uninterrupted one, bit by bit; an interrupted experiment
 is resumed and must end with the rows of an uninterrupted one.
+
+With `--fail` nothing is killed: from a chosen call on, calls that change files fail, as where the
+quota is used up (EDQUOT: what takes room fails) or the file system becomes read-only (EROFS: all
+fails). The command must then end in one line, with its output as above and, under the quota, with
+nothing left over; where it ends well, its output must be the new one.
 """
 
 import argparse
 import contextlib
 import ctypes
+import errno
 import hashlib
 import json
 import os
@@ -34,11 +40,16 @@ from pathlib import Path
 from benchmarks.fuzz.run import scratch
 from benchmarks.fuzz.targets import make_raw, recording
 from surgisoft.cli import run as command_line
+from surgisoft.errors import InputError
 
 COUNTER = Path(__file__).with_name("kill_at_call.c")
 """Source of the library that counts calls and ends the process."""
 LEFTOVER = re.compile(r"(^|/)\.[^/]*[0-9a-f]{12}[^/]*(/|$)")
 """Hidden files of a kill, which no reader takes for an output (surgisoft.files)."""
+BAD_INPUT = 2
+"""Exit code of a command that says in one line why it does nothing."""
+FAILING = {"quota": (errno.EDQUOT, False), "read-only": (errno.EROFS, True)}
+"""How calls fail: the error number, and whether those that take no room fail too."""
 TORN, RANDOM = 0.25, 0.2
 """Shares of the kills in the middle of a write, and after a random time."""
 
@@ -63,6 +74,13 @@ class Command:
     """Files of the output that state times or versions and are only looked at."""
     share: float = 1.0
     """Share of the kills, relative to the other commands."""
+
+
+def ended_with(code: int) -> None:
+    """Raise where a command line ended badly; InputError where it did so in one line."""
+    if code != 0:
+        kind = InputError if code == BAD_INPUT else RuntimeError
+        raise kind(f"the command ended with code {code}")
 
 
 def _options(**fields):
@@ -183,8 +201,7 @@ def _import_lerobot(work: Path, number: int) -> None:
     code = command_line(
         ["import", str(work / f"set{number}"), "-o", str(work / "b.csv"), "--force"]
     )
-    if code != 0:
-        raise RuntimeError(f"import ended with code {code}")
+    ended_with(code)
 
 
 def _export(work: Path, _: int) -> None:
@@ -266,8 +283,7 @@ on_timeout = "go on"
 
 def _scene(work: Path, number: int) -> None:
     code = command_line(["scene", "new", str(work / "organ.ply"), "-o", str(work / "scene")])
-    if code != 0:
-        raise RuntimeError(f"scene new ended with code {code}")
+    ended_with(code)
 
 
 def _open_scene(path: Path) -> None:
@@ -354,6 +370,8 @@ class Moment:
     """Whether a write is done by half first."""
     after_s: float | None = None
     """After this time, s."""
+    failing: str = ""
+    """Instead of a kill: how calls fail from `call` on, a key of FAILING."""
 
 
 AT_NO_TIME = Moment()
@@ -370,11 +388,17 @@ def run_child(call: Callable[[], object], moment: Moment = AT_NO_TIME) -> tuple[
         os.dup2(sink, 1)
         os.dup2(sink, 2)
         code = 1
-        counter.kill_arm(moment.call, int(moment.torn))
+        if moment.failing:
+            number, all_calls = FAILING[moment.failing]
+            counter.fail_arm(moment.call, number, int(all_calls))
+        else:
+            counter.kill_arm(moment.call, int(moment.torn))
         try:
             call()
             code = 0
-        except BaseException:
+        except BaseException as error:
+            one_line = isinstance(error, InputError | OSError) and moment.failing
+            code = BAD_INPUT if one_line else 1
             with contextlib.suppress(OSError):
                 os.write(writing, traceback.format_exc().encode())
         finally:
@@ -388,7 +412,7 @@ def run_child(call: Callable[[], object], moment: Moment = AT_NO_TIME) -> tuple[
     with os.fdopen(reading, "rb") as pipe:
         said, _, count = pipe.read().rpartition(b"\0")
     status = os.waitpid(pid, 0)[1]
-    if os.WIFEXITED(status) and os.WEXITSTATUS(status) != 0:
+    if os.WIFEXITED(status) and os.WEXITSTATUS(status) not in (0, BAD_INPUT):
         raise RuntimeError(said.decode())
     return int(count or 0), status
 
@@ -407,8 +431,13 @@ def moments(count: int, calls: int, seconds: float, random: random.Random) -> li
     return found
 
 
-def kill_command(name: str, folder: Path, count: int, seed: int, note: Callable) -> None:
-    """Kill a command so many times; `note` is given what was left of its output each time."""
+def kill_command(
+    name: str, folder: Path, count: int, seed: int, note: Callable, fail: bool = False
+) -> None:
+    """Kill a command so many times; `note` is given what was left of its output each time.
+
+    fail: let calls fail instead.
+    """
     command, inputs, old, work = COMMANDS[name], folder / "in", folder / "old", folder / "work"
     inputs.mkdir(parents=True)
     prepare(inputs)
@@ -428,11 +457,19 @@ def kill_command(name: str, folder: Path, count: int, seed: int, note: Callable)
     seconds, new = time.monotonic() - began, whole()
     if new in (before, "absent"):
         raise RuntimeError(f"{name}: the new output is not told from the old one")
-    for moment in moments(count, calls, seconds, random.Random(f"{seed} {name}")):
+    own = random.Random(f"{seed} {name}")
+    chosen = failures(count, calls, own) if fail else moments(count, calls, seconds, own)
+    for moment in chosen:
         shutil.rmtree(work)
         shutil.copytree(old, work)
-        _, status = run_child(lambda: command.run(work, 1), moment)
-        killed, bad = os.WIFSIGNALED(status), ""
+        status, bad = 0, ""
+        try:
+            _, status = run_child(lambda: command.run(work, 1), moment)
+        except RuntimeError as error:
+            if not fail:
+                raise
+            bad = f"a traceback: {str(error).strip().splitlines()[-1]}"
+        killed = os.WIFSIGNALED(status) or (fail and status != 0)
         now = whole()
         kind = {before: "old", new: "new", "absent": "absent"}.get(now, "between")
         try:
@@ -449,11 +486,38 @@ def kill_command(name: str, folder: Path, count: int, seed: int, note: Callable)
                 bad = "neither the old nor the new output"
         except Exception as error:
             bad = f"{type(error).__name__}: {error}"
+        if fail and not bad:
+            bad = _wrong_end(status, moment, kind, work)
         note(_row(name, moment, int(killed), kind, bad))
+
+
+def _wrong_end(status: int, moment: Moment, left: str, work: Path) -> str:
+    """What is wrong with the end of a command whose calls failed; empty where nothing is."""
+    if not os.WIFEXITED(status):
+        return f"it was ended by signal {os.WTERMSIG(status)}"
+    if os.WEXITSTATUS(status) == 0 and left != "new":
+        return f"it ended well, with its output {left}"
+    if moment.failing == "quota":
+        for path in work.rglob("*"):
+            if LEFTOVER.search(str(path.relative_to(work))):
+                return f"{path.name} is left over"
+    return ""
+
+
+def failures(count: int, calls: int, random: random.Random) -> list[Moment]:
+    """So many moments from which on calls fail: every call once before any of them twice."""
+    found = []
+    for failing in FAILING:
+        at: list[int] = []
+        while len(at) < -(-count // len(FAILING)):
+            at += random.sample(range(1, calls + 1), calls)
+        found += [Moment(call, failing=failing) for call in at[: -(-count // len(FAILING))]]
+    return found
 
 
 def _row(name: str, moment: Moment, kills: int, left: str, bad: str) -> dict:
     when = "time" if moment.after_s is not None else "in a write" if moment.torn else "call"
+    when = moment.failing or when
     about = {"command": name, "killed": kills, "when": when, "left": left, "bad": bad}
     return about | {"call": moment.call, "s": moment.after_s}
 
@@ -556,7 +620,7 @@ def preloaded() -> None:
     os.execv(sys.executable, [sys.executable, "-m", "benchmarks.kills", *sys.argv[1:]])
 
 
-def served(name: str, count: int, seed: int, note: Callable[[dict], None]) -> int:
+def served(name: str, count: int, seed: int, note: Callable[[dict], None], fail: bool) -> int:
     """Kill one command in a process of its own; its exit code, 0 where all kills were made."""
     sys.stdout.flush()
     pid = os.fork()
@@ -568,7 +632,7 @@ def served(name: str, count: int, seed: int, note: Callable[[dict], None]) -> in
                 os.chdir(folder)
                 kill = kill_training if name == TRAIN else None
                 if kill is None:
-                    kill_command(name, folder, count, seed, note)
+                    kill_command(name, folder, count, seed, note, fail)
                 else:
                     kill(folder, count, seed, note)
             code = 0
@@ -606,6 +670,8 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=600, help="number of kills (600)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", default=[*COMMANDS, TRAIN])
+    parser.add_argument("--fail", action="store_true", help="let calls that change files fail "
+                        "instead of killing")  # fmt: skip
     parser.add_argument("--log", type=Path, help="append each kill; commands that are complete in "
                         "it are not killed again")  # fmt: skip
     given = parser.parse_args()
@@ -614,6 +680,8 @@ def main() -> int:
                    "surgisoft.live.session", "surgisoft.surrogate.export"):  # fmt: skip
         __import__(module)
     log = (given.log or Path(tempfile.mkdtemp()) / "kills.jsonl").absolute()
+    if given.fail:
+        given.only = [name for name in given.only if name != TRAIN]
     shares = {name: COMMANDS[name].share if name in COMMANDS else 1.5 for name in given.only}
 
     def note(row: dict) -> None:
@@ -631,7 +699,7 @@ def main() -> int:
         count = int(count) - sum(max(1, row["killed"]) for row in earlier)
         if count > 0:
             began = time.monotonic()
-            failed |= served(name, count, given.seed + len(earlier), note) != 0
+            failed |= served(name, count, given.seed + len(earlier), note, given.fail) != 0
             print(f"{name}: {count} kills in {time.monotonic() - began:.0f} s", flush=True)
     rows = _rows(log)
     print(report(rows, given.only))

@@ -46,7 +46,10 @@ def write_torch_script_of(
             traced = torch.jit.trace_module(module, given, check_trace=False)
         except Exception as error:
             raise DoesNotTrace(_line(error)) from error
-        torch.jit.save(traced, str(file))
+        # Written by Python: the library's own writer ends the process where the disk is full.
+        content = io.BytesIO()
+        torch.jit.save(traced, content)
+        file.write_bytes(content.getvalue())
         again = torch.jit.load(str(file))
 
     def function(name: str) -> Call:
@@ -70,24 +73,24 @@ def write_onnx(
     shapes = tuple({0: torch.export.Dim("batch")} for _ in example) if batched else None
     with _quiet():
         try:
-            torch.onnx.export(
+            made = torch.onnx.export(
                 module,
                 # Copies: one tensor given twice would become one input.
                 tuple(value.clone() for value in example),
-                str(file),
                 input_names=list(inputs),
                 output_names=list(outputs),
                 dynamic_shapes=shapes,
                 opset_version=OPSET,
-                external_data=False,
                 dynamo=True,
                 verbose=False,
             )
+            assert made is not None  # the exporter of torch 2.5 and before gives nothing back
+            content = made.model_proto.SerializeToString()
         except ImportError:
             raise
         except Exception as error:
-            file.unlink(missing_ok=True)
             raise DoesNotTrace(_line(error)) from error
+    file.write_bytes(content)
     from onnx.reference import ReferenceEvaluator
 
     session = ReferenceEvaluator(str(file))

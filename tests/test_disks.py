@@ -2,14 +2,28 @@
 
 import multiprocessing
 import os
+import re
+import resource
 import subprocess
 import sys
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import rerun as rr
+import torch
+from torch import nn
 
+import surgisoft
+from surgisoft.agents import run_folder
 from surgisoft.errors import InputError
-from surgisoft.files import new_folder, write_atomically
+from surgisoft.files import new_file, new_folder, write_atomically, write_json
+from surgisoft.graphs import write_torch_script
 from surgisoft.measurement.recordings import load_recording, save_recording
+from surgisoft.replay import live_view
+from surgisoft.replay.recording import new_recording
 from surgisoft.surrogate.checkpoint import default_arm, load_model, save_model
 from tests.diagnosis.synthetic import recording, walk
 
@@ -50,6 +64,75 @@ def test_a_full_disk_leaves_the_old_output(tmp_path):
     if done.returncode == 77 or "unshare" in done.stderr:
         pytest.skip("no mount namespaces here")
     assert done.stdout.split() == ["full", "full", "{}", "old", "a.csv", "arm"], done.stderr
+
+
+def limited(call, path, size: int = 300) -> str:
+    """How a write ends in a process that may make no file of more than `size` bytes."""
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        try:
+            call(path)
+            said = "written"
+        except (InputError, OSError) as error:
+            said = f"one line, {'File too large' in str(error)}"
+        except BaseException as error:
+            said = repr(error)
+        os.write(writing, said.encode())
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        said = pipe.read()
+    return said if os.waitpid(pid, 0)[1] == 0 else "its process was ended"
+
+
+def a_graph(path):
+    with new_file(path) as fresh:
+        write_torch_script(nn.Linear(9, 9), [torch.zeros(1, 9)], fresh)
+
+
+def a_replay(path):
+    layout = rr.blueprint.Blueprint(rr.blueprint.Spatial3DView(name="the scene"))
+    with new_recording(path, "test", "one", layout) as stream:
+        stream.log("points", rr.Points3D(np.arange(900.0).reshape(-1, 3)))
+
+
+MADE = recording(np.zeros(400), walk(400))
+WRITERS = {
+    "a.csv": lambda path: save_recording(MADE, path, force=True),
+    "a.parquet": lambda path: save_recording(MADE, path, force=True),
+    "arm.pt": a_graph,
+    "a.rrd": a_replay,
+    "a.json": lambda path: write_json(path, list(range(900))),
+}
+"""What writes a file of more than 300 bytes, by the file's name."""
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_write_that_ends_in_the_middle_leaves_the_old_file(tmp_path, name):
+    """As where a quota is used up: half of the file is written, and the next write fails."""
+    path = tmp_path / name
+    path.write_text("old")
+    assert limited(WRITERS[name], path) == "one line, True"
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {name: "old"}
+    assert limited(WRITERS[name], path, 1 << 30) == "written"
+    assert path.stat().st_size > 300
+
+
+@pytest.mark.parametrize("size", [0, 300])
+def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path, monkeypatch, size):
+    monkeypatch.setattr(live_view, "FLUSH_S", 1.0)
+    path, bench = tmp_path / "a.rrd", live_view.LiveBench(3, 2, "kPa", 70.0, "a bench", False)
+
+    def view(path):
+        with live_view.live_view(bench, file=path):
+            pass
+
+    path.write_text("old")
+    assert limited(view, path, size).startswith("one line")
+    assert path.read_text() == "old"
+    assert limited(view, path, 1 << 30) == "written"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -102,3 +185,30 @@ def test_a_clock_that_goes_back_changes_nothing_that_is_read(tmp_path):
         os.utime(path, (0, 0))
     assert load_model(tmp_path / "arm").spec == default_arm().spec
     assert load_recording(tmp_path / "a.csv").samples == 9
+
+
+def test_a_clock_that_jumps_decides_nothing():
+    """Times are those of the monotonic clock; the wall clock gives names, dates and guesses."""
+    package = Path(surgisoft.__file__).parent
+    calendar = re.compile(r"time\.time(_ns)?\(|datetime\.(utc)?now|\.(to)?today\(")
+    found = {
+        str(path.relative_to(package))
+        for path in package.rglob("*.py")
+        if calendar.search(path.read_text())
+    }
+    assert found == {
+        "agents/run_folder.py",  # name of a new run's folder, which need not be free; its date
+        "cli/progress.py",  # when a command will have ended
+    }
+
+
+def test_two_runs_of_one_second_get_two_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder, "datetime", SimpleNamespace(now=lambda: datetime(2026, 1, 1)))
+    names = []
+    for _ in range(3):
+        names.append(run_folder.default_folder("reach"))
+        names[-1].mkdir(parents=True)
+    assert [path.name for path in names] == [
+        f"reach-20260101-000000{end}" for end in ("", "-1", "-2")
+    ]

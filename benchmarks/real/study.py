@@ -238,8 +238,8 @@ def _amended(
     """Error without and with effects on the held-out quarter, mm; None without effects.
 
     Where they were fitted together with the network: without them that of the network that was
-    trained on as long. The given model may have been fitted to the held-out rows, the trained ones
-    have not.
+    trained for as many epochs. The given model may have been fitted to the held-out rows, the
+    trained ones have not.
     """
     if not effects:
         return None

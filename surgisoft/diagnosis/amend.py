@@ -21,7 +21,7 @@ from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import LEAST_KNOWN, Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import open_model, refuse_predictions
 from surgisoft.diagnosis.pairs import LEAST_SHARE, Change, Paired, before_and_after
-from surgisoft.diagnosis.refit import Refit, can_hide, fit_together, refit_reason
+from surgisoft.diagnosis.refit import Refit, apart_mm, can_hide, fit_together, refit_reason
 from surgisoft.diagnosis.refit import refit as refit_effects
 from surgisoft.diagnosis.residuals import Problem, Sealed, residual_table
 from surgisoft.diagnosis.statistics import block_interval, block_sums
@@ -263,8 +263,10 @@ def amend(
     paired difference (`pairs`), so that the network's error does not enter; paired: as for
     `diagnose`.
     refit: `always` fits the whole network together with the
-    effects, `auto` does where a network may have imitated them (`surgisoft.diagnosis.refit`) and
-    held-out runs reward it, `never` does not; refit_progress and processes as for `diagnose`.
+    effects, `never` does not, `auto` does where a network may have imitated them
+    (`surgisoft.diagnosis.refit`) and the joint fit leaves less on left-out rows than the network
+    alone, and than the effects fitted to the network as it is; refit_progress and processes as for
+    `diagnose`.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text: None)
@@ -297,6 +299,16 @@ def amend(
         judged = refit_effects(
             problem, reason, together=names, progress=refit_progress, processes=processes
         )
+    if judged is not None and judged.winner is not None and refit == "auto":
+        joint_mm = judged.candidates[0].heldout_rmse_mm
+        plain_mm = apart_mm(problem, names)
+        if plain_mm is not None and plain_mm <= joint_mm:
+            judged = None
+            notes = (
+                *notes,
+                f"on rows left out in turn the network as it is leaves {plain_mm:.3f} mm with the "
+                f"effects, fitted together with them {joint_mm:.3f} mm: it stays as it is",
+            )
     if judged is not None and (refit == "always" or judged.winner is not None):
         joint = fit_together(problem, names, judged.candidates[0], progress=refit_progress)
         better, retuned, parameters = joint.model, False, joint.parameters

@@ -17,7 +17,7 @@ from surgisoft.diagnosis.estimation.intervals import Parameter, values_text
 from surgisoft.diagnosis.estimation.network import retune
 from surgisoft.diagnosis.inputs import Model, Recordings, open_inputs
 from surgisoft.diagnosis.other_models import open_model, refuse_predictions
-from surgisoft.diagnosis.refit import JointFit, fit_together
+from surgisoft.diagnosis.refit import JointFit, apart_mm, fit_together
 from surgisoft.diagnosis.residuals import Sealed, model_discrepancy, residual_table
 from surgisoft.errors import InputError
 from surgisoft.measurement.recordings import Recording
@@ -166,7 +166,7 @@ def improve(
         rounds.append(done)
         tell(done)
 
-    going = True
+    going, trained = True, False  # whether the network was trained on these rows
     while going and len(added) < most_effects:
         found = diagnose(
             models[-1],
@@ -186,6 +186,9 @@ def improve(
             before = problem.with_model(models[-1])
             fitted: Fitted | JointFit
             together = found.refit is not None and found.refit.winner == name
+            if found.refit is not None and together and refit == "auto" and not trained:
+                plain_mm = apart_mm(before, [*added, name])
+                together = plain_mm is None or plain_mm > found.refit.of(name).heldout_rmse_mm
             if found.refit is not None and together:
                 validated = found.refit.of(name)
                 fitted = fit_together(before, [*added, name], validated, progress=refit_progress)
@@ -212,6 +215,7 @@ def improve(
             models.append(fitted.model)
             parameters = fitted.parameters
             if isinstance(fitted, JointFit):
+                trained = True
                 known = fitted.model.training_residuals
                 discrepancy = model_discrepancy(fitted.model, problem.noise_mm)
                 problem = replace(problem, discrepancy_mm=discrepancy)

@@ -27,9 +27,10 @@ import numpy as np
 import torch
 
 from surgisoft.diagnosis.data_quality import FAR_ROWS, far_share
-from surgisoft.diagnosis.estimation.effects import shrink, starts
+from surgisoft.diagnosis.estimation.effects import fit_effects, shrink, starts
 from surgisoft.diagnosis.estimation.intervals import Parameter
 from surgisoft.diagnosis.estimation.nuisance import kinds
+from surgisoft.diagnosis.inputs import LEAST_KNOWN
 from surgisoft.diagnosis.residuals import TOGETHER, Problem
 from surgisoft.diagnosis.statistics import (
     block_interval,
@@ -743,6 +744,29 @@ def _decided(
     if competing:
         sure = min(sure, ASKED.most_confidence)
     return best.effect, tuple(score.effect for score in competing), of_line, sure
+
+
+def apart_mm(problem: Problem, effects: Iterable[str], config: RefitConfig = REFIT) -> float | None:
+    """Error of effects that are fitted to the network as it is, on the parts that a refit leaves
+    out in turn, mm: what a joint fit has to beat.
+
+    A network that is trained on with few motions may get worse elsewhere, more than the effects
+    make it better. None where the network was fitted to some of the rows, so that its error there
+    is no test, and where a part alone cannot be fitted.
+    """
+    known = problem.model.fitted_rows
+    if known is not None and known.share_of(problem.history) >= LEAST_KNOWN:
+        return None
+    names, split = list(dict.fromkeys(effects)), Split.of(problem, config)
+    square = 0.0
+    for part in range(config.seeds):
+        out = split.part == part
+        try:
+            fitted = fit_effects(problem.without_blocks(out), names)
+        except InputError:
+            return None
+        square += float(split.losses(fitted.model)[out].sum())
+    return float(np.sqrt(square / _counts(split).sum()))
 
 
 # The model that results -----------------------------------------------------------------------

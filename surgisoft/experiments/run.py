@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from surgisoft.agents.evaluate import episode_table
+from surgisoft.agents.evaluate import RATES, episode_table
 from surgisoft.agents.exact_checks import EpisodeCheck, ExactChecks, has_obstacles
 from surgisoft.agents.on_rig import at_benches, real_benches
 from surgisoft.agents.rollout import EpisodeRecorders, Instant, Rollout, rollout
@@ -178,13 +178,24 @@ def read_rows(folder: Path, every: list[Job]) -> list[Row]:
             row = read_json(file)
             place = (job.setting.label, episode)
             known = isinstance(row, dict) and (row.get("setting"), row.get("episode")) == place
-            if not known or (rows and _kinds(row) != _kinds(rows[0])):
+            if not known or not _is_whole(row) or (rows and _kinds(row) != _kinds(rows[0])):
                 raise InputError(
                     f"{file}: is not the row of episode {episode} of '{job.setting.label}'; "
                     "delete it and continue with --resume"
                 )
             rows.append(row)
     return rows
+
+
+def _is_whole(row: Row) -> bool:
+    """Whether a row has what every row has, with success, collision and failure as 0 or 1."""
+    rates = [row.get(name, 0) for name in RATES]
+    texts = [row.get(name) for name in ("case", "outcome")]
+    return (
+        "success" in row
+        and all(type(rate) in (int, float) and rate in (0, 1) for rate in rates)
+        and all(isinstance(text, str) for text in texts)
+    )
 
 
 def _kinds(row: Row) -> dict[str, type]:

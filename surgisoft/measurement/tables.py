@@ -22,6 +22,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.parquet_pages import MOST_UNPACKED, open_metadata
 
 MISSING = ("", "NaN", "nan", "NAN")
 """Texts that mean a missing value."""
@@ -31,11 +32,6 @@ LARGEST = 1e100
 """A number of this size or more is no measurement: its square and cube would be infinite."""
 BLOCK_BYTES = 1 << 20
 """Text of up to this size is read cell by cell where pyarrow refuses it; more goes in parts."""
-MOST_UNPACKED = 1 << 28
-"""Largest text in a compressed file, bytes; a small file can claim a thousand times its size."""
-MOST_PACKED = 100
-"""Most bytes of numbers in each byte of a Parquet file, where they are more than `MOST_UNPACKED`:
-measured positions have noise and do not compress."""
 _COMPRESSED = {b"\x1f\x8b": gzip, b"BZh": bz2, b"\xfd7zXZ": lzma}
 
 
@@ -80,18 +76,11 @@ class ParquetTable:
     @classmethod
     def open(cls, path: Path) -> "ParquetTable":
         """Open a Parquet file without reading its columns; InputError if it is unreadable."""
+        content = open_metadata(path)
         try:
-            content = pq.read_metadata(path)
-            names = list(content.schema.to_arrow_schema().names)
-        except (pa.ArrowException, OSError, ValueError) as error:
+            return cls(path, list(content.schema.to_arrow_schema().names))
+        except (pa.ArrowException, ValueError) as error:
             raise InputError(f"{path}: not a readable Parquet file") from error
-        claimed, most = 8 * content.num_rows * len(names), MOST_PACKED * path.stat().st_size
-        if claimed > max(most, MOST_UNPACKED):
-            raise InputError(
-                f"{path}: claims {content.num_rows} rows of {len(names)} columns in "
-                f"{path.stat().st_size} bytes; expected a Parquet file with measurements"
-            )
-        return cls(path, names)
 
     def numbers(self, positions: Sequence[int]) -> np.ndarray:
         """Cells (T, len(positions)) float64 of columns; raises InputError for other types."""

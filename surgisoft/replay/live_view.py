@@ -49,6 +49,9 @@ LARGE_MM = 1.0
 """Residual at which the colour scale of the key points ends (mm)."""
 WINDOW_S = 60.0
 """Time that the plots show while the run lasts (s)."""
+FLUSH_S = 30.0
+"""Longest time that is waited for the view's last data to be written, s; rerun-sdk 0.41 would wait
+for ever where a disk is full."""
 EVENTS = "/events"
 """Entity of the text log."""
 LEGEND = "/legend"
@@ -259,14 +262,29 @@ def live_view(
             targets.append(rr.GrpcSink(f"rerun+http://{LOCAL}:{data}/proxy"))
         if file is not None:
             targets.append(rr.FileSink(stack.enter_context(new_file(file))))
-        recording.set_sinks(*targets, default_blueprint=live_blueprint(bench))
-        stack.callback(recording.disconnect)
+        with _one_line(file):
+            recording.set_sinks(*targets, default_blueprint=live_blueprint(bench))
+            stack.callback(recording.disconnect)
+            view = LiveView(recording, bench)
         if web:
             on_address(web_address(page, data))
-        view = LiveView(recording, bench)
         yield view
-        recording.send_blueprint(live_blueprint(bench, view.end_s))
-        recording.flush()
+        # Without a file, what failed is a viewer that was closed, which is no error.
+        with contextlib.suppress(RuntimeError), _one_line(file):
+            recording.send_blueprint(live_blueprint(bench, view.end_s))
+            recording.flush(timeout_sec=FLUSH_S)
         if viewer is not None and stay():
             with contextlib.suppress(KeyboardInterrupt):
                 viewer.wait()
+
+
+@contextlib.contextmanager
+def _one_line(file: Path | None) -> Iterator[None]:
+    """What rerun raises where it cannot write the file, as InputError."""
+    try:
+        yield
+    except RuntimeError as error:
+        if file is None:
+            raise
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{file}: the view is not written ({reason})") from error

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
 from surgisoft.errors import InputError
 from surgisoft.files import new_file
@@ -25,16 +26,46 @@ STEP = "step"
 def new_recording(
     path: Path, application: str, identity: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
-    """A recording to log to; the file appears when the block ends without an exception."""
+    """A recording to log to; the file appears when the block ends without an exception.
+
+    It is kept in memory until then: rerun-sdk 0.41 waits for ever where its own writing fails, on a
+    full disk for example.
+    """
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
+    flush_and_cleanup_orphaned_recordings()  # the last recording's threads, which no one holds now
     with new_file(path) as fresh:
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
-        recording.save(fresh, default_blueprint=blueprint)
+        content = recording.memory_recording()
+        with _ended_blueprint(blueprint):
+            recording.send_blueprint(blueprint, make_active=False)
         yield recording
-        recording.flush()
+        fresh.write_bytes(content.drain_as_bytes())
         recording.disconnect()
+
+
+@contextlib.contextmanager
+def _ended_blueprint(blueprint: rrb.Blueprint) -> Iterator[None]:
+    """End the streams that rerun opens for a layout inside the block.
+
+    rerun-sdk 0.41 keeps the stream in memory, with two threads, until the process ends: a thousand
+    replays of one experiment had four thousand threads.
+    """
+    streams: list[rr.RecordingStream] = []
+    write = blueprint._log_to_stream
+
+    def kept(stream: rr.RecordingStream) -> None:
+        streams.append(stream)
+        write(stream)
+
+    blueprint._log_to_stream = kept  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        del blueprint._log_to_stream
+        for stream in streams:
+            stream.disconnect()
 
 
 class Columns:

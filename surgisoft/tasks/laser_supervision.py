@@ -78,8 +78,8 @@ def _retracted(task: LaserTask, state: TaskState, within: float) -> Tensor:
 
 def _incomplete(row: Row) -> tuple:
     """Success first, then the share that was completed, then the beam's error."""
-    error = row.get("beam_error_mean_mm")
-    return (1.0 - row["success"], 1.0 - row["completion"], error or 0.0)
+    error, share = row.get("beam_error_mean_mm"), row.get("completion")
+    return (1.0 - row["success"], 1.0 - (share or 0.0), error or 0.0)
 
 
 HOW = (

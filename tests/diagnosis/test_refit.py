@@ -16,7 +16,13 @@ from surgisoft.diagnosis import improve as improving
 from surgisoft.diagnosis import refit as refitting
 from surgisoft.diagnosis.diagnose import Diagnosis, ErrorLevels, Ranked, Verdict, with_refit
 from surgisoft.diagnosis.inputs import identification_problem
-from surgisoft.diagnosis.refit import RefitConfig, fit_together, reason_to_refit, refit
+from surgisoft.diagnosis.refit import (
+    RefitConfig,
+    apart_mm,
+    fit_together,
+    reason_to_refit,
+    refit,
+)
 from surgisoft.errors import InputError
 from surgisoft.measurement.fitting import fit
 from surgisoft.measurement.recordings import Recording, save_recording
@@ -299,6 +305,36 @@ def test_command_and_python_say_the_same_and_amend_makes_the_error_fall(
     assert better.steps[0][0] == "line_lag"
     assert better.rounds[0].together
     assert better.claimed
+
+
+def test_a_network_that_needs_no_training_stays_as_it_is(problem, lagging, found, monkeypatch):
+    """The network of the arm without its lag needs the lag beside it, and no training."""
+    clean = fitted_to(arm_by_hand(0.0, rows=900), epochs=60)
+    rows = identification_problem(clean, [lagging[0]])
+    assert apart_mm(problem, ["line_lag"], SHORT) is None, "fitted to these rows"
+    unknown = replace(problem, model=problem.model.replace())
+    unknown.model.fitted_rows = None
+    apart, imitated = (apart_mm(each, ["line_lag"], SHORT) for each in (rows, unknown))
+    assert NOISE_MM < apart < 0.4 * rows.rmse_mm
+    assert imitated > 2 * found.of("line_lag").heldout_rmse_mm, "there only a joint fit helps"
+
+    def judged(heldout_mm):
+        best = replace(found.of("line_lag"), heldout_rmse_mm=heldout_mm)
+        return lambda *given, **options: replace(found, candidates=(best,))
+
+    def joint(*given, **options):
+        raise AssertionError("fitted together")
+
+    monkeypatch.setattr(amending, "refit_reason", lambda *given: "the network may imitate it")
+    monkeypatch.setattr(amending, "fit_together", joint)
+    monkeypatch.setattr(amending, "refit_effects", judged(1.1 * apart))
+    amended = amending.amend(clean, [lagging[0]], "line_lag")
+    assert amended.refit is None
+    assert amended.claimed
+    assert any("it stays as it is" in note for note in amended.notes)
+    monkeypatch.setattr(amending, "refit_effects", judged(0.5 * apart))
+    with pytest.raises(AssertionError, match="fitted together"):
+        amending.amend(clean, [lagging[0]], "line_lag")
 
 
 @pytest.mark.parametrize("name", ["diagnose", "amend", "improve"])

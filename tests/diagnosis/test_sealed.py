@@ -115,5 +115,5 @@ def test_held_out_rows_are_opened_once(pair):
     assert np.isnan(table.history.rows(table.history.key_points).numpy()[held]).all()
     check = sealed.opened(table).final_check()
     np.testing.assert_array_equal(check.measured, made.key_points_mm[held])
-    with pytest.raises(ValueError, match="opened before"):
+    with pytest.raises(ValueError, match="used before"):
         sealed.opened(table)

@@ -13,6 +13,7 @@ from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments.plan import build_task, settings
+from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import open_results, run_experiment
 from surgisoft.experiments.spec import load_experiment
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
@@ -138,10 +139,15 @@ def test_a_damaged_row_is_one_line(whole, tmp_path):
     texts = ["[]", "[" * 10**5, json.dumps(content | {"episode": 7})]
     texts += [json.dumps(content | {"clearance_mm": "x"}), json.dumps(content | {"new": 1})]
     texts.append(json.dumps(content | {"clearance_mm": 10**400}))
+    texts += [json.dumps(content | {"success": value}) for value in (65536.0, -1.0, 0.5, None, "1")]
+    texts += [json.dumps(content | {"outcome": None}), json.dumps(content | {"case": 1.0})]
     for text in texts:
         row.write_text(text)
         with pytest.raises(InputError, match=row.name):
             run_experiment(spec, tmp_path / "results")
+    row.write_text(json.dumps(content | {"completion": None}))
+    rows = run_experiment(spec, tmp_path / "results")
+    assert sum_up(spec, tmp_path / "results", rows).settings[0].overall["completion"].episodes == 2
     row.write_text(json.dumps(content))
     assert len(run_experiment(spec, tmp_path / "results")) == 3
 

@@ -1,11 +1,14 @@
 """Every bad recording gets one line: the file, the place, what came, what was expected."""
 
+import re
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from surgisoft.errors import InputError
+from surgisoft.measurement import parquet_pages
 from surgisoft.measurement.recordings import load_recording, load_recordings
 
 HEAD = "t_s,p1_kPa,k0_x_mm,k0_y_mm,k0_z_mm"
@@ -236,6 +239,21 @@ def test_a_parquet_file_cannot_claim_gigabytes(tmp_path):
     pq.write_table(pa.table([zeros] * len(names), names=names), path, row_group_size=10**7)
     assert path.stat().st_size < 300_000
     assert "claims 10000000 rows of 5 columns" in error_of(path)
+
+
+def test_the_pages_of_a_parquet_file_cannot_claim_gigabytes(tmp_path, monkeypatch):
+    """Headers that state 1 MiB for pages of 160 kB; pyarrow takes that memory before it reads."""
+    monkeypatch.setattr(parquet_pages, "MOST_UNPACKED", 1 << 20)
+    path, names = tmp_path / "bad.parquet", HEAD.split(",")
+    table = pa.table([np.zeros(20_000)] * len(names), names=names)
+    pq.write_table(table, path, use_dictionary=False, compression="zstd")
+    assert "claims" not in error_of(path)
+    sizes = re.compile(rb"(\x15\x00\x15)[\x80-\xff]{2}[\x01-\x7f](\x15)")  # PageHeader 1, 2, 3
+    most = b"\xfe\xff\x7f"  # 2**20 - 1 in the same three bytes
+    content, changed = sizes.subn(lambda found: found[1] + most + found[2], path.read_bytes())
+    path.write_bytes(content)
+    assert changed == len(names)
+    assert f"claims pages of {2 * (2**20 - 1)} bytes" in error_of(path)
 
 
 @pytest.mark.parametrize("name", ["p" + "1" * 5000 + "_kPa", "k" + "9" * 5000 + "_x_mm"])

@@ -18,6 +18,7 @@ from surgisoft.errors import InputError
 from surgisoft.scene import mesh
 from surgisoft.tasks.base import Episodes
 from surgisoft.tasks.episodes import parts
+from surgisoft.tasks.episodes.consistency import contradiction
 from surgisoft.tasks.episodes.file import load_episode, save_episode
 from surgisoft.tasks.episodes.log import EpisodeRecorder
 from surgisoft.tasks.registry import make_task
@@ -42,6 +43,12 @@ def members(tmp_path_factory):
     save_episode(replace(log, dose=dose), file)
     with zipfile.ZipFile(file) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def log(members, tmp_path_factory):
+    """The log in the file."""
+    return load_episode(written(tmp_path_factory.mktemp("log"), members))
 
 
 def written(folder, members):
@@ -170,3 +177,78 @@ def test_a_table_with_another_value_is_refused(members, tmp_path, path, value, s
 
 def test_roles_are_those_of_scenes():
     assert parts.ROLES == mesh.ROLES
+
+
+def with_arm(log, **fields):
+    """The log with fields of its first arm changed."""
+    name, arm = next(iter(log.arms.items()))
+    return replace(log, arms=log.arms | {name: replace(arm, **fields)})
+
+
+def with_body(log, **fields):
+    """The log with fields of its first body changed."""
+    return replace(log, bodies=(replace(log.bodies[0], **fields), *log.bodies[1:]))
+
+
+def with_dose(log, **fields):
+    """The log with fields of its dose changed."""
+    return replace(log, dose=replace(log.dose, **fields))
+
+
+def with_first(log, table, **fields):
+    """The log with fields of the first entry of `beams` or `cameras` changed."""
+    name, part = next(iter(getattr(log, table).items()))
+    return replace(log, **{table: {name: replace(part, **fields)}})
+
+
+CONTRADICTIONS = {
+    "it has no rows": lambda log: replace(log, time_s=log.time_s[:0]),
+    "its times do not rise": lambda log: replace(log, time_s=log.time_s[::-1].copy()),
+    "its targets and actual places do not belong together": lambda log: replace(
+        log, targets_mm=log.targets_mm[:, :0], actuals_mm=log.actuals_mm[:, :0]
+    ),
+    "it has no arms": lambda log: replace(log, arms={}, agents=()),
+    "its paths have no beginnings": lambda log: replace(
+        log, path_starts=np.array([0]), path_closed=None
+    ),
+    "its paths do not begin one after the other": lambda log: replace(
+        log, path_starts=np.array([1]), path_closed=np.array([True])
+    ),
+    "has no body": lambda log: with_arm(
+        log, **dict.fromkeys(("points_mm", "seen_mm"), np.zeros((len(log.time_s), 0, 3)))
+    ),
+    "a radius or a shaft of an impossible size": lambda log: with_arm(log, radius_mm=0.0),
+    "its limits are no numbers": lambda log: replace(log, limits={"clearance_mm": "1"}),
+    "it has a beam without the arm 'x'": lambda log: replace(
+        log, beams={"x": next(iter(log.beams.values()))}
+    ),
+    "two of its bodies have one name": lambda log: replace(
+        log, bodies=(*log.bodies, log.bodies[0])
+    ),
+    "an event of an unknown level 'x'": lambda log: replace(
+        log, events=(parts.Event(0.0, "x", "text"),)
+    ),
+    "'path_mm' of the log is no array": lambda log: replace(log, path_mm=[[0.0, 0.0, 0.0]]),
+    "holds infinite numbers": lambda log: with_first(
+        log, "beams", power_w=np.full(len(log.time_s), np.inf)
+    ),
+    "'driver' of the log is no text": lambda log: replace(log, driver=1),
+    "'seed' of the log is no integer": lambda log: replace(log, seed=1.5),
+    "the camera's range is no pair of numbers": lambda log: with_first(
+        log, "cameras", range_mm=(1.0,)
+    ),
+    "has an unknown role 'x'": lambda log: with_body(log, role="x"),
+    "has no face": lambda log: with_body(log, faces=np.zeros((0, 3), np.int32)),
+    "the dose has an unknown zone": lambda log: with_dose(log, zone=log.dose.zone + 3),
+    "on a face of a negative number": lambda log: with_dose(log, faces=-1 - log.dose.faces),
+    "a limit that is not above 0": lambda log: with_dose(log, cut_j_per_mm2=0.0),
+    "its rewards are no table": lambda log: replace(log, rewards=[1.0]),
+    "is no number for each of": lambda log: replace(log, measures={"a": np.zeros(1)}),
+}
+
+
+@pytest.mark.parametrize("said", CONTRADICTIONS)
+def test_a_log_that_contradicts_itself_says_where(log, said):
+    assert contradiction(log) is None
+    found = contradiction(CONTRADICTIONS[said](log))
+    assert said in (found or "")

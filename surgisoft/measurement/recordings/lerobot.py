@@ -24,10 +24,10 @@ import pyarrow.parquet as pq
 from surgisoft.config import from_table, read_toml
 from surgisoft.errors import InputError
 from surgisoft.files import new_folder, read_json
+from surgisoft.measurement.parquet_pages import check_claim, open_metadata
 from surgisoft.measurement.recordings.columns import parse_header
 from surgisoft.measurement.recordings.recording import Recording
 from surgisoft.measurement.recordings.sidecar import Sidecar, sidecar_text
-from surgisoft.measurement.tables import MOST_PACKED, MOST_UNPACKED
 
 VERSION = "v3.0"
 """Version of the format that is written and read."""
@@ -505,11 +505,8 @@ def _frames(file: Path, columns: dict[str, list[str]]) -> np.ndarray:
     """(T, c) the frames of one file."""
     width = sum(map(len, columns.values()))
     try:
-        rows = pq.read_metadata(file).num_rows
-        if 8 * rows * width > max(MOST_PACKED * file.stat().st_size, MOST_UNPACKED):
-            raise InputError(
-                f"{file}: claims {rows} frames of {width} numbers in {file.stat().st_size} bytes"
-            )
+        rows = open_metadata(file).num_rows
+        check_claim(file, 8 * rows * width, f"{rows} frames of {width} numbers")
         table = pq.read_table(file, columns=list(columns))
         blocks = [_block(table[key].combine_chunks(), len(columns[key])) for key in columns]
         return np.column_stack(blocks)

@@ -19,7 +19,7 @@ import numpy as np
 from surgisoft.apart import packed, read_apart, unpacked
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.tables import MOST_PACKED, MOST_UNPACKED
+from surgisoft.measurement.parquet_pages import MOST_PACKED, MOST_UNPACKED
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""

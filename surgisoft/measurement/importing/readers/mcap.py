@@ -23,7 +23,7 @@ import numpy as np
 
 from surgisoft.errors import InputError
 from surgisoft.measurement.importing.raw import FileRole, RawTable, Reader
-from surgisoft.measurement.tables import MOST_PACKED, MOST_UNPACKED
+from surgisoft.measurement.parquet_pages import MOST_PACKED, MOST_UNPACKED
 
 MAGIC = b"\x89MCAP0\r\n"
 """First bytes of an MCAP file."""

@@ -1,0 +1,25 @@
+"""Writing of Rerun recordings: nothing of one stays in the process behind it."""
+
+from pathlib import Path
+
+import pytest
+import rerun as rr
+import rerun.blueprint as rrb
+
+from surgisoft.replay.recording import new_recording
+
+TASKS = Path("/proc/self/task")
+
+
+def threads_behind(path, number: int) -> int:
+    """Write a recording with a layout; the number of threads behind it."""
+    layout = rrb.Blueprint(rrb.TimeSeriesView(origin="/", name="values"))
+    with new_recording(path, "test", f"number {number}", layout) as recording:
+        recording.log("a", rr.Scalars(1.0))
+    return len(list(TASKS.iterdir()))
+
+
+@pytest.mark.skipif(not TASKS.is_dir(), reason="no list of threads here")
+def test_many_recordings_take_no_more_threads_than_two(tmp_path):
+    threads = [threads_behind(tmp_path / "a.rrd", number) for number in range(6)]
+    assert threads[-1] <= threads[1]

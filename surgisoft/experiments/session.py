@@ -23,7 +23,7 @@ from surgisoft.files import write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
-from surgisoft.rig.registry import SIMULATED, parse_rig
+from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import PHANTOM, packaged_scene
 from surgisoft.tasks.base import Task
@@ -113,7 +113,10 @@ def with_rigs(spec: Experiment, rigs: Iterable[str], preflight: bool = False) ->
         replace(case, rigs=rigs, preflight=preflight) if case.plant == "rig" else case
         for case in spec.cases
     )
-    names = {parse_rig(text).name for text in rigs_by_arm(rigs, spec.of.agents).values()}
+    texts = rigs_by_arm(rigs, spec.of.agents).values()
+    for text in texts:
+        check_rig(text)
+    names = {parse_rig(text).name for text in texts}
     together = spec.together if names <= set(SIMULATED) else 1
     return replace(spec, cases=cases, together=together)
 

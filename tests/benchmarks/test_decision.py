@@ -213,14 +213,23 @@ def test_the_fewest_wrong_names_that_cost_few_right_ones(wrong, right, needless,
     assert (-found.wrong_name, -found.needless_name) == costs
 
 
-def test_cases_without_their_truth_have_the_stated_weight():
-    """Real cases keep a mean weight of 1 together with them: 10 + 0.3 x 10 = 13 in all."""
-    twins = [replace(one, label="unknown", left_out=("creep",)) for one in some_cases(count=10)]
-    some = sample("known", [case(n) for n in range(10)] + twins)
-    weights = case_weights("known", some, 0.3)
-    assert weights[:10] == pytest.approx(10 * [1.0])
-    assert weights[10:] == pytest.approx(0.3 * weights[:1].repeat(len(weights) - 10))
-    assert len(weights) == 10 + sum(one.size >= 0.5 for one in twins)
+def test_cases_without_their_truth_share_the_weight_of_unknown_ones():
+    """Six known cases, four of an unknown effect and ten without their truth, at 0.3 of a real one.
+
+    The two kinds count alike (PRIORS), 5 of 10 each, and of the unknown ones' 5 the ten have 3 / 7.
+    Where no share is stated, in `missing`, they take nothing from cases where nothing is missing.
+    """
+    known = [case(n) for n in range(6)]
+    unknown = [case(n, label="unknown", truth=("leak",)) for n in range(6, 10)]
+    twins = [replace(case(n, label="unknown"), left_out=("creep",)) for n in range(10, 20)]
+    weights = case_weights("known", sample("known", known + unknown + twins), 0.3)
+    assert weights[:6] == pytest.approx(6 * [5 / 6])
+    assert weights[6:10] == pytest.approx(4 * [5 * 4 / 7 / 4])
+    assert weights[10:] == pytest.approx(10 * [5 * 3 / 7 / 10])
+    clean = [case(n, label="clean", truth=(), size=0.0) for n in range(20, 30)]
+    weights = case_weights("missing", sample("missing", known + unknown + twins + clean), 0.3)
+    assert weights[-10:] == pytest.approx(10 * [1.0])
+    assert weights[:20].sum() == pytest.approx(10.0)
 
 
 def test_the_table_counts_cases_without_their_truth_apart():

@@ -68,7 +68,7 @@ docs: $(DOCS_STAMP)  ## the documentation site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "Read it with: $(BIN)/python -m http.server --directory site"
 
-tutorials: $(STAMP)  ## run every block of code of the tutorials (ten minutes)
+tutorials: $(STAMP)  ## run every block of code of the tutorials, and the guides' Python
 	$(BIN)/python docs/run_tutorials.py
 
 clean:

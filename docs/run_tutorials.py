@@ -1,9 +1,9 @@
-"""Run the tutorials: every block of code in docs/tutorials, in order, and write what it prints.
+"""Run the code of the documentation: tutorials with all their blocks, guides with their Python.
 
     python docs/run_tutorials.py [NAME...]           run pages; stop at the first block that fails
     python docs/run_tutorials.py --write [NAME...]   also renew their outputs and pictures
 
-Each page runs in an empty folder of its own. What a block is, its fence says:
+A tutorial (docs/tutorials) runs in an empty folder of its own. What a block is, its fence says:
 
 - `bash`: lines for the shell, in which `surgisoft` is the one of this Python;
 - `python`: Python; all blocks of a page share their names;
@@ -13,6 +13,10 @@ Each page runs in an empty folder of its own. What a block is, its fence says:
 
 A picture of a page, `![...](images/NAME.png)`, is the file NAME.png that its blocks left in the
 folder; --write copies it, at most `MOST_PIXELS` wide.
+
+A guide (README.md and docs) runs in a folder with a recording, a model, a trained policy and the
+scenes; a block that begins with `# NAME.py` is also that file. Its lines for the shell are parsed
+by tests/test_docs.py: commands and options exist.
 """
 
 import contextlib
@@ -32,16 +36,31 @@ MOST_PIXELS = 1000
 """Widest picture that is kept; all pictures together stay below 2 MB."""
 COLOURS = 128
 """Colours of a picture that is kept."""
+ROOT = PAGES.parents[1]
+NOT_RUN = {
+    "docs/rigs.md": "drives the devices of a laboratory; a rig of four methods is run by own_rig",
+    "docs/export.md": "reads a bench's samples; tests/agents/test_export.py runs controller.py",
+}
+"""Guides whose Python cannot run without a robot, and what runs in their place."""
 PICTURE = re.compile(r"\]\(images/([\w-]+\.png)\)")
+PYTHON = re.compile(r"^(?P<indent> *)```python\n(?P<body>.*?)^ *```", re.S | re.M)
 BLOCK = re.compile(r"^```(?P<info>[^\n]*)\n(?P<body>.*?)^```\n", re.S | re.M)
 
 
 def main(arguments: list[str]) -> int:
     """Run the pages that are named, or all of them."""
     write = "--write" in arguments
-    names = [name for name in arguments if not name.startswith("-")]
+    names = [name.removesuffix(".md") for name in arguments if not name.startswith("-")]
+    for guide in guides():
+        name = guide.relative_to(ROOT).with_suffix("").as_posix()
+        if not names or name in names:
+            began = time.perf_counter()
+            with tempfile.TemporaryDirectory(prefix="guide-") as folder:
+                prepare(Path(folder))
+                run_guide(guide.read_text(), Path(folder), guide.name)
+            print(f"{name}: {time.perf_counter() - began:.0f} s")
     pages = [PAGES / f"{name}.md" for name in names] or sorted(PAGES.glob("*.md"))
-    for page in pages:
+    for page in filter(Path.is_file, pages):
         if page.name == "index.md":
             continue
         began = time.perf_counter()
@@ -59,6 +78,44 @@ def main(arguments: list[str]) -> int:
             page.write_text(text)
         print(f"{page.name}: {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def guides() -> list[Path]:
+    """Pages outside of the tutorials whose Python is run."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    return sorted(
+        page
+        for page in pages
+        if page.parent != PAGES
+        and page.relative_to(ROOT).as_posix() not in NOT_RUN
+        and PYTHON.search(page.read_text())
+    )
+
+
+def prepare(folder: Path) -> None:
+    """Put what the guides' blocks read into a folder: recording, model, policy, scenes."""
+    import surgisoft
+
+    recording = surgisoft.collect("mixed", seed=0, points=900, hidden=["creep"])
+    surgisoft.save_recording(recording, folder / "bench.parquet")
+    surgisoft.save_model(surgisoft.load_model("default"), folder / "arm")
+    shutil.copytree(ROOT / "surgisoft/assets/policies/ring", folder / "runs" / "ring")
+    shutil.copytree(ROOT / "scenes", folder / "scenes")
+    context = (ROOT / "docs/examples/credibility/phantom.toml").read_text()
+    context = context.replace('"bench_1.parquet", "bench_2.parquet"', '"bench.parquet"')
+    context = re.sub(r"\[\[sources\]\]\nname = \"bench_2\"\n(.+\n)*", "", context)
+    (folder / "context.toml").write_text(context.replace("bench_1", "bench"))
+
+
+def run_guide(text: str, folder: Path, name: str) -> None:
+    """Run the blocks of Python of a guide, which share their names."""
+    names: dict = {"__name__": "guide"}
+    for block in PYTHON.finditer(text):
+        indent = len(block["indent"])
+        source = "".join(line[indent:] or "\n" for line in block["body"].splitlines(keepends=True))
+        if titled := re.match(r"# (\w+\.py)\b", source):
+            (folder / titled[1]).write_text(source)
+        python(source, folder, names, name)
 
 
 def run_page(text: str, folder: Path, name: str) -> str:

@@ -17,11 +17,11 @@ LARGEST_KEPT = 1 << 30
 
 
 @functools.cache
-def keep_freed_memory() -> bool:
+def keep_freed_memory(most: int = LARGEST_KEPT) -> bool:
     """Let this process keep memory that it frees, for its next allocations; whether it does.
 
-    For loops that allocate the same large arrays again and again. Only with glibc; elsewhere the
-    call has no effect.
+    For loops that allocate the same large arrays again and again. most: size of the largest blocks
+    that are kept, bytes. Only with glibc; elsewhere the call has no effect.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -30,5 +30,5 @@ def keep_freed_memory() -> bool:
     except (OSError, AttributeError):
         return False
     mallopt.argtypes, mallopt.restype = (ctypes.c_int, ctypes.c_int), ctypes.c_int
-    largest = (1 << 31) - 1
-    return bool(mallopt(_MMAP_THRESHOLD, LARGEST_KEPT) and mallopt(_TRIM_THRESHOLD, largest))
+    kept = min(4 * most, (1 << 31) - 1)
+    return bool(mallopt(_MMAP_THRESHOLD, most) and mallopt(_TRIM_THRESHOLD, kept))

@@ -30,7 +30,7 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
-    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay", "diagnosis"},
     "replay": {"scene", "tasks", "diagnosis"},
     "report": set(),
     "credibility": {
@@ -264,3 +264,48 @@ def test_rig_shares_nothing_with_the_models():
         for name in _imports(path):
             assert not name.startswith(("surgisoft.surrogate", "surgisoft.diagnosis", "torch"))
             assert name != "surgisoft.measurement.histories"
+
+
+UNIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "readline", "resource", "termios", "tty"}
+"""Modules of Python's library that Windows lacks."""
+UNIX_NAMES = {
+    "SIGHUP",
+    "SIGKILL",
+    "SIGALRM",
+    "SIGUSR1",
+    "pthread_kill",
+    "fork",
+    "killpg",
+    "geteuid",
+}
+"""Names of `signal` and `os` that Windows lacks."""
+
+
+def on_import(node: ast.AST):
+    """Nodes of a module that run when it is imported: all but the bodies of its functions."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield child
+            yield from on_import(child)
+
+
+def unix_only(source: str) -> list[str]:
+    """What a module needs on its import that Windows lacks."""
+    found = []
+    for node in on_import(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += UNIX_ONLY & {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found += UNIX_ONLY & {node.module}
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            found += {node.attr} & UNIX_NAMES if node.value.id in ("os", "signal") else ()
+    return found
+
+
+def test_windows_can_import_every_module():
+    assert unix_only("import pty\nS = (signal.SIGHUP,)\ndef f():\n    import tty") == [
+        "pty",
+        "SIGHUP",
+    ]
+    needs = {str(path): unix_only(path.read_text()) for path in PACKAGE.rglob("*.py")}
+    assert {path: found for path, found in needs.items() if found} == {}

@@ -2,16 +2,20 @@
 
 import ast
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer import BadParameter, Exit
 from typer.main import get_command
 
 from surgisoft.cli import COMMANDS, app
+from surgisoft.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
+UsageError = BadParameter.__base__
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 
@@ -65,3 +69,57 @@ def test_the_picture_of_the_architecture_is_that_of_the_imports():
     command = [sys.executable, ROOT / "docs" / "draw_architecture.py", "--check"]
     drawn = subprocess.run(command, capture_output=True, text=True, check=False)
     assert drawn.returncode == 0, drawn.stderr
+
+
+NOT_FOUND = r"no such file|there is no|is no (file|folder)"
+"""Answers to a line whose files are a reader's own."""
+PLACEHOLDER = re.compile(r"(?:^|[=:,/-])[A-Z]{1,}\b|\$|\.\.\.")
+"""A word in the place of a value: N, MODEL, $seed; `...`: options that are not repeated."""
+
+
+def shell_lines(text: str):
+    """Commands of this package in a page's blocks, up to a pipe or a redirection."""
+    for info, body in re.findall(r"^ *```([^\n]*)\n(.*?)^ *```", text, re.S | re.M):
+        if info.partition(" ")[0] in ("", "bash"):
+            for line in re.sub(r"\\\n\s*", " ", body).splitlines():
+                words = shlex.split(line, comments=True) if "surgisoft " in line else []
+                if words[:1] == ["surgisoft"]:
+                    ends = (k for k, word in enumerate(words) if re.match(r"\d?>|[|;&]", word))
+                    yield words[1 : next(ends, None)]
+
+
+def unknown(words: list[str]) -> str | None:
+    """Why the command line does not know a command or an option of a line."""
+    for module in COMMANDS:
+        __import__(f"surgisoft.cli.{module}")
+    command, context = get_command(app), None
+    try:
+        while True:
+            context = command.make_context(command.name, list(words), parent=context)
+            if not hasattr(command, "resolve_command"):
+                return None
+            _, command, words = command.resolve_command(
+                context, context._protected_args + context.args
+            )
+    except (SystemExit, Exit):  # `--version` and lists print, and end
+        return None
+    except InputError as error:
+        return None if re.search(NOT_FOUND, str(error)) else str(error)
+    except UsageError as error:
+        if isinstance(error, BadParameter) and any(map(PLACEHOLDER.search, words)):
+            return None
+        return error.format_message()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_lines_for_the_shell_are_commands(page):
+    for words in shell_lines(page.read_text()):
+        assert unknown(words) is None, (page.name, words)
+
+
+def test_an_unknown_option_in_a_page_is_found():
+    lines = ("surgisoft replay a.rrd --screenshot a.png | cat", "surgisoft scene new x.stl --no")
+    known, wrong = shell_lines("\n".join(("```", *lines, "```\n")))
+    assert known == ["replay", "a.rrd", "--screenshot", "a.png"]
+    assert unknown(known) is None
+    assert "No such option" in unknown(wrong)

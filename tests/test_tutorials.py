@@ -80,3 +80,38 @@ def test_every_output_of_a_tutorial_was_written():
     for page in (DOCS / "tutorials").glob("*.md"):
         for block in tutorials.BLOCK.finditer(page.read_text()):
             assert block["info"] != "text" or block["body"].strip(), page.name
+
+
+GUIDE = """# A guide
+
+```python
+# mine.py: a file of the reader
+n = 4
+```
+
+1. In a list:
+
+   ```python
+   from mine import n as same
+
+   assert same == n
+   n = same + 1
+   ```
+
+```
+surgisoft --version
+```
+"""
+
+
+def test_blocks_of_a_guide_share_names_and_are_files(tmp_path):
+    tutorials.run_guide(GUIDE, tmp_path, "guide")
+    assert (tmp_path / "mine.py").read_text().endswith("n = 4\n")
+    with pytest.raises(AssertionError):
+        tutorials.run_guide(GUIDE.replace("same == n", "same == n + 1"), tmp_path, "guide")
+
+
+def test_python_of_every_guide_is_run_or_says_why_not():
+    run = {page.relative_to(DOCS.parent).as_posix() for page in tutorials.guides()}
+    assert {"README.md", "docs/your_model.md", "docs/tasks.md"} <= run
+    assert all((DOCS.parent / page).is_file() for page in tutorials.NOT_RUN)

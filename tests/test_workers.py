@@ -7,9 +7,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from surgisoft.workers import ONE_THREAD, workers
+from surgisoft.workers import ONE_THREAD, torch_threads, workers
 
 ASKS = """
 import os, sys, time
@@ -81,3 +82,24 @@ def test_ctrl_c_does_not_reach_a_worker_that_starts():
         held = pool.submit(signal.pthread_sigmask, signal.SIG_BLOCK, []).result()
     assert signal.SIGINT in held
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def spent_by_other_threads() -> float:
+    """Processor time, s, that threads other than this one spend on products of matrices."""
+    square = np.ones((1200, 1200))
+    before = time.process_time() - time.thread_time()
+    _ = square @ square
+    return time.process_time() - time.thread_time() - before
+
+
+@pytest.mark.skipif(
+    "openblas" not in np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"],
+    reason="another library than OpenBLAS",
+)
+def test_a_block_of_one_thread_holds_for_products_of_numpy_too():
+    with torch_threads(2):
+        assert spent_by_other_threads() > 0.002
+        with torch_threads(1):
+            time.sleep(0.1)  # idle threads of OpenBLAS spin for a moment before they sleep
+            assert spent_by_other_threads() < 0.001
+        assert spent_by_other_threads() > 0.002

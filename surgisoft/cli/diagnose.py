@@ -33,6 +33,9 @@ from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError
 from surgisoft.files import write_json
 
+MOST_KEPT = 1 << 25
+"""Size of the largest blocks of freed memory that stay with the process, bytes: the temporaries of
+a diagnosis, and not the columns of a long recording."""
 ReplayOfChange = Annotated[
     Path | None,
     typer.Option(
@@ -98,7 +101,9 @@ def diagnose(
 
     from surgisoft.diagnosis.diagnose import diagnose as diagnose_model
     from surgisoft.measurement.recordings import save_recordings
+    from surgisoft.memory import keep_freed_memory
 
+    keep_freed_memory(MOST_KEPT)
     with progress("diagnose") as tell:
         stages = iter(range(1, 100))
         found = diagnose_model(

@@ -21,6 +21,7 @@ def progress(title: str) -> Iterator[Progress]:
     from rich.progress import Progress as RichProgress
 
     console = Console(stderr=True)
+    terminal = console.is_terminal and sys.stderr.isatty()  # notebooks force colours into a pipe
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -29,9 +30,7 @@ def progress(title: str) -> Iterator[Progress]:
         TextColumn("{task.fields[pace]}"),
         TextColumn("{task.fields[note]}"),
     )
-    with RichProgress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    with RichProgress(*columns, console=console, transient=True, disable=not terminal) as bar:
         task = bar.add_task(title, total=None, note="", pace="")
         last, paced = time.monotonic(), Pace()
 
@@ -39,7 +38,7 @@ def progress(title: str) -> Iterator[Progress]:
             nonlocal last
             pace = paced(done, total)
             bar.update(task, completed=done, total=total, note=note, pace=pace)
-            if not console.is_terminal and time.monotonic() - last > LINE_EVERY_S:
+            if not terminal and time.monotonic() - last > LINE_EVERY_S:
                 last = time.monotonic()
                 share = f"{done / total:.0%}" if total else ""
                 parts = ", ".join(part for part in (share, note, pace) if part)

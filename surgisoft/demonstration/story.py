@@ -14,7 +14,7 @@ from surgisoft.agents.session import Evaluations, evaluate
 from surgisoft.diagnosis.amend import Amendment, amend
 from surgisoft.diagnosis.compare import Compared, Comparison, compare
 from surgisoft.diagnosis.diagnose import Diagnosis, diagnose
-from surgisoft.diagnosis.pages.amendment import amend_page, track_chart
+from surgisoft.diagnosis.pages.amendment import amend_page, track_charts
 from surgisoft.diagnosis.pages.compare import write_report
 from surgisoft.diagnosis.pages.diagnosis import diagnosis_page
 from surgisoft.diagnosis.residuals import residual_table
@@ -170,7 +170,10 @@ def _page(result: Demonstration, log, picture: Path | None, drawn: list[Path]) -
         amended = [
             Command(f"surgisoft amend default --effect {names} --data bench.parquet -o amended"),
             *amended,
-            track_chart(result.amendment.tracks[1], "Held-out part of the recording"),
+            *track_charts(
+                {"Held-out part of the recording": result.amendment.tracks[1]},
+                result.amendment.held_out.floor,
+            ),
             Text(
                 "The folder amended holds the new model; it is used like any other, for example "
                 "by `surgisoft train --task track_circle --arm amended`. "
@@ -238,9 +241,11 @@ def _error_pictures(drawn: list[Path]) -> list:
     """Body, loops and error; the broad ones scroll on a narrow page."""
     by_name = {path.stem: path for path in drawn}
     return [
-        Picture.from_file(by_name["body"], "Measured key points and predicted bodies"),
-        Picture.from_file(by_name["loops"], "Loops, measured and predicted", "", BROAD_PX),
-        Picture.from_file(by_name["error"], "Error over the recording", "", BROAD_PX),
+        Picture.from_file(by_name["body"], "Measured and predicted bodies", drawn=True),
+        Picture.from_file(
+            by_name["loops"], "Loops, measured and predicted", "", BROAD_PX, drawn=True
+        ),
+        Picture.from_file(by_name["error"], "Error over the recording", "", BROAD_PX, drawn=True),
     ]
 
 

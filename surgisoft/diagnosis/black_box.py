@@ -51,7 +51,7 @@ def black_box(problem: Problem) -> BlackBox:
 
     The same folds, rows and discrepancy as the effects have.
     """
-    inputs = problem.table.features[problem.index.numpy()]
+    inputs = problem.table.features_at(problem.index.numpy())
     spread = inputs.std(axis=0)
     inputs = (inputs - inputs.mean(axis=0)) / np.where(spread > 1e-9, spread, 1.0)
     products = (inputs[:, :, None] * problem.pressure[:, None, :]).reshape(len(inputs), -1)

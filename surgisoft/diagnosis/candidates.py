@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from surgisoft.diagnosis.residuals import Problem
-from surgisoft.surrogate.chain import Taps, context_of
+from surgisoft.surrogate.chain import Taps, context_of, memory_at
 from surgisoft.surrogate.effects import (
     ArmFacts,
     Context,
@@ -90,13 +90,18 @@ class Candidate:
         """The effect at amplitudes (K,); None for more of one that the model has."""
         if self.more:
             return None
-        effect, first = copy.deepcopy(self.effect), 0
+        effect, first = copied(self.effect), 0
         amplitudes = amplitudes if self.spread is None else self.spread @ amplitudes
         for parameter in effect.amplitudes().values():
             part = amplitudes[first : first + parameter.numel()]
             parameter.copy_(torch.as_tensor(part, dtype=parameter.dtype).view_as(parameter))
             first += parameter.numel()
         return effect
+
+
+def copied(effect: Effect) -> Effect:
+    """A copy of an effect; what it knows of the arm, which does not change, is shared."""
+    return copy.deepcopy(effect, {id(effect.facts): effect.facts})
 
 
 def with_effect(model: ArmModel, name: str, effect: Effect) -> ArmModel:
@@ -139,6 +144,10 @@ class RowsOfModel(Protocol):
     def history(self) -> History:
         """All runs, every row."""
 
+    @property
+    def taps(self) -> Taps | None:
+        """What a scan of the history by the model gave, where one was made."""
+
     def rows(self, tensor: Tensor) -> Tensor:
         """The looked-at rows of a (R, T, ...) tensor."""
 
@@ -148,7 +157,7 @@ def signals(problem: RowsOfModel) -> Signals:
     """The signals of a problem's model."""
     chain, history = problem.model.chain, problem.history
     first = problem.model.first_pressure(history)
-    taps = chain.scan(history, first)
+    taps = problem.taps or chain.scan(history, first)
     context = replace(context_of(history), pressure=taps.pressure)
     slope = chain.slope(history, first, taps, problem.rows)
     return Signals(context, taps, slope, chain.standing(first)[1], first)
@@ -163,8 +172,8 @@ def sensitivities_of(problem: RowsOfModel, signal: Signals, effect: Effect) -> n
     """
     chain, at = problem.model.chain, signal.taps.behind[effect.stage]
     before = chain.first_memory(effect, signal.rest, at[:, 0], signal.first)
-    memory = effect.scan(before, at, signal.context)
-    changes = chain.sensitivities(effect, problem.rows(at), problem.rows(memory), signal.slope)
+    memory = memory_at(effect, before, at, signal.context, problem.rows)
+    changes = chain.sensitivities(effect, problem.rows(at), memory, signal.slope)
     return changes.movedim(0, -1).numpy()
 
 

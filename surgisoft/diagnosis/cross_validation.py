@@ -188,8 +188,11 @@ class CrossValidation:
     @classmethod
     def on(cls, split: Split, sensitivities: np.ndarray) -> "CrossValidation":
         """The cross-validation of sensitivities (rows, n, 3, K) on a split."""
-        first = split.residual[: split.rows, ..., None]
-        both = np.concatenate([first, _masked(split, sensitivities)], axis=3)
+        *field, count = sensitivities.shape
+        both = np.empty((*field, 1 + count), np.float32)
+        both[..., 0] = split.residual[: split.rows]
+        both[..., 1:] = sensitivities
+        both[~split.seen[: split.rows]] = 0.0
         known = split.residual[split.rows :]
         turned = split.turned(both, known)
         grams, held_out = _products(split, both, turned, both, turned)
@@ -255,7 +258,9 @@ class CrossValidation:
 
 def _masked(split: Split, sensitivities: np.ndarray) -> np.ndarray:
     """Columns (rows, n, 3, K) in single precision, 0 where nothing was measured."""
-    return np.where(split.seen[: split.rows, :, None, None], sensitivities, 0.0).astype(np.float32)
+    answer = sensitivities.astype(np.float32)
+    answer[~split.seen[: split.rows]] = 0.0
+    return answer
 
 
 def _products(split: Split, a, turned_a, b, turned_b) -> tuple[np.ndarray, np.ndarray]:

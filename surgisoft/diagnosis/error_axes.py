@@ -40,8 +40,9 @@ class Axis:
     """Unit of the columns; `{unit}` is the actuation's."""
     columns: Callable[[ResidualTable], np.ndarray]
     """(S, c) values: one column, or one a chamber; NaN where not known."""
-    design: Callable[[ResidualTable], np.ndarray]
-    """(S, F) functions of the axis, of order 1, that a residual in the base frame may follow."""
+    design: Callable[[ResidualTable, np.ndarray], np.ndarray]
+    """(R, F) functions of the axis, of order 1, that a residual in the base frame may follow, in
+    some rows (R,) of a table; scaled by the values of all of its rows."""
     static: bool = False
     """Whether posture alone fixes it: its share is not counted beyond the actuation's."""
     timed: bool = False
@@ -60,9 +61,13 @@ def _powers(values: np.ndarray, degree: int) -> np.ndarray:
     return np.concatenate([x**k for k in range(1, degree + 1)], axis=1)
 
 
-def _with(table: ResidualTable, values: np.ndarray, *more: np.ndarray) -> np.ndarray:
-    """(S, F) functions (S, f) alone and times each column of the actuation, and of `more`."""
-    gates = np.concatenate([table.scaled_pressure, *more], axis=1)
+def _with(
+    table: ResidualTable, rows: np.ndarray, values: np.ndarray, *more: np.ndarray
+) -> np.ndarray:
+    """(R, F) functions (N, f) in some rows (R,), alone and times each column of the actuation, and
+    of `more`."""
+    gates = np.concatenate([part[rows] for part in (table.scaled_pressure, *more)], axis=1)
+    values = values[rows]
     products = (values[:, :, None] * gates[:, None, :]).reshape(len(values), -1)
     return np.concatenate([values, products], axis=1)
 
@@ -85,9 +90,9 @@ def lag(table: ResidualTable, time_s: float = LAG_S) -> np.ndarray:
     return table.pressure - table.memory.low_pass[..., TIMES_S.index(time_s)]
 
 
-def _lags(table: ResidualTable, times_s: list[float]) -> np.ndarray:
+def _lags(table: ResidualTable, rows: np.ndarray, times_s: list[float]) -> np.ndarray:
     half = np.array(table.spec.span) / 2
-    return _with(table, np.concatenate([lag(table, time) / half for time in times_s], axis=1))
+    return _with(table, rows, np.concatenate([lag(table, time) / half for time in times_s], axis=1))
 
 
 def azimuth(table: ResidualTable) -> np.ndarray:
@@ -120,21 +125,23 @@ def _since_reversal(table: ResidualTable) -> np.ndarray:
     return np.concatenate([table.memory.direction, *parts], axis=1)
 
 
-def _dwell(table: ResidualTable) -> np.ndarray:
+def _dwell(table: ResidualTable, rows: np.ndarray) -> np.ndarray:
     """Grows with the time at table, differently after a rise and after a fall."""
     grown = np.stack([-np.expm1(-table.memory.dwell_s / time) for time in DWELL_TIMES_S], axis=1)
-    return _with(table, grown, table.memory.direction)
+    return _with(table, rows, grown, table.memory.direction)
 
 
-def _rate(table: ResidualTable) -> np.ndarray:
+def _rate(table: ResidualTable, rows: np.ndarray) -> np.ndarray:
     scale = table.memory.rate.std(axis=0)
     rate = table.memory.rate / np.where(scale > 0, scale, 1.0)
-    return _with(table, np.concatenate([rate, np.tanh(rate), np.abs(np.tanh(rate))], axis=1))
+    return _with(table, rows, np.concatenate([rate, np.tanh(rate), np.abs(np.tanh(rate))], axis=1))
 
 
-def _elapsed(table: ResidualTable) -> np.ndarray:
+def _elapsed(table: ResidualTable, rows: np.ndarray) -> np.ndarray:
     time = np.stack([table.memory.elapsed_s, table.memory.in_run_s], axis=1)
-    return _with(table, np.concatenate([_powers(time, 2), _powers(np.log1p(time), 1)], axis=1))
+    return _with(
+        table, rows, np.concatenate([_powers(time, 2), _powers(np.log1p(time), 1)], axis=1)
+    )
 
 
 AXES: dict[str, Axis] = {
@@ -142,20 +149,20 @@ AXES: dict[str, Axis] = {
         "actuation itself",
         "{unit}",
         lambda table: table.pressure,
-        lambda table: polynomial(table.scaled_pressure),
+        lambda table, rows: polynomial(table.scaled_pressure[rows]),
         static=True,
     ),
     "direction": Axis(
         "whether a chamber last rose (+1) or fell (-1)",
         "",
         lambda table: table.memory.direction,
-        lambda table: _with(table, table.memory.direction),
+        lambda table, rows: _with(table, rows, table.memory.direction),
     ),
     "since reversal": Axis(
         "travel of a chamber since its last reversal",
         "{unit}",
         lambda table: table.memory.since_reversal,
-        lambda table: _with(table, _since_reversal(table)),
+        lambda table, rows: _with(table, rows, _since_reversal(table)),
     ),
     "rate": Axis(
         "rate of change of a chamber",
@@ -168,14 +175,14 @@ AXES: dict[str, Axis] = {
         f"actuation minus its low pass of {LAG_S:g} s",
         "{unit}",
         lag,
-        lambda table: _lags(table, [time for time in TIMES_S if time <= LAG_S]),
+        lambda table, rows: _lags(table, rows, [time for time in TIMES_S if time <= LAG_S]),
         timed=True,
     ),
     "past actuation": Axis(
         f"actuation minus its mean over the past {PAST_S:g} s and longer",
         "{unit}",
         lambda table: lag(table, PAST_S),
-        lambda table: _lags(table, [time for time in TIMES_S if time >= PAST_S]),
+        lambda table, rows: _lags(table, rows, [time for time in TIMES_S if time >= PAST_S]),
         timed=True,
     ),
     "dwell": Axis(
@@ -195,33 +202,33 @@ AXES: dict[str, Axis] = {
         "largest actuation of a chamber so far in its run",
         "{unit}",
         lambda table: table.memory.largest,
-        lambda table: _with(table, _powers(table.memory.largest, 2)),
+        lambda table, rows: _with(table, rows, _powers(table.memory.largest, 2)),
     ),
     "azimuth": Axis(
         "side that the body bends to, from x towards y",
         "deg",
         lambda table: _column(azimuth(table)),
-        lambda table: _around(azimuth(table)),
+        lambda table, rows: _around(azimuth(table)[rows]),
         static=True,
     ),
     "gravity": Axis(
         "angle of the bending plane to the weight",
         "deg",
         lambda table: _column(gravity_angle(table)),
-        lambda table: _around(gravity_angle(table)),
+        lambda table, rows: _around(gravity_angle(table)[rows]),
         static=True,
     ),
     "temperature": Axis(
         "temperature",
         "degC",
         lambda table: _column(table.temp_C),
-        lambda table: _with(table, _powers(_column(table.temp_C), 1)),
+        lambda table, rows: _with(table, rows, _powers(_column(table.temp_C), 1)),
     ),
     "payload": Axis(
         "mass attached to the arm",
         "g",
         lambda table: _column(table.payload_g),
-        lambda table: _with(table, _powers(_column(table.payload_g), 1)),
+        lambda table, rows: _with(table, rows, _powers(_column(table.payload_g), 1)),
     ),
 }
 """Every axis over rows by name. Arc length runs over the key points: `arc_length`."""
@@ -319,7 +326,7 @@ def shares(problem: Problem) -> list[AxisShare]:
         """(K,) squared error of each block; mm^2."""
         return block_sums(np.nansum(np.square(residual), axis=1), block)
 
-    static = AXES["pressure"].design(table)[rows]
+    static = AXES["pressure"].design(table, rows)
     before = squared(target)
     beyond = left(static)
     base = squared(beyond)
@@ -327,7 +334,7 @@ def shares(problem: Problem) -> list[AxisShare]:
         beyond = target
     answer = []
     for name, axis in found.items():
-        own = axis.design(table)[rows]
+        own = axis.design(table, rows)
         if axis.static:
             without, rest = target, beyond if name == "pressure" else left(own)
             won = before - (base if name == "pressure" else squared(rest))

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
 from surgisoft.diagnosis.statistics import block_sums, studentised
@@ -169,7 +169,7 @@ def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
 
 def normal_quantile(p_value: float) -> float:
     """Standard normal quantile of 1 - p, finite for every p-value from random draws."""
-    return float(stats.norm.isf(min(max(p_value, 1e-6), 1.0 - 1e-6)))
+    return -float(ndtri(min(max(p_value, 1e-6), 1.0 - 1e-6)))
 
 
 def evidence_of(found: Findings) -> Evidence:

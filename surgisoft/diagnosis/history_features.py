@@ -19,6 +19,9 @@ TIMES_S = (0.15, 0.5, 1.5, 5.0, 15.0, 50.0, 150.0)
 """Time constants of the low passes, s."""
 RADII = (0.03, 0.1, 0.25, 0.5)
 """Radii of the plays, in half ranges of a chamber."""
+BLOCK_ROWS = 1 << 16
+"""Rows that are followed at once where there are more: what is computed on the way is several times
+larger than what is kept."""
 SHORT_S = 0.25
 """Time constant over which a rate is taken, s: shorter, and it shows the sensor's noise."""
 
@@ -50,7 +53,23 @@ class Memory:
 
 
 def memory_of(history: History, spec: ArmSpec) -> Memory:
-    """Follow the actuation of every run of a history."""
+    """Follow the actuation of every run of a history, of a long one some runs at a time."""
+    runs, steps = history.valid.shape
+    wide = max(1, BLOCK_ROWS // steps)
+    if wide >= runs:
+        return _memory_of(history, spec)
+    answer, begin = {}, 0
+    for first in range(0, runs, wide):
+        some = torch.arange(first, min(first + wide, runs))
+        for name, values in vars(_memory_of(history.select(some), spec)).items():
+            if name not in answer:
+                answer[name] = np.empty((int(history.valid.sum()), *values.shape[1:]))
+            answer[name][begin : begin + len(values)] = values
+        begin += len(values)
+    return Memory(**answer)
+
+
+def _memory_of(history: History, spec: ArmSpec) -> Memory:
     signal = history.pressure.double()
     half = torch.tensor(spec.span, dtype=torch.float64) / 2
     start = signal[:, 0]
@@ -109,25 +128,32 @@ def _since_reversal(anchor: Tensor, direction: Tensor) -> Tensor:
     return way - torch.where(mark > 0, mark - 1, torch.zeros_like(mark))
 
 
-def features(memory: Memory, spec: ArmSpec, context: np.ndarray | None, timed: bool) -> np.ndarray:
-    """(S, F) numbers of order 1 for each row: all that the residual may depend on.
+def features(
+    memory: Memory,
+    spec: ArmSpec,
+    context: np.ndarray | None,
+    timed: bool,
+    rows: np.ndarray | slice = slice(None),
+) -> np.ndarray:
+    """(S, F) numbers of order 1 for some rows: all that the residual may depend on.
 
-    context: (S, c) further columns such as temperature, NaN where missing; timed: whether rows
-    follow each other in time (not so for settled points, whose order alone counts).
+    memory: that of N rows; context: (N, c) further columns such as temperature, NaN where missing;
+    timed: whether rows follow each other in time (not so for settled points, whose order alone
+    counts); rows: (S,) those that are asked for, scaled by what all N are.
     """
     half = np.array(spec.span) / 2
-    x = memory.pressure / half
-    parts = [x, memory.direction]
-    parts += [memory.play[..., k] / half - x for k in range(memory.play.shape[-1])]
-    parts.append(memory.largest / half - x)
+    x = memory.pressure[rows] / half
+    parts = [x, memory.direction[rows]]
+    parts += [memory.play[rows, :, k] / half - x for k in range(memory.play.shape[-1])]
+    parts.append(memory.largest[rows] / half - x)
     for elapsed in (memory.elapsed_s, memory.in_run_s):
-        scaled = elapsed / max(float(elapsed.max()), 1e-9)
+        scaled = elapsed[rows] / max(float(elapsed.max()), 1e-9)
         parts.append(np.stack([scaled, scaled**2], axis=1))
     if timed:
-        parts += [x - memory.low_pass[..., k] / half for k in range(len(TIMES_S))]
-        parts.append(np.log1p(memory.dwell_s)[:, None])
+        parts += [x - memory.low_pass[rows, :, k] / half for k in range(len(TIMES_S))]
+        parts.append(np.log1p(memory.dwell_s[rows])[:, None])
     if context is not None and context.shape[1]:
         known = ~np.isnan(context)
         mean = np.where(known, context, 0).sum(0) / np.maximum(known.sum(0), 1)
-        parts.append(np.where(known, context, mean))
+        parts.append(np.where(known, context, mean)[rows])
     return np.concatenate(parts, axis=1)

@@ -26,6 +26,7 @@ from surgisoft.measurement.histories import actuation_of, check_fits, history_of
 from surgisoft.measurement.noise import hold_noise, stated_noise
 from surgisoft.measurement.recordings import Recording
 from surgisoft.surrogate.arm import ArmSpec
+from surgisoft.surrogate.chain import Taps
 from surgisoft.surrogate.history import History
 from surgisoft.surrogate.model import ArmModel
 from surgisoft.surrogate.scan import linear_scan
@@ -175,6 +176,8 @@ class ResidualTable:
     discrepancy, mm; None: the residuals are those of the model."""
     paired_tolerance_mm: np.ndarray | None = None
     """(n,) where they are paired differences: `Problem.tolerance_mm`."""
+    taps: Taps | None = None
+    """What the model's scan of the history gave: signals and memories in every row."""
     body_before_mm: np.ndarray | None = None
     """(N, n, 3) where they are paired differences: key points of BEFORE along the same motion, base
     frame, mm, without gaps."""
@@ -227,12 +230,12 @@ class ResidualTable:
         """What the actuation's past amounts to in each row."""
         return memory_of(self.history, self.spec)
 
-    @cached_property
-    def features(self) -> np.ndarray:
-        """(N, F) all that the residual may depend on, of order 1 (`history_features.features`)."""
+    def features_at(self, rows: np.ndarray) -> np.ndarray:
+        """(S, F) all that the residual may depend on, of order 1, in rows (S,) of the table
+        (`history_features.features`)."""
         context = None if np.isnan(self.temp_C).all() else self.temp_C[:, None] / 10.0
         timed = bool((self.history.dt_s > 0).any())
-        return features(self.memory, self.spec, context, timed)
+        return features(self.memory, self.spec, context, timed, rows)
 
     def only(self, part: Part) -> "ResidualTable":
         """The table of one part: key points of all other rows are NaN, in the history too.
@@ -248,6 +251,8 @@ class ResidualTable:
             noise, source = _differences_noise(training, self.run)
             floor = _floor_of(noise, source)
         shown = self.held_out if part == "held_out" else ~self.held_out
+        if np.isnan(self.measured_mm[~shown]).all():
+            return replace(self, noise_mm=noise, floor=floor)
         points = self.history.key_points.clone()
         points[self.history.valid] = points[self.history.valid].masked_fill(
             ~torch.from_numpy(shown)[:, None, None], torch.nan
@@ -310,8 +315,9 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
     check_fits(model.spec, recordings, sized=False)
     history = history_of(recordings, model.spec.actuation)
     with torch.no_grad():
-        predicted = history.rows(model.predict(history))
-        direction = history.rows(model.trace(history).direction)
+        taps = model.scan(history)
+        predicted = history.rows(taps.behind["sensor"])
+        direction = history.rows(taps.direction)
     if not torch.isfinite(predicted).all():
         raise InputError("the model predicts values that are not finite; fit it again")
     noise, source = noise_of(recordings)
@@ -346,6 +352,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         noise_mm=noise,
         floor=_floor_of(noise, source),
         holds=hold_floor(recordings),
+        taps=taps,
     )
 
 
@@ -494,9 +501,20 @@ class Problem:
         np.add.at(sums, self.motion, np.moveaxis(values, -1, 0))
         return np.moveaxis(sums, 0, -1) / np.bincount(self.motion)
 
+    @cached_property
+    def _places(self) -> tuple[Tensor, Tensor]:
+        """(S,) run and step of each fitted row."""
+        runs, steps = self.history.valid.nonzero(as_tuple=True)
+        return runs[self.index], steps[self.index]
+
     def rows(self, tensor: Tensor) -> Tensor:
         """The fitted rows of a (R, T, ...) tensor."""
-        return self.history.rows(tensor)[self.index]
+        return tensor[self._places]
+
+    @property
+    def taps(self) -> Taps | None:
+        """What a scan of the history by the model gave; None for a model other than the table's."""
+        return self.table.taps if self.model is self.table.model else None
 
     def without_blocks(self, out: np.ndarray) -> "Problem":
         """The problem without the blocks of time where out (B,) bool is set."""
@@ -566,14 +584,15 @@ def blocks(
     LEAST_BLOCKS of them in all. A block never crosses the border of a run. step: every how many
     rows one is fitted.
     """
-    run = np.where(seen, history.run_of_row.numpy(), -1)
-    time = history.rows(history.t_s).numpy()
-    lengths = {r: float(np.ptp(time[run == r])) for r in np.unique(run[seen])}
-    total = sum(lengths.values())
+    time, shown = history.rows(history.t_s).numpy(), np.flatnonzero(seen)
+    # Runs stand one after another.
+    _, begins = np.unique(history.run_of_row.numpy()[shown], return_index=True)
+    runs = np.split(shown, begins[1:])
+    lengths = [float(np.ptp(time[rows])) for rows in runs if len(rows)]
+    total = sum(lengths)
     length = min(BLOCK_S, total / (2 * LEAST_BLOCKS)) if total > 0 else 1.0
-    answer, count = np.full(len(run), -1), 0
-    for r, span in lengths.items():
-        rows = np.flatnonzero(run == r)
+    answer, count = np.full(len(seen), -1), 0
+    for rows, span in zip(runs, lengths, strict=False):
         parts = max(1, min(round(span / max(length, 1e-9)), len(rows) // (step * BLOCK_ROWS)))
         edges = np.linspace(0, len(rows), parts + 1).astype(int)
         for begin, end in itertools.pairwise(edges):

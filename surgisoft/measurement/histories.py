@@ -55,7 +55,7 @@ def history_of(recordings: list[Recording], actuation: str = "measured") -> Hist
         for run in recording.runs:
             times.append(torch.from_numpy(recording.t_s[run].copy()))
             pressures.append(torch.from_numpy(signal[run].copy()))
-            points.append(torch.from_numpy(recording.key_points_mm[run].copy()))
+            points.append(torch.from_numpy(recording.key_points_mm[run].astype(np.float32)))
             first = torch.from_numpy(recording.measured[run.start].copy())
             settled = recording.kind == "settled"
             stood.append(torch.full_like(first, torch.nan) if settled else first)

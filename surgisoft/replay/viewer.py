@@ -31,9 +31,10 @@ def viewer_command() -> str:
     """Path of the viewer's program, which rerun-sdk installs."""
     import rerun_cli
 
-    beside = Path(sys.executable).with_name("rerun")
-    inside = Path(rerun_cli.__file__).with_name("rerun")
-    for program in (inside, beside):
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    folder = Path(rerun_cli.__file__).parent
+    bundle = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"  # of macOS
+    for program in (bundle, folder / name, Path(sys.executable).with_name(name)):
         if program.exists():
             return str(program)
     raise InputError("the Rerun viewer's program is missing: expected it with rerun-sdk")

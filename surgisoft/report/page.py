@@ -57,9 +57,15 @@ def render(page: Page) -> str:
         '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
         f"<title>{html.escape(page.title)}</title><style>{STYLE}</style></head><body><main>"
         f'<header><h1>{html.escape(page.title)}</h1>{about}<p class="verdict {page.tone}">'
-        f"{html.escape(page.verdict)}</p>{contents}</header>{inner}"
+        f"{html.escape(_sentence(page.verdict))}</p>{contents}</header>{inner}"
         f"<footer>surgisoft {__version__}</footer></main></body></html>\n"
     )
+
+
+def _sentence(text: str) -> str:
+    """A verdict as a sentence of its own: a capital first, a full stop at its end."""
+    ended = text if not text or text[-1] in ".!?:" else f"{text}."
+    return ended[:1].upper() + ended[1:]
 
 
 def write_page(page: Page, path: Path) -> Path:

@@ -150,19 +150,25 @@ class Picture:
     """MIME type of `data`."""
     least_px: int = 0
     """Smallest width in pixels; on a narrower page the picture scrolls in its own frame."""
+    drawn: bool = False
+    """Dark lines on white paper: a dark page shows the picture inverted, hues kept."""
 
     @classmethod
-    def from_file(cls, path: Path, alt: str, caption: str = "", least_px: int = 0) -> "Picture":
+    def from_file(
+        cls, path: Path, alt: str, caption: str = "", least_px: int = 0, *, drawn: bool = False
+    ) -> "Picture":
         """Read a picture file; its suffix gives the type."""
         kind = KINDS.get(path.suffix.lower())
         if kind is None:
             raise InputError(f"{path}: suffix '{path.suffix}', expected one of {', '.join(KINDS)}")
-        return cls(path.read_bytes(), alt, caption, kind, least_px)
+        return cls(path.read_bytes(), alt, caption, kind, least_px, drawn)
 
     def to_html(self) -> str:
         data = base64.b64encode(self.data).decode("ascii")
         caption = f"<figcaption>{html.escape(self.caption)}</figcaption>" if self.caption else ""
-        framed = ' class="photo"' if self.kind != "image/svg+xml" else ""
+        framed = ""
+        if self.kind != "image/svg+xml":
+            framed = ' class="photo drawn"' if self.drawn else ' class="photo"'
         source = f"data:{self.kind};base64,{data}"
         least = f' style="min-width:{self.least_px}px"' if self.least_px else ""
         image = f'<img{framed}{least} alt="{html.escape(self.alt)}" src="{source}">'

@@ -13,6 +13,7 @@ STYLE = f"""
 body{{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif}}
 main{{max-width:1120px;margin:0 auto;padding:32px 24px 48px}}
+header{{margin-bottom:16px}}
 h1{{font-size:1.6rem;line-height:1.25;margin:0 0 4px;overflow-wrap:anywhere}}
 h2{{font-size:1.2rem;margin:40px 0 12px;padding-top:16px;border-top:1px solid var(--line)}}
 h3{{font-size:1rem;margin:20px 0 8px}}
@@ -31,7 +32,7 @@ dd{{margin:0;font-size:1.25rem;font-variant-numeric:tabular-nums;overflow-wrap:a
 pre{{margin:0 0 12px;padding:10px 14px;overflow-x:auto;background:var(--card);border-radius:4px;
 font-size:.875rem}}
 figure .wide{{margin:0 0 4px}}
-.long{{min-width:18em}}
+.long{{min-width:11em}}
 table{{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}}
 th,td{{text-align:left;padding:5px 18px 5px 0;border-bottom:1px solid var(--line);
 vertical-align:top}}
@@ -44,13 +45,14 @@ border-radius:2px}}
 figure{{margin:0 0 16px}}
 img{{display:block;max-width:100%;height:auto}}
 .photo{{background:#fff;border-radius:4px}}
+@media (prefers-color-scheme:dark){{.drawn{{filter:invert(.92) hue-rotate(180deg)}}}}
 .gallery{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,440px),1fr));
 gap:12px 20px}}
 .gallery img{{width:100%}}
 code{{font-size:.9em}}
 footer{{margin-top:40px}}
 @media (max-width:600px){{main{{padding:20px 14px 32px}}h1{{font-size:1.3rem}}
-.verdict{{font-size:1rem;padding:12px 14px}}}}
+.verdict{{font-size:1rem;padding:12px 14px}}.long{{min-width:18em}}}}
 @media print{{section{{break-inside:avoid}}nav{{display:none}}}}
 """
 """The style sheet of every page."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import pty
 import select
 import signal
 import socket
@@ -21,7 +20,6 @@ import struct
 import sys
 import threading
 import time
-import tty
 from collections.abc import Iterator
 
 import numpy as np
@@ -58,6 +56,13 @@ class Emulator:
         self.rig = open_rig(rig) if isinstance(rig, str) else rig
         if not is_simulated(self.rig):
             raise InputError("the emulator needs a simulated rig, such as virtual:seed=0")
+        try:
+            import pty
+            import tty
+        except ImportError:
+            raise InputError(
+                "the emulator needs pseudo-terminals, which Windows lacks; run it in WSL"
+            ) from None
         self.speed = speed
         low, high = self.rig.limits.T
         self.info = Info(

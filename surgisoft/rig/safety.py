@@ -17,6 +17,7 @@ pressure controller has to vent by itself where no command comes (the line proto
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import math
 import os
@@ -38,8 +39,10 @@ from surgisoft.rig.interface import Rig, Sample, close, is_simulated, vent, vent
 
 STOP_KEYS = (b" ", b"\x1b")
 """Keys of the emergency stop: the space bar and Esc."""
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a run vented: Ctrl-C, `kill`, and a terminal that is closed."""
+STOP_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""Signals that end a run vented: Ctrl-C, `kill`, and a closed terminal (Windows has none such)."""
 LOCK_S = 0.2
 """Longest time that venting waits for a command that is being sent [s]."""
 
@@ -244,8 +247,10 @@ class SafeRig:
             if ours:
                 self._lock.release()
         if self._handlers and threading.current_thread() is not threading.main_thread():
-            main = threading.main_thread().ident  # a signal also ends a sleep of the program
-            signal.pthread_kill(main or 0, signal.SIGINT)
+            if sys.platform == "win32":
+                _thread.interrupt_main()
+            else:  # a signal also ends a sleep of the program
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     def __enter__(self) -> SafeRig:
         if threading.current_thread() is threading.main_thread():

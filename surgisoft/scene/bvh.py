@@ -249,15 +249,45 @@ def triangle(triangles, k):
 
 
 @compiled
-def segment_surface_d2(p, q, bound2, triangles, starts, lower, upper, nodes, reach):
+def _segment_box_d2(p, q, low, high, lower, upper, node, slanting):
+    """Lower bound of the squared distance between segment p q and a box: row `node` (2 N - 1, 3).
+
+    The gap between the segment's own box low..high and the box; if `slanting` and it is larger, the
+    gap between both along the line that joins their middles, which is tight for a slanting segment
+    that is far away.
+    """
+    apart = boxes_d2(low, high, lower, upper, node)
+    if not slanting:
+        return apart
+    x = 0.5 * (lower[node, 0] + upper[node, 0] - p[0] - q[0])
+    y = 0.5 * (lower[node, 1] + upper[node, 1] - p[1] - q[1])
+    z = 0.5 * (lower[node, 2] + upper[node, 2] - p[2] - q[2])
+    size2 = x * x + y * y + z * z
+    across = (
+        abs(x) * (upper[node, 0] - lower[node, 0])
+        + abs(y) * (upper[node, 1] - lower[node, 1])
+        + abs(z) * (upper[node, 2] - lower[node, 2])
+    )
+    along = abs(x * (q[0] - p[0]) + y * (q[1] - p[1]) + z * (q[2] - p[2]))
+    gap = size2 - 0.5 * (across + along)
+    if gap > 0.0:
+        return max(apart, gap * gap / size2 * (1.0 - 1e-9))
+    return apart
+
+
+@compiled
+def segment_surface_d2(p, q, bound2, tree, nodes, reach, slanting):
     """Squared distance from segment p q to the surface if below bound2, bound2 otherwise.
 
-    `nodes` (STACK,) int64 and `reach` (STACK,) float64 are working memory.
+    tree: arrays of a `TriangleTree`. `nodes` (STACK,) int64 and `reach` (STACK,) float64 are
+    working memory. slanting: whether boxes are ruled out by tighter bounds, which pays for few
+    segments and many faces; the result is the same.
     """
+    triangles, starts, lower, upper = tree[0], tree[1], tree[2], tree[3]
     low = (min(p[0], q[0]), min(p[1], q[1]), min(p[2], q[2]))
     high = (max(p[0], q[0]), max(p[1], q[1]), max(p[2], q[2]))
     leaves = len(starts) - 1
-    nodes[0], reach[0] = 0, boxes_d2(low, high, lower, upper, 0)
+    nodes[0], reach[0] = 0, _segment_box_d2(p, q, low, high, lower, upper, 0, slanting)
     size, best = 1, bound2
     while size > 0:
         size -= 1
@@ -271,8 +301,8 @@ def segment_surface_d2(p, q, bound2, triangles, starts, lower, upper, nodes, rea
                 best = segment_triangle_d2(p, q, a, b, c, best)
             continue
         one, two = 2 * node + 1, 2 * node + 2
-        d_one = boxes_d2(low, high, lower, upper, one)
-        d_two = boxes_d2(low, high, lower, upper, two)
+        d_one = _segment_box_d2(p, q, low, high, lower, upper, one, slanting)
+        d_two = _segment_box_d2(p, q, low, high, lower, upper, two, slanting)
         if d_one < d_two:
             one, two, d_one, d_two = two, one, d_two, d_one
         nodes[size], reach[size] = one, d_one

@@ -18,7 +18,6 @@ from surgisoft.scene.bvh import (
     line_triangle,
     point_surface,
     segment_surface_d2,
-    segment_triangle_d2,
     segments_d2,
     triangle,
 )
@@ -193,9 +192,7 @@ def _exact(
         if lows[k] < best and best > 0.0:
             p = (line[k, 0], line[k, 1], line[k, 2])
             q = (line[k + 1, 0], line[k + 1, 1], line[k + 1, 2])
-            d2 = segment_surface_d2(
-                p, q, best * best, tree[0], tree[1], tree[2], tree[3], nodes, reach
-            )
+            d2 = segment_surface_d2(p, q, best * best, tree, nodes, reach, False)
             best = min(best, math.sqrt(d2))
     if not closed:
         return best
@@ -448,61 +445,6 @@ def _nearer(lines, n, i, j, best):
 
 
 @compiled
-def _between_d2(p, q, lower, upper, node):
-    """Lower bound of the squared distance between segment p q and a box: row `node` (2 N - 1, 3).
-
-    The larger of the gap between both along the line that joins their middles, which is tight for a
-    slanting segment that is far away, and of that between the segment's own box and the box.
-    """
-    low = (min(p[0], q[0]), min(p[1], q[1]), min(p[2], q[2]))
-    high = (max(p[0], q[0]), max(p[1], q[1]), max(p[2], q[2]))
-    x = 0.5 * (lower[node, 0] + upper[node, 0] - p[0] - q[0])
-    y = 0.5 * (lower[node, 1] + upper[node, 1] - p[1] - q[1])
-    z = 0.5 * (lower[node, 2] + upper[node, 2] - p[2] - q[2])
-    size2 = x * x + y * y + z * z
-    across = (
-        abs(x) * (upper[node, 0] - lower[node, 0])
-        + abs(y) * (upper[node, 1] - lower[node, 1])
-        + abs(z) * (upper[node, 2] - lower[node, 2])
-    )
-    along = abs(x * (q[0] - p[0]) + y * (q[1] - p[1]) + z * (q[2] - p[2]))
-    gap = size2 - 0.5 * (across + along)
-    apart = boxes_d2(low, high, lower, upper, node)
-    if gap > 0.0:
-        return max(apart, gap * gap / size2 * (1.0 - 1e-9))
-    return apart
-
-
-@compiled
-def _segment_d2(p, q, bound2, tree, nodes, reach):
-    """`segment_surface_d2` with tighter bounds of boxes: for few segments and many faces."""
-    triangles, starts, lower, upper = tree[0], tree[1], tree[2], tree[3]
-    leaves = len(starts) - 1
-    nodes[0], reach[0] = 0, _between_d2(p, q, lower, upper, 0)
-    size, best = 1, bound2
-    while size > 0:
-        size -= 1
-        node = nodes[size]
-        if reach[size] >= best:
-            continue
-        if node >= leaves - 1:
-            leaf = node - (leaves - 1)
-            for k in range(starts[leaf], starts[leaf + 1]):
-                a, b, c = triangle(triangles, k)
-                best = segment_triangle_d2(p, q, a, b, c, best)
-            continue
-        one, two = 2 * node + 1, 2 * node + 2
-        d_one = _between_d2(p, q, lower, upper, one)
-        d_two = _between_d2(p, q, lower, upper, two)
-        if d_one < d_two:
-            one, two, d_one, d_two = two, one, d_two, d_one
-        nodes[size], reach[size] = one, d_one
-        nodes[size + 1], reach[size + 1] = two, d_two
-        size += 2
-    return best
-
-
-@compiled
 def nearest_to_surface(line, turn, shift, bound, slack, tree, found, nodes, reach):
     """Which segments of a line (K, 3) mm come nearest to a body, and at what distance (mm).
 
@@ -516,7 +458,8 @@ def nearest_to_surface(line, turn, shift, bound, slack, tree, found, nodes, reac
     for k in range(segments - 1, -1, -1):
         q = _moved(turn, shift, line[k])
         limit = best + slack
-        distance[k] = math.sqrt(_segment_d2(p, q, limit * limit, tree, nodes, reach))
+        d2 = segment_surface_d2(p, q, limit * limit, tree, nodes, reach, True)
+        distance[k] = math.sqrt(d2)
         best, p = min(best, distance[k]), q
     found[0], found[1] = segments, -1
     for k in range(segments):
@@ -605,7 +548,7 @@ def beam_near_surface(origin, aim, range_mm, turn, shift, slack, tree, nodes, re
     p = _moved(turn, shift, origin)
     q = _moved(turn, shift, origin + range_mm * aim)
     limit = slack * slack
-    return _segment_d2(p, q, limit, tree, nodes, reach) < limit
+    return segment_surface_d2(p, q, limit, tree, nodes, reach, True) < limit
 
 
 @compiled

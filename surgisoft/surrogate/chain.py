@@ -6,7 +6,7 @@ history (`Resting`), an arm that was held for a while (`Standing`), or given mem
 First-order sensitivities use the signals that a scan has recorded.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -22,6 +22,9 @@ from surgisoft.surrogate.scan import direction_scan, direction_step
 
 STOOD_S = 10.0
 """Time for which an arm is assumed to have been held where a run begins away from rest, s."""
+BLOCK_ROWS = 1 << 16
+"""Rows that are followed at once where there are more: the temporaries of a block stay in the
+processor's cache, and those of two million rows would take gigabytes."""
 NETWORK = "network"
 """Key of a recurrent network's state in `ArmState.memory`."""
 
@@ -217,12 +220,21 @@ class Scanning:
         return direction_scan(chamber, chain.band, chain.rest)[1]
 
     def effect(self, link: Link, signal: Signal) -> Tensor:
-        """Signal behind an effect whose memory has followed every row."""
+        """Signal behind an effect whose memory has followed every row.
+
+        The memory is kept, unless only some rows are asked for and there are very many.
+        """
+        part, value = link.part, signal.value
         if self.rows is not None and link.stage in ("body", "sensor"):
-            return link.part.apply(signal.value, signal.value[..., :0, 0])
-        memory = link.part.scan(self.start[link.name], signal.value, self.context_at(signal))
-        self.memory[link.name] = memory
-        return link.part.apply(signal.value, memory)
+            return part.apply(value, value[..., :0, 0])
+        start, context = self.start[link.name], self.context_at(signal)
+        if self.rows is not None and _very_many(value):
+            answer = torch.empty_like(value)
+            for place, memory in _followed(part, start, value, context):
+                answer[place] = part.apply(value[place], memory)
+            return answer
+        self.memory[link.name] = memory_along(part, start, value, context)
+        return part.apply(value, self.memory[link.name])
 
     def network(self, link: Link, signal: Signal) -> Tensor:
         """(R, T, n, 3), or (S, n, 3), key points in mm."""
@@ -234,7 +246,92 @@ class Scanning:
             actuation, direction = self.rows(actuation), self.rows(direction)
         if network.remembers:
             return network(actuation, direction, network.scan(actuation, direction))
+        if self.rows is None and _very_many(actuation):
+            flat = (t.flatten(0, 1).split(BLOCK_ROWS) for t in (actuation, direction))
+            points = torch.cat([network(*some) for some in zip(*flat, strict=True)])
+            return points.view(*actuation.shape[:2], *points.shape[1:])
         return network(actuation, direction)
+
+
+def _very_many(signal: Tensor) -> bool:
+    """Whether a signal (R, T, ...) is followed in blocks of rows: without gradients."""
+    return not torch.is_grad_enabled() and signal.shape[0] * signal.shape[1] > BLOCK_ROWS
+
+
+def _followed(
+    effect: Effect, start: Tensor, signal: Tensor, context: Context
+) -> Iterator[tuple[tuple[slice, slice], Tensor]]:
+    """The memory of an effect along a signal (R, T, ...) from (R, ...), block of rows by block.
+
+    Yields the runs and steps of each block, and its memory. A block follows some whole runs, or a
+    part of one from the memory that the part before it ends with: that is all of its state.
+    """
+    runs, steps = signal.shape[:2]
+    wide, long = max(1, BLOCK_ROWS // steps), min(steps, BLOCK_ROWS)
+    for run in range(0, runs, wide):
+        own = slice(run, min(run + wide, runs))
+        memory = start[own]
+        for step in range(0, steps, long):
+            place = own, slice(step, min(step + long, steps))
+            followed = effect.scan(memory, signal[place], _at(context, place))
+            yield place, followed
+            memory = followed[:, -1]
+
+
+def _at(context: Context, place: tuple[slice, slice]) -> Context:
+    """The context (R, T) of some steps of some runs."""
+
+    def part(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor[place]
+
+    return Context(
+        context.dt_s[place],
+        part(context.t_s),
+        part(context.temperature_C),
+        part(context.pressure),
+    )
+
+
+def memory_along(effect: Effect, start: Tensor, signal: Tensor, context: Context) -> Tensor:
+    """(R, T, ...) memory of an effect along a signal (R, T, ...), from (R, ...) before it."""
+    if not _very_many(signal):
+        return effect.scan(start, signal, context)
+    answer = None
+    for place, memory in _followed(effect, start, signal, context):
+        if answer is None:
+            answer = memory.new_empty(*signal.shape[:2], *memory.shape[2:])
+        answer[place] = memory
+    assert answer is not None
+    return answer
+
+
+def memory_at(
+    effect: Effect,
+    start: Tensor,
+    signal: Tensor,
+    context: Context,
+    rows: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """(S, ...) memory of an effect on some rows of a signal (R, T, ...), from (R, ...) before it.
+
+    rows: picks the rows (S, ...) of a (R, T, ...) tensor. Memory follows every row, of which no
+    more than BLOCK_ROWS are held at once.
+    """
+    if not _very_many(signal):
+        return rows(effect.scan(start, signal, context))
+    runs, steps = signal.shape[:2]
+    asked = rows(torch.arange(runs * steps).view(runs, steps))
+    run, step = asked // steps, asked % steps
+    answer = None
+    for (own, part), memory in _followed(effect, start, signal, context):
+        inside = (run >= own.start) & (run < own.stop)
+        inside &= (step >= part.start) & (step < part.stop)
+        found = memory[run[inside] - own.start, step[inside] - part.start]
+        if answer is None:
+            answer = found.new_empty(len(asked), *found.shape[1:])
+        answer[inside] = found
+    assert answer is not None
+    return answer
 
 
 class Holding:
@@ -329,25 +426,28 @@ class Chain:
             return state, None
         return state, Taps(*signal.behind_chambers(), mode.memory, behind)
 
-    def standing(self, pressure: Tensor) -> tuple[ArmState, dict[Stage, Tensor]]:
+    def standing(
+        self, pressure: Tensor, signals: bool = True
+    ) -> tuple[ArmState, dict[Stage, Tensor]]:
         """Arms before the first row of runs that begin at `pressure` (R, m), and their signals.
 
         An arm that begins away from rest is assumed to have come straight from rest and to have
         been held for STOOD_S. The signals are those behind each stage, (R, m) for line and
         material, (R, n, 3) in mm for body and sensor; behind the material that of rest, because an
-        effect that is added there starts from rest too (`first_memory`).
+        effect that is added there starts from rest too (`first_memory`). Without `signals` these
+        are not asked for, and the network is left out where nothing needs its key points.
         """
-        state, taps = self.at_rest(self.rest.expand(len(pressure), -1), taps=True)
-        assert taps is not None
-        seen = taps.behind
+        whole = bool(signals or self.outer or self.net.remembers)
+        state, taps = self.at_rest(self.rest.expand(len(pressure), -1), whole)
+        seen = taps.behind if taps else {}
         away = (pressure != self.rest).any(-1)
         if not away.any():
             return state, seen
         mode = Standing(state)
         there: dict[Stage, Tensor] = {}
-        signal = self.walk(Signal(pressure), mode, behind=there)
+        signal = self.walk(Signal(pressure), mode, self.links if whole else self.inner, there)
         stages: tuple[Stage, ...] = ("line", "body", "sensor")
-        for stage in stages:
+        for stage in stages if whole else ():
             wide = away.view(-1, *[1] * (there[stage].ndim - 1))
             seen[stage] = there[stage].where(wide, seen[stage])
         stood = ArmState(pressure, mode.anchor, signal.behind_chambers()[1], mode.memory)
@@ -388,7 +488,8 @@ class Chain:
 
         links: the links to pass; default all.
         """
-        mode = Scanning(self.standing(first)[0].memory, context_of(history), history=history)
+        start = self.standing(first, signals=False)[0].memory
+        mode = Scanning(start, context_of(history), history=history)
         behind: dict[Stage, Tensor] = {}
         signal = self.walk(Signal(history.pressure), mode, links, behind)
         return Taps(*signal.behind_chambers(), mode.memory, behind)
@@ -434,7 +535,7 @@ class Chain:
         """
         actuation = taps.behind["material"]
         if isinstance(self.net, CallableNetwork) and self.net.whole_runs:
-            memory = self.standing(first)[0].memory.get(NETWORK)
+            memory = self.standing(first, signals=False)[0].memory.get(NETWORK)
             return self.net.slope_along(actuation, history, memory, rows)
         return self.network_slope(rows(actuation), rows(taps.direction))
 
@@ -499,7 +600,7 @@ class RepeatedScan:
     def mode(self) -> Scanning:
         """A scan from the memories before the first row, for the present parameters."""
         runs = self.history.runs
-        start = self.chain.standing(self.first)[0].memory
+        start = self.chain.standing(self.first, signals=False)[0].memory
         start = {name: memory.expand(runs, *memory.shape[1:]) for name, memory in start.items()}
         rows = self.rows if self.thin else None
         return Scanning(start, context_of(self.history), rows, history=self.history)

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
 from scipy.spatial import cKDTree
+from scipy.special import stdtrit
 from torch import Tensor
 
 from surgisoft.errors import InputError, unknown_name
@@ -700,7 +700,7 @@ def _better(before: Tensor, after: Tensor, block: Tensor) -> tuple[bool, str]:
         )
     error = float((total - total.mean()).square().sum().sqrt()) / len(gain)
     error *= math.sqrt(blocks / (blocks - 1))
-    if mean > float(stats.t.ppf(0.975, blocks - 1)) * error:
+    if mean > float(stdtrit(blocks - 1, 0.975)) * error:
         return True, ""
     scale = max(float(before.nanmean()), 1e-12)
     advice = "; more held-out data (--valid) may decide it" if mean > error else ""

@@ -218,7 +218,7 @@ class ArmModel(nn.Module):
         from rest and to have been held for `STOOD_S`: lags and oscillations have died away, the
         material remembers.
         """
-        return self.chain.standing(pressure)[0]
+        return self.chain.standing(pressure, signals=False)[0]
 
     def step(
         self,
@@ -253,7 +253,11 @@ class ArmModel(nn.Module):
 
     def predict(self, history: History) -> Tensor:
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
-        return self.chain.scan(history, self.first_pressure(history)).behind["sensor"]
+        return self.scan(history).behind["sensor"]
+
+    def scan(self, history: History) -> Taps:
+        """Signals behind each stage, key points too, and memories in each row of a history."""
+        return self.chain.scan(history, self.first_pressure(history))
 
     @property
     def states_interval(self) -> bool:

@@ -417,7 +417,7 @@ class _Through:
         columns = columns.clamp(max=last)
         context = self._context(rows, columns)
         chain = self.model.chain
-        rest = chain.standing(self.first[starts[:, 0]])[0].memory
+        rest = chain.standing(self.first[starts[:, 0]], signals=False)[0].memory
         first, start = starts[:, 1] == 0, {}
         for name, memory in trace.memory.items():
             before = memory[starts[:, 0], (starts[:, 1] - 1).clamp(min=0)]

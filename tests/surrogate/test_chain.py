@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of
+from surgisoft.surrogate import chain
+from surgisoft.surrogate.chain import Holding, RepeatedScan, Signal, context_of, memory_at
 from surgisoft.surrogate.effects import STAGES, effect_class, hypothesis_of
 from surgisoft.surrogate.effects.drift import Drift
 from surgisoft.surrogate.model import ArmModel
@@ -205,3 +206,43 @@ def test_a_drift_of_the_actuation_begins_with_the_recording(away):
         for t, (_, points) in enumerate(stepped(arm, seen)):
             torch.testing.assert_close(points, expected[:, t], atol=1e-3, rtol=0.0)
         assert (expected - plain.predict(seen)).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("rows", [7, 100], ids=["parts of runs", "whole runs"])
+@SETS
+def test_long_recordings_are_followed_in_blocks_with_the_same_result(
+    names, rows, away, monkeypatch
+):
+    """Every row, a scan that is repeated, and the memory on some rows alone."""
+    arm, asked = model(names), torch.tensor([3, 17, 44, 79])
+    first = arm.first_pressure(away)
+    wide = replace(away, **{k: v.repeat(3, *[1] * (v.ndim - 1)) for k, v in _tensors(away).items()})
+    long = first.repeat(3, 1)
+
+    def some(tensor):
+        return wide.rows(tensor)[asked]
+
+    def followed():
+        with torch.no_grad():
+            taps = arm.chain.scan(wide, long)
+            again = RepeatedScan(arm.chain, wide, long, set(names), some)()
+            seen = {n: taps.behind[e.stage] for n, e in arm.effects.items()}
+            context = replace(context_of(wide), pressure=taps.pressure)
+            there = {
+                n: memory_at(e, taps.memory[n][:, 0], seen[n], context, some)
+                for n, e in arm.effects.items()
+            }
+        return {"points": taps.behind["sensor"], "again": again, **taps.memory}, there
+
+    whole, at_once = followed()
+    monkeypatch.setattr(chain, "BLOCK_ROWS", rows)
+    blocks, in_turn = followed()
+    for one, other in ((whole, blocks), (at_once, in_turn)):
+        assert one.keys() == other.keys()
+        for name, values in one.items():
+            assert torch.allclose(values, other[name], rtol=1e-5, atol=2e-4), name
+
+
+def _tensors(seen) -> dict:
+    """The fields of a history that hold tensors."""
+    return {k: v for k, v in vars(seen).items() if isinstance(v, torch.Tensor)}

@@ -232,6 +232,10 @@ class Design:
     seconds: float
     """Time that the rows stand for, s."""
 
+    @property
+    def taps(self) -> None:
+        """No scan of the history was made before."""
+
     def rows(self, tensor: Tensor) -> Tensor:
         """The looked-at rows of a (R, T, ...) tensor."""
         return self.history.rows(tensor)[self.index]

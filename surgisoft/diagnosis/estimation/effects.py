@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from surgisoft.diagnosis.candidates import Candidate, model_candidates, with_effect
+from surgisoft.diagnosis.candidates import Candidate, copied, model_candidates, with_effect
 from surgisoft.diagnosis.criteria import SEARCH
 from surgisoft.diagnosis.cross_validation import cross_validation_of
 from surgisoft.diagnosis.estimation.intervals import (
@@ -245,7 +245,7 @@ class Refined(Candidate):
     @torch.no_grad()
     def with_amplitudes(self, amplitudes: np.ndarray) -> Effect:
         """The effect at a multiple (1,) of its fitted amplitudes."""
-        effect = copy.deepcopy(self.effect)
+        effect = copied(self.effect)
         for parameter in effect.amplitudes().values():
             parameter.mul_(float(amplitudes[0]))
         return effect

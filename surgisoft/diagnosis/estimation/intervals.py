@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, ndtri, stdtrit
 from torch import Tensor
 
 from surgisoft.diagnosis.discrepancy import body_covariance
@@ -127,7 +127,7 @@ def with_covariance(fit: Fit, problem: Problem) -> Fitted:
     grams, slopes = block_slopes(fit, problem.block)
     blocks = len(grams)
     centred = slopes - slopes.mean(0)
-    wider = stats.t.ppf(0.975, blocks - 1) / stats.norm.ppf(0.975)
+    wider = stdtrit(blocks - 1, 0.975) / ndtri(0.975)
     meat = centred.T @ centred * wider**2 * blocks / (blocks - 1)
     # (n, 3, F, P) how each feature of the discrepancy pulls at the values.
     pull = np.einsum("sf,sncp->ncfp", fit.nuisance.features, fit.nuisance.weighted(fit.jacobian))
@@ -150,7 +150,7 @@ def p_value(fitted: Fitted, amplitudes: np.ndarray) -> float:
     pull = fitted.curvature[among] @ fitted.fit.values[amplitudes]
     meat = fitted.meat[among]
     meat = meat + 1e-12 * np.trace(meat) * np.eye(len(meat))
-    return float(stats.chi2.sf(float(pull @ np.linalg.solve(meat, pull)), len(amplitudes)))
+    return float(chdtrc(len(amplitudes), float(pull @ np.linalg.solve(meat, pull))))
 
 
 def intervals(

@@ -65,10 +65,13 @@ def amend_page(result: Amendment, title: str, about: str) -> Page:
             Section("Parameters", [parameter_table(result.parameters)]),
             Section(
                 "Error over time",
-                [
-                    track_chart(held_out, "Held-out part: not used in the fit"),
-                    track_chart(training, "Training part: the parameters were fitted to it"),
-                ],
+                track_charts(
+                    {
+                        "Held-out part: not used in the fit": held_out,
+                        "Training part: the parameters were fitted to it": training,
+                    },
+                    result.held_out.floor,
+                ),
             ),
             Section("How to read this", [Text(HOW)]),
         ],
@@ -94,29 +97,41 @@ def parameter_table(parameters: tuple[Parameter, ...]) -> Table:
     return Table(header, rows)
 
 
-def track_chart(track: Track, caption: str) -> Picture:
-    """The error of both models over time; runs and recordings stand one after another."""
+def track_charts(tracks: dict[str, Track], floor_mm: float) -> list[Picture]:
+    """A chart of each track by its caption, all with one scale of the error.
+
+    A track is the error of both models over time; runs and recordings stand one after another.
+    """
     from matplotlib import pyplot as plt
 
+    thinned = {caption: _thinned(track) for caption, track in tracks.items()}
+    most = max(float(np.nanmax([before, after])) for _, before, after in thinned.values())
+    pictures = []
+    with drawing():
+        for caption, (time_s, before, after) in thinned.items():
+            figure, axis = plt.subplots(figsize=(7.2, 2.8))
+            for values, colour, label in ((before, RED, "before"), (after, BLUE, "after")):
+                axis.plot(*with_gaps(time_s, values), c=colour, lw=1, label=label)
+            axis.axhline(floor_mm, c=MUTED, lw=0.8, ls="--", label="noise floor")
+            axis.set_xlabel("time [s]")
+            axis.set_ylabel("error [mm]")
+            axis.set_ylim(0, 1.05 * most)
+            figure.legend(loc="outside lower center", ncols=3)
+            pictures.append(chart(figure, caption, caption))
+    return pictures
+
+
+def _thinned(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time and both errors of a track, RMS over so many rows that about POINTS are left."""
     width = max(1, len(track.time_s) // POINTS)
     count = len(track.time_s) // width * width
-    time_s = track.time_s[:count].reshape(-1, width)[:, 0]
-    with drawing():
-        figure, axis = plt.subplots(figsize=(7.2, 2.8))
-        for values, colour, label in (
-            (track.before_mm, RED, "before"),
-            (track.after_mm, BLUE, "after"),
-        ):
-            square = np.square(values[:count]).reshape(-1, width)
-            seen = np.isfinite(square)
-            with np.errstate(invalid="ignore"):
-                mean = np.sqrt(np.nansum(square, 1) / np.where(seen.any(1), seen.sum(1), np.nan))
-            axis.plot(*with_gaps(time_s, mean), c=colour, lw=1, label=label)
-        axis.set_xlabel("time [s]")
-        axis.set_ylabel("error [mm]")
-        axis.set_ylim(bottom=0)
-        figure.legend(loc="outside lower center", ncols=2)
-        return chart(figure, caption, caption)
+    means = []
+    for values in (track.before_mm, track.after_mm):
+        square = np.square(values[:count]).reshape(-1, width)
+        seen = np.isfinite(square)
+        with np.errstate(invalid="ignore"):
+            means.append(np.sqrt(np.nansum(square, 1) / np.where(seen.any(1), seen.sum(1), np.nan)))
+    return track.time_s[:count].reshape(-1, width)[:, 0], *means
 
 
 def improve_page(
@@ -148,11 +163,12 @@ def improve_page(
     failed: list[Part] = []
     if drawn is not None:
         alt = "The body before and after, measured and predicted, with one scale of the errors"
-        failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620))
-    failed += [
-        track_chart(held_out, "Error on the held-out part: not used in any round"),
-        track_chart(training, "Error on the training part: diagnosed and fitted on it"),
-    ]
+        failed.append(Picture.from_file(drawn, alt, f"{alt}; held-out part", 620, drawn=True))
+    captions = {
+        "Error on the held-out part: not used in any round": held_out,
+        "Error on the training part: diagnosed and fitted on it": training,
+    }
+    failed += track_charts(captions, fall.floor)
     parts.append(Section("Where the model failed", failed))
     if result.diagnoses:
         parts.append(_missing(result))

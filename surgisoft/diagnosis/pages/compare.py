@@ -53,6 +53,8 @@ PICTURES = {
     "error": "The error over time",
 }
 """Caption of each picture by the stem of its file."""
+SIDE_BY_SIDE = "Measured and predicted bodies of each model, with one scale of the errors"
+"""Caption of the picture of several models."""
 BROAD_PX = {"loops": 620, "error": 620}
 """Width below which a picture scrolls, pixels."""
 
@@ -74,7 +76,11 @@ def compare_page(
                 "Measured and predicted",
                 [
                     Picture.from_file(
-                        path, PICTURES[path.stem], PICTURES[path.stem], BROAD_PX.get(path.stem, 0)
+                        path,
+                        PICTURES[path.stem],
+                        PICTURES[path.stem],
+                        BROAD_PX.get(path.stem, 0),
+                        drawn=True,
                     )
                     for path in pictures
                     if path.stem in PICTURES
@@ -235,7 +241,8 @@ def share_chart(share: AxisShare, floor_mm: float | None) -> Picture:
         low.plot(profile.middle, profile.shift_mm, ".-", c=colour, lw=1.2, ms=4, label=own)
         low.fill_between(profile.middle, *bounds, color=colour, alpha=0.15, lw=0)
     low.axhline(0.0, c=MUTED, lw=0.8)
-    low.set_ylabel("tip follows by [mm]")
+    top.set_xlim(low.get_xlim())  # one scale, though the panels may show other chambers
+    low.set_ylabel("mean error of the tip [mm]")
     for panel in (top, low):
         if share.axis == "direction":
             panel.set_xticks([-1, 0, 1], ["falling", "", "rising"])
@@ -362,8 +369,7 @@ def together_page(compared: Sequence[Compared], title: str, drawn: Sequence[Path
         small = [_models_along(compared)]
         small += [_models_over(compared, name) for name in _telling(compared)]
     pictures = [
-        Picture.from_file(path, "Measured and predicted bodies of each model, one scale", "", 620)
-        for path in drawn
+        Picture.from_file(path, SIDE_BY_SIDE, SIDE_BY_SIDE, 620, drawn=True) for path in drawn
     ]
     return Page(
         title=title,

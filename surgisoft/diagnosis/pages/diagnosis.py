@@ -36,6 +36,8 @@ HOW_SETUP = (
 )
 TONES = {"identified": "good", "several": "good", "nothing_missing": "good"}
 """Tone of a verdict; the others are warnings."""
+LEAST_SURE = 0.5
+"""Confidence below which a named effect is a warning, too."""
 
 
 HOW_CHANGE = (
@@ -62,7 +64,9 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     ]
     parts: list[Part] = [Facts(facts)]
     if found.checks:
-        parts.append(Section("Checks of the data", [Text("\n\n".join(found.checks))]))
+        parts.append(
+            Section("Checks of the data", [Text("\n\n".join(map(_sentence, found.checks)))])
+        )
     if found.setup:
         parts.append(_setup(found.setup))
     else:
@@ -97,20 +101,26 @@ def diagnosis_page(found: Diagnosis, title: str) -> Page:
     if verdict.effects:
         parts.append(_parameters(found))
     parts.append(Section("How to read this", [Text(HOW_SETUP if found.setup else HOW)]))
+    unsure = bool(verdict.effects) and verdict.confidence < LEAST_SURE
     return Page(
         title=f"Diagnosis of {title}",
-        verdict=verdict.sentence[:1].upper() + verdict.sentence[1:] + ".",
-        about=verdict.kind.replace("_", " "),
-        tone=TONES.get(verdict.kind, "warn"),
+        verdict=verdict.sentence,
+        about=f"verdict: {verdict.kind.replace('_', ' ')}",
+        tone="warn" if unsure else TONES.get(verdict.kind, "warn"),
         parts=parts,
     )
+
+
+def _sentence(text: str) -> str:
+    """A finding as a sentence of its own."""
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _change(found: Diagnosis) -> Section:
     """How far AFTER differs from BEFORE, and what the named effects explain of it."""
     change = found.change
     assert change is not None
-    parts: list = [Text(change.sentence[:1].upper() + change.sentence[1:] + ".")]
+    parts: list = [Text(_sentence(change.sentence))]
     rows = [
         (
             f"{each.after}, run {each.after_run}",
@@ -303,11 +313,11 @@ def _chart(found: Diagnosis):
             axis.plot([low, high], [place, place], c=RED if named else BLUE, lw=1.2, alpha=0.6)
             axis.plot(row.heldout_rmse_mm, place, "o", c=RED if named else BLUE, ms=5)
         axis.axvline(found.error_mm.floor, c=GREEN, lw=1, label="noise floor")
-        axis.axvline(found.error_mm.before, c=AMBER, lw=1, ls="--", label="error as it is")
+        axis.axvline(found.error_mm.before, c=AMBER, lw=1, ls="--", label="error of the model")
         axis.set_yticks(range(len(rows)), [row.effect for row in rows])
         axis.set_xlabel("held-out error with this effect added [mm]")
         axis.set_xlim(left=0)
-        axis.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+        axis.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
         return chart(figure, "Held-out error with each effect")
 
 

@@ -109,7 +109,7 @@ def loops(table: ResidualTable, unit: str, title: str = ""):
     figure, axes = plt.subplots(
         2, chambers, figsize=(4.2 * chambers, 6.2), layout="constrained", squeeze=False
     )
-    figure.suptitle(title or "Tip against actuation")
+    figure.suptitle(_titled("Tip against actuation", title))
     for chamber in range(chambers):
         rows = _stretch(table, chamber)
         along = _main_direction(table.measured_mm[rows, -1])
@@ -189,8 +189,8 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
     scale = error_scale(first.measured_mm, [table.error_mm for table in tables.values()])
     rows = _worse_rows(tables)
     count = len(tables)
-    figure = plt.figure(figsize=(5.4 * count + 0.6, 6.0), layout="constrained")
-    figure.suptitle(title or "Body, measured and predicted")
+    figure = plt.figure(figsize=(5.8 * count + 1.2, 6.6), layout="constrained")
+    figure.suptitle(_titled("Postures, measured and predicted", title))
     colours = plt.get_cmap(ERROR_COLOURS)
     panels = []
     for number, (name, table) in enumerate(tables.items()):
@@ -234,6 +234,11 @@ def bodies(tables: dict[str, ResidualTable], title: str = ""):
     layout: Any = figure.get_layout_engine()
     layout.set(rect=(0.0, 0.0, 0.97, 1.0))
     return figure
+
+
+def _titled(what: str, of: str) -> str:
+    """Title of a figure: what it shows, then the model and the recordings."""
+    return f"{what}: {of}" if of else what
 
 
 def _worse_rows(tables: dict[str, ResidualTable]) -> np.ndarray:
@@ -292,7 +297,7 @@ def error_over_time(table: ResidualTable, title: str = "", radius: np.ndarray | 
     left.set_xlabel("time [s]" + (", recordings one after another" if len(table.names) > 1 else ""))
     left.set_ylabel("error [mm]")
     left.set_ylim(bottom=0)
-    left.set_title(title or "Error over the recording")
+    left.set_title(_titled("Error over time", title))
     columns = [column[~np.isnan(column)] for column in error.T]
     right.boxplot(columns, showfliers=False, tick_labels=[f"k{k}" for k in range(len(columns))])
     right.set_ylabel("error [mm]")

@@ -50,6 +50,9 @@ def dead_channels(
             points[k] = points.get(k, 0) + int(lost[:, k].sum())
         for k, stretch in away:
             channels[k] = channels.get(k, 0) + stretch.stop - stretch.start
+        if not (away or lost.any()):
+            masked.append(recording)
+            continue
         positions = np.where(lost[..., None], np.nan, recording.key_points_mm)
         for _, stretch in away:
             positions[stretch] = np.nan

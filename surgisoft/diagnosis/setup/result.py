@@ -13,7 +13,7 @@ from surgisoft.diagnosis.setup.arrangements import units
 from surgisoft.diagnosis.setup.blind import Blind, blind_channel
 from surgisoft.diagnosis.setup.channels import Dead, dead_channels
 from surgisoft.diagnosis.setup.correction import Correction
-from surgisoft.diagnosis.setup.sample import Arrangement, sample_of
+from surgisoft.diagnosis.setup.sample import Arrangement, sample_of, samples_of
 from surgisoft.diagnosis.setup.search import (
     PROOF,
     SETTINGS,
@@ -149,9 +149,8 @@ def _of_one_setup(model: ArmModel, recordings: list[Recording]) -> SetupResult |
 
 
 def _search(model: ArmModel, recordings: list[Recording], levels: Levels) -> Search:
-    coarse = sample_of(model, recordings, SETTINGS.coarse_rows)
-    fine = sample_of(model, recordings, SETTINGS.fine_rows)
-    full = sample_of(model, recordings, EVERY_ROW)
+    sizes = (SETTINGS.coarse_rows, SETTINGS.fine_rows, EVERY_ROW)
+    coarse, fine, full = samples_of(model, recordings, sizes)
     actuation = np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings])
     return Search(coarse, fine, full, levels, units(model.spec, actuation))
 
@@ -174,12 +173,12 @@ class _Report:
         best = self.found.best if self.found else self.search.start
         given = self.blind.hypothesis if self.blind else best.hypothesis
         frame = self.blind.frame if self.blind else self._exact(best)
-        before = self._raw_error()
         after = self.blind.rmse_mm if self.blind else best.rmse_mm
         lost = self._lost(given)
         silent = (self.blind.channel,) if self.blind else self.taken
-        proved = self.found or self.blind or self.search.explains(before, after)
-        frozen = self.dead.frozen if proved else {}
+        frozen = self.dead.frozen
+        if frozen and not (self.found or self.blind):
+            frozen = frozen if self.search.explains(self._raw_error(), after) else {}
         faults = [_dead_key_point(k, self.dead.key_points[k]) for k in lost]
         faults += [_dead_chamber(k, self.blind) for k in silent]
         faults += [_frozen_chamber(k, share) for k, share in frozen.items()]
@@ -189,6 +188,7 @@ class _Report:
             faults += self.blind.further(self._unit, self._recorded(given))
         if not faults:
             return None
+        before = self._raw_error()
         whole = self.dead.key_points
         correction = replace(
             self._correction(given, frame),

@@ -106,11 +106,15 @@ class Sample:
 
     def predicted(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
         """(A, S, n, 3) predicted key points, mm, if the channels drove the chambers so."""
+        return self.predicted_single(arrangements).astype(float)
+
+    def predicted_single(self, arrangements: Sequence[Arrangement]) -> np.ndarray:
+        """What `predicted` gives in single precision, in which models compute."""
         history, cases = self.history, len(arrangements)
 
         def each(tensor: torch.Tensor) -> torch.Tensor:
             """(A R, ...) a tensor (R, ...) for every arrangement."""
-            return tensor.repeat(cases, *[1] * (tensor.ndim - 1))
+            return tensor if cases == 1 else tensor.repeat(cases, *[1] * (tensor.ndim - 1))
 
         def arranged(tensor: torch.Tensor) -> torch.Tensor:
             """(A R, ..., m) actuation (R, ..., m) of the chambers in every arrangement."""
@@ -123,15 +127,15 @@ class Sample:
         wide = History(
             t_s=each(history.t_s),
             pressure=arranged(history.pressure),
-            key_points=each(history.key_points),
+            key_points=each(history.key_points[:, :, :0]),  # no prediction depends on them
             valid=each(history.valid),
             noise=history.noise,
             temperature_C=None if history.temperature_C is None else each(history.temperature_C),
             stood=None if history.stood is None else arranged(history.stood),
         )
         with torch.no_grad():
-            points = wide.rows(self.model.predict(wide)).double().numpy()
-        points = np.where(np.isfinite(points), points, 0.0)
+            points = wide.rows(self.model.predict(wide)).numpy()
+        points[~np.isfinite(points)] = 0.0
         return points.reshape(cases, -1, *points.shape[1:])
 
     def without(self, lost: np.ndarray) -> "Sample":
@@ -143,42 +147,49 @@ class Sample:
 
 def sample_of(model: ArmModel, recordings: list[Recording], rows: int) -> Sample:
     """About `rows` rows of the recordings, evenly thinned; a recurrent network sees every row."""
+    return samples_of(model, recordings, (rows,))[0]
+
+
+def samples_of(
+    model: ArmModel, recordings: list[Recording], sizes: Sequence[int]
+) -> tuple[Sample, ...]:
+    """Samples of the recordings of about so many rows each, see `sample_of`."""
     whole = history_of(recordings, model.spec.actuation)
-    count = int(whole.valid.sum())
-    step = 1 if model.remembers else max(1, round(count / rows))
+    lengths = whole.valid.sum(1).tolist()
     training = ~held_out_rows(recordings)
     measured = np.concatenate([recording.key_points_mm for recording in recordings])
-    measured = np.where(training[:, None, None], measured, np.nan)
+    measured[~training] = np.nan
     seen = np.isfinite(measured).all(2).any(1)
-    block = blocks(whole, seen, step, least_blocks=1)
-    times, points, at, kept = [], [], [], []
-    begin = 0
-    for run in range(whole.runs):
-        length = int(whole.valid[run].sum())
-        inside = slice(begin, begin + length)
-        t_s = whole.t_s[run, :length].numpy()
-        times.append(t_s)
-        points.append(measured[inside])
-        at.append(t_s[::step])
-        kept.append(block[inside][::step])
-        begin += length
-    return Sample(
-        model=model,
-        history=History(
+    ends = np.cumsum(lengths)[:-1]
+    times = tuple(whole.t_s[run, :length].numpy() for run, length in enumerate(lengths))
+    points = tuple(np.split(measured, ends))
+    timed = all(recording.kind == "continuous" for recording in recordings)
+    samples = []
+    for rows in sizes:
+        step = 1 if model.remembers else max(1, round(len(measured) / rows))
+        block = blocks(whole, seen, step, least_blocks=1)
+        thinned = replace(
+            whole,
             t_s=whole.t_s[:, ::step],
             pressure=whole.pressure[:, ::step],
             key_points=whole.key_points[:, ::step],
             valid=whole.valid[:, ::step],
-            noise=whole.noise,
             temperature_C=None if whole.temperature_C is None else whole.temperature_C[:, ::step],
-            stood=whole.stood,
-        ),
-        times=tuple(times),
-        points=tuple(points),
-        at=tuple(at),
-        block=np.concatenate(kept),
-        timed=all(recording.kind == "continuous" for recording in recordings),
-    )
+            noise_mm=None,
+            predicted=None,
+        )
+        samples.append(
+            Sample(
+                model=model,
+                history=thinned,
+                times=times,
+                points=points,
+                at=tuple(each[::step] for each in times),
+                block=np.concatenate([part[::step] for part in np.split(block, ends)]),
+                timed=timed,
+            )
+        )
+    return tuple(samples)
 
 
 def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -189,7 +200,10 @@ def interpolated(at: np.ndarray, times: np.ndarray, points: np.ndarray) -> np.nd
     after = np.clip(np.searchsorted(times, at - 1e-9), 1, len(times) - 1)
     share = (at - times[after - 1]) / (times[after] - times[after - 1])
     share = np.where(np.abs(share - np.round(share)) < 1e-6, np.round(share), share)
-    first, second = points[after - 1], points[after]
+    first, second = (
+        points[after - 1].astype(float, copy=False),
+        points[after].astype(float, copy=False),
+    )
     part = share[:, None, None]
     # A row that is met exactly does not need its neighbour, which may be missing.
     found = np.where(part == 0, first, np.where(part == 1, second, first + part * (second - first)))

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.signal import lfilter
 
 from surgisoft.diagnosis.setup.alignment import (
     HANDED,
@@ -437,9 +436,9 @@ class Search:
         return self._predicted[arrangement]
 
     def _full(self, arrangement: Arrangement) -> np.ndarray:
-        """(N, n, 3) prediction for every row, mm."""
+        """(N, n, 3) prediction for every row in single precision, mm."""
         if arrangement not in self._whole:
-            self._whole[arrangement] = self.full.predicted([arrangement])[0]
+            self._whole[arrangement] = self.full.predicted_single([arrangement])[0]
         return self._whole[arrangement]
 
     def _late(self, predicted: np.ndarray, later_s: float) -> np.ndarray:
@@ -610,7 +609,7 @@ class Search:
         """
         full, parts, begin = self._full(hypothesis.arrangement), [], 0
         for times in self.full.at:
-            part = full[begin : begin + len(times)].copy()
+            part = full[begin : begin + len(times)].astype(float)
             begin += len(times)
             step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
             for _ in range(lags if tau_s else 0):
@@ -635,6 +634,8 @@ def _first_order(values: np.ndarray, step_s: float, tau_s: float) -> np.ndarray:
     keep = np.exp(-ratio)
     new = 1.0 - (1.0 - keep) / ratio
     old = 1.0 - keep - new
+    from scipy.signal import lfilter  # a tenth of a second, which few searches need
+
     start = values[:1] * (1.0 - new)
     return lfilter([new, old], [1.0, -keep], values, axis=0, zi=start)[0]
 

@@ -60,10 +60,10 @@ def find_warnings(recording: Recording) -> list[QualityWarning]:
 def _changes(signal: np.ndarray, run: np.ndarray) -> np.ndarray:
     """(T,) bool: where a signal (T, d) differs from the row before or a run (T,) starts."""
     with np.errstate(invalid="ignore"):
-        differs = (signal[1:] != signal[:-1]).any(axis=1)
-    known = ~np.isnan(signal).any(axis=1)
-    differs |= ~(known[1:] & known[:-1])
-    return np.concatenate([[True], differs | (run[1:] != run[:-1])])
+        differs = run[1:] != run[:-1]
+        for column in signal.T:  # a missing value differs from every value
+            differs |= column[1:] != column[:-1]
+    return np.concatenate([[True], differs])
 
 
 def _long_repeats(changed: np.ndarray) -> list[slice]:
@@ -73,11 +73,8 @@ def _long_repeats(changed: np.ndarray) -> list[slice]:
     others = np.sort(lengths)[:-1]
     usual = np.quantile(others, 0.99, method="lower") if len(others) else 0
     least = max(LEAST_FROZEN_ROWS, FROZEN_RATIO * usual)
-    return [
-        slice(int(start), int(start + length))
-        for start, length in zip(starts, lengths, strict=True)
-        if length >= least
-    ]
+    long = np.flatnonzero(lengths >= least)
+    return [slice(int(starts[i]), int(starts[i] + lengths[i])) for i in long]
 
 
 def _lives(changed: np.ndarray, stretch: slice) -> bool:

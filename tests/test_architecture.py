@@ -30,7 +30,7 @@ MAY_IMPORT = {
         "replay",
         "report",
     },
-    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay"},
+    "live": {"agents", "surrogate", "measurement", "rig", "tasks", "replay", "diagnosis"},
     "replay": {"scene", "tasks", "diagnosis"},
     "report": set(),
     "credibility": {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -101,12 +101,13 @@ def evaluate(
     batch: int = BATCH,
     progress: Progress = silent,
     watch: Callable[[Instant], None] | None = None,
+    without: Collection[str] = (),
 ) -> Evaluation:
     """Roll out episodes 0 to `episodes - 1` of a seed and summarise them.
 
     name: how the result names the policy. exact: contact, clearance and success are those of the
     exact collision checker (FCL) where the task has obstacles. batch, progress, watch: as for
-    `rollout`.
+    `rollout`. without: measures that are left out of the numbers.
     """
     exactly = ExactChecks(task) if exact and has_obstacles(task) else None
     watchers = [each for each in (exactly, watch) if each is not None]
@@ -118,6 +119,7 @@ def evaluate(
     result = rollout(task, policy, episodes, seed, batch, progress, see if watchers else None)
     checks = exactly.checks() if exactly else None
     table = episode_table(task, result, checks)
+    table = {key: values for key, values in table.items() if key not in without}
     overall = {key: summary(values, key in RATES) for key, values in table.items()}
     return Evaluation(name, table, overall, checks)
 

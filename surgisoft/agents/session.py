@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
@@ -50,6 +50,21 @@ def task_config(
     return with_fields(config, **{name: str(v) for name, v in given.items() if v is not None})
 
 
+class Rules(Protocol):
+    """Rules that an experiment lays over a task: its phases, interlock and limits."""
+
+    without: Collection[str]
+    """Measures of single steps whose means mean nothing."""
+
+    def over(self, task: Task) -> Task:
+        """The task, in simulation or on rigs, under the rules."""
+        ...
+
+    def policy(self, name: str, task: Task) -> Policy:
+        """A policy by name, for a task that `over` gave: it acts where the rules let it."""
+        ...
+
+
 @dataclass(frozen=True)
 class EvaluationRequest:
     """Which policies to evaluate, on what."""
@@ -72,6 +87,8 @@ class EvaluationRequest:
     """Scene; None: the configuration's."""
     config: Any = None
     """Configuration of the task, or a TOML file with fields of it; None: that of the first run."""
+    rules: Rules | None = None
+    """Rules of an experiment that are laid over the task; None: the task alone."""
     log: Collection[str] = ()
     """Policies whose first episode is logged."""
 
@@ -194,6 +211,8 @@ def evaluate(
     request = EvaluationRequest(names, task, **fields)
     plain, config = request.resolved(on_warning)
     place = plain if request.rig is None else on_rig(plain, request.rig, on_warning=on_warning)
+    if request.rules is not None:
+        plain, place = request.rules.over(plain), request.rules.over(place)
     with at_benches(place):
         return _evaluated(request, plain, place, config, progress)
 
@@ -215,7 +234,8 @@ def _evaluated(
 ) -> Evaluations:
     """Roll out every policy of a request on a task that is placed in simulation or on rigs."""
     measured = tuple(real_benches(place))
-    opened = {name: open_policy(name, place) for name in request.policies}
+    opening = open_policy if request.rules is None else request.rules.policy
+    opened = {name: opening(name, place) for name in request.policies}
     if measured:
         for policy in opened.values():
             _warm_up(plain, policy)
@@ -241,6 +261,7 @@ def _evaluated(
             batch=1 if measured else BATCH,
             progress=tell,
             watch=logs.get(name),
+            without=() if request.rules is None else request.rules.without,
         )
         results.append(result)
     return Evaluations(

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -28,6 +28,10 @@ from surgisoft.cli.progress import progress
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.files import write_json
 
+if TYPE_CHECKING:
+    from surgisoft.agents.session import Rules
+    from surgisoft.experiments.spec import Experiment
+
 PLACES = ("simulation", "rig")
 """Plants: simulated arm models, or rigs."""
 
@@ -46,7 +50,12 @@ def evaluate(
     episodes: Annotated[
         int, typer.Option(min=1, max=100_000, help="Episodes of each policy.")
     ] = 20,
-    seed: Annotated[int, typer.Option(min=0, max=SEED_MAX, help="Seed of the episodes.")] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=SEED_MAX, help="Seed of the episodes; default 0, with --rules its seed."
+        ),
+    ] = None,
     on: Annotated[
         str | None,
         typer.Option(
@@ -84,9 +93,9 @@ def evaluate(
         typer.Option(
             "--rules",
             metavar="EXPERIMENT",
-            help="Rules of an experiment (FILE.toml, or a packaged name such as liver): its scene "
-            "and its fields of the task, such as fire_mm. Without it those of the training run, or "
-            "of --config.",
+            help="Rules of an experiment (FILE.toml, or a packaged name such as liver): its scene, "
+            "fields of the task such as fire_mm, phases, limits and seed, so that episode k is its "
+            "episode k. Without it those of the training run, or of --config.",
         ),
     ] = None,
     effect_files: EffectFiles = None,
@@ -102,10 +111,16 @@ def evaluate(
     rigs = _rig_config(on, rig, robot_seed, hidden, cameras, observer_gain, preflight)
 
     from surgisoft.agents.session import evaluate as evaluate_policies
+    from surgisoft.experiments.session import ExperimentRules
 
     of_task: object = config
+    laid: Rules | None = None
     if rules:
-        task, of_task = _rules(rules, task, config)
+        spec = _experiment(rules, task, config)
+        place = {"scene": spec.scene} if spec.in_scene else {}
+        task, of_task = spec.scenario, replace(spec.task, **place)
+        laid, seed = ExperimentRules(spec), spec.seed if seed is None else seed
+    seed = seed or 0
 
     with progress("evaluate") as report_progress:
         found = evaluate_policies(
@@ -120,6 +135,7 @@ def evaluate(
             arm=arm,
             scene=scene,
             config=of_task,
+            rules=laid,
             log=policies if report else policies[:1] if replay else (),
         )
     about = f"{counted(episodes, 'episode')} of seed {seed}"
@@ -152,8 +168,8 @@ def evaluate(
     show_written(written)
 
 
-def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str, object]:
-    """The task of an experiment and the task's configuration in it."""
+def _experiment(experiment: Path, task: str | None, config: Path | None) -> "Experiment":
+    """The experiment whose rules hold."""
     if config:
         raise InputError("--config and --rules both set the task's fields; give one of the two")
     from surgisoft.experiments.session import open_experiment
@@ -163,8 +179,7 @@ def _rules(experiment: Path, task: str | None, config: Path | None) -> tuple[str
         raise InputError(
             f"--rules {experiment}: is an experiment of {spec.scenario}, not of {task}"
         )
-    place = {"scene": spec.scene} if spec.in_scene else {}
-    return spec.scenario, replace(spec.task, **place)
+    return spec
 
 
 def _rig_config(

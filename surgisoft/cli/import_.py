@@ -89,7 +89,10 @@ def import_(
     elif map_name is None and all(is_dataset(path) for path in raw):
         parts = [import_lerobot(path, name or path.name) for path in raw]
     elif map_name is None:
-        raise InputError("--map is missing: a map file states columns, units and frames")
+        raise InputError(
+            "--map is missing: a map file states columns, units and frames; "
+            "docs/recordings.md has one to start from"
+        )
     else:
         parts = import_files(raw, load_map(map_name), name)
     if to_file and len(parts) > 1:

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surgisoft.agents.on_rig import rigs_by_arm
+from surgisoft.agents.policies import Policy
 from surgisoft.agents.run_folder import RunFolder
 from surgisoft.config import read_toml
 from surgisoft.errors import InputError
+from surgisoft.experiments.controllers import PhaseControllers
 from surgisoft.experiments.page import experiment_page, markdown, shown_episodes
+from surgisoft.experiments.phases import PhasedTask
 from surgisoft.experiments.pictures import film, write_pictures
 from surgisoft.experiments.plan import settings
 from surgisoft.experiments.results import Results, drop_logs, sum_up, write_tables
-from surgisoft.experiments.run import open_results, run_experiment
+from surgisoft.experiments.run import DROPPED, open_results, run_experiment
 from surgisoft.experiments.spec import SCRIPTED, Experiment, load_experiment
 from surgisoft.files import write_atomically
 from surgisoft.progress import Progress, silent
 from surgisoft.replay.episode_view import write_replay
 from surgisoft.report import write_page
-from surgisoft.rig.registry import SIMULATED, parse_rig
+from surgisoft.rig.registry import SIMULATED, check_rig, parse_rig
 from surgisoft.scene.spec import FILE as SCENE_FILE
 from surgisoft.scene.spec import PHANTOM, packaged_scene
+from surgisoft.tasks.base import Task
 
 PACKAGED = PHANTOM / "experiments"
 """The experiments that come with the package."""
@@ -56,12 +60,35 @@ def open_experiment(name: str | Path) -> Experiment:
     return spec
 
 
+@dataclass(frozen=True)
+class ExperimentRules:
+    """The phases, interlock and limits of an experiment, laid over a task that `evaluate` places.
+
+    Satisfies `surgisoft.agents.session.Rules`. With the experiment's seed and task, an episode of
+    `evaluate` is that of the experiment.
+    """
+
+    spec: Experiment
+    """The experiment."""
+    without: tuple[str, ...] = DROPPED
+    """See `Rules`."""
+
+    def over(self, task: Task) -> PhasedTask:
+        """The task under the rules."""
+        return PhasedTask(self.spec.of.experiment.supervise(task), self.spec)
+
+    def policy(self, name: str, task: Task) -> Policy:
+        """The controllers of the phases, the named policy among them."""
+        assert isinstance(task, PhasedTask)
+        return PhaseControllers(self.spec, task, name)
+
+
 def with_policy(spec: Experiment, folder: str | Path) -> Experiment:
     """The experiment with one more case for each scripted one: the policy of a training run."""
     trained = RunFolder(folder).config["task"]
     if trained != spec.scenario:
         raise InputError(f"{folder}: was trained on {trained}; expected a run of {spec.scenario}")
-    path = Path(folder).resolve()
+    path = RunFolder(folder).path.resolve()
     twins = tuple(
         replace(case, name=f"{case.name}-{path.name}", policy=str(path))
         for case in spec.cases
@@ -86,7 +113,10 @@ def with_rigs(spec: Experiment, rigs: Iterable[str], preflight: bool = False) ->
         replace(case, rigs=rigs, preflight=preflight) if case.plant == "rig" else case
         for case in spec.cases
     )
-    names = {parse_rig(text).name for text in rigs_by_arm(rigs, spec.of.agents).values()}
+    texts = rigs_by_arm(rigs, spec.of.agents).values()
+    for text in texts:
+        check_rig(text)
+    names = {parse_rig(text).name for text in texts}
     together = spec.together if names <= set(SIMULATED) else 1
     return replace(spec, cases=cases, together=together)
 

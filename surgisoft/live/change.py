@@ -1,12 +1,22 @@
 """Change detection: when has a model stopped holding?
 
 The residual (measured less predicted key points) of a good model is not white: camera noise is
-correlated over tenths of a second, the model's own error over seconds, and both differ by
-direction. The detector therefore works on the residual's means over blocks of time and whitens
+correlated over tenths of a second, and the model's own error is a function of where the arm is and
+how it came there. It returns with every motion, it stands still while the arm does, and it changes
+as fast as the arm moves. The detector works on the residual's means over blocks of time and whitens
 them with what a clean *reference* shows (residuals of the same model on an arm that is known to be
-unchanged): principal components in space, and in time a first-order autoregression of each,
+unchanged):
 
-    y_i(j) = phi_i y_i(j - 1) + s_i sqrt(1 - phi_i^2) z_i(j),    z_i white.
+- The *static error* m(x, d) of actuation x and direction of its change d is a Gaussian process
+  (model discrepancy; Kennedy & O'Hagan 2001) given the reference: its posterior mean is subtracted,
+  and where the reference was not, its posterior variance counts.
+- What is left, in its principal components, is correlated along the path, not along time: it is the
+  sum of white noise and of an Ornstein-Uhlenbeck process in time and path length,
+
+      corr(y(j), y(j - 1)) = rho(j) = (1 - w) exp(-|x(j) - x(j - 1)| / l - block / tau).
+
+  Its innovation z = (y(j) - rho y(j - 1)) / (s sqrt(1 - rho^2)) is small in a hold and large in a
+  fast move; w, l and tau are the most likely ones for the reference.
 
 Each component has two charts, cumulative sums of log-likelihood ratios (CUSUM; Page 1954) against
 the same normal distribution with lambda times the scale:
@@ -15,8 +25,9 @@ the same normal distribution with lambda times the scale:
     level:       x = [y^2 (1 - lambda^-2) / (2 s^2) - log lambda] / T,
     innovation:  x =  z^2 (1 - lambda^-2) / 2        - log lambda,
 
-with T = (1 + phi^2) / (1 - phi^2) the number of blocks in which the square of an autoregression is
-worth one independent value. The level finds errors that last, the innovation those that come fast.
+with T = (1 + r^2) / (1 - r^2), r = rho / (1 - w), the number of blocks in which the square of the
+slow part is worth one independent value: none while the arm stands still. The level finds errors
+that last, the innovation those that come fast.
 The alarm is raised where any chart passes
 
     h = log(M K),
@@ -29,7 +40,8 @@ What the reference cannot state exactly enlarges the scale s. A variance that wa
 independent values counts with the upper end of its 95 % confidence interval. Then s is enlarged
 until resampled hours of the reference (moving blocks of 20 s; Künsch 1989), judged by statistics
 that were estimated without them, raise no more false alarms than wanted: errors of a network have
-heavier tails than a normal distribution.
+heavier tails than a normal distribution. Ten minutes hold some fifty independent values of the slow
+part, and hours hold rarer ones; so no independent value may add more than h / 3.
 
 A reference says nothing about motions that are not in it: a network errs more in the corners of its
 range. A block counts only where some block of the reference has an actuation, and a change of it
@@ -44,22 +56,40 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from surgisoft.diagnosis.discrepancy import kernel
 from surgisoft.errors import InputError
 
 LIKE_SHARE = 0.15
 """Largest difference in actuation, and in its change from block to block, at which a block of the
 reference covers one of a run, as a share of the actuation's range [-]."""
+TURN = 0.01
+"""Least change from block to block that turns a chamber's direction, in half ranges: more than the
+noise of a pressure sensor."""
 LEAST_BLOCKS = 60
 """Fewest blocks of a reference: half a minute with the default block."""
-LARGEST_PHI = 0.98
-"""Largest autoregression coefficient that is accepted: a correlation time of 25 s."""
+CENTRES = 300
+"""Most blocks of the reference that carry the static error's features."""
+RIDGES = (0.5, 2.0, 8.0, 32.0)
+"""Tried variances of what is not static, in variances of the static error [-]; the one that leaves
+least on held-out parts of the reference is taken."""
+REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+"""Tried path lengths over which what is left decorrelates [half ranges of the actuation]."""
+TIMES_S = (3.0, 10.0, 30.0, 100.0, np.inf)
+"""Tried times in which it decorrelates [s]; infinite: it stands still while the arm does."""
+WHITE = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Tried shares of white noise in its variance [-]."""
 FOLDS = 5
 """Parts of a reference that are judged by statistics of the others."""
 CONFIDENCE = 0.95
 """Level of the upper confidence bound of a variance (Chew 1966)."""
+MOST_BLOCK, MOST_VALUE = 1 / 4, 1 / 3
+"""Most that one block, and one independent value, may add to a chart, as shares of the threshold: a
+marker's glitch is two blocks, out and back, and three motions in which the model errs by much more
+than in the reference raise no alarm yet."""
 ENLARGE = 1.1
 """Factor between two tried enlargements of the scale."""
 HIGHEST = 1.25
@@ -99,42 +129,6 @@ class AlarmDesign:
             raise InputError(f"scale is {self.scale:g}, expected 1.1 to 100")
 
 
-@dataclass(frozen=True, eq=False)
-class Whitening:
-    """Statistics of a clean residual's block means: d = 3 n components."""
-
-    mean_mm: np.ndarray
-    """(d,) mean [mm]."""
-    axes: np.ndarray
-    """(d, d) principal components as columns."""
-    level_mm: np.ndarray
-    """(d,) standard deviation of each component, its upper confidence bound [mm]."""
-    innovation_mm: np.ndarray
-    """(d,) standard deviation of what the autoregression leaves of it [mm]."""
-    phi: np.ndarray
-    """(d,) coefficient of each component's autoregression [-]."""
-    worth: np.ndarray
-    """(d,) 1 / T: independent values that one block counts for [-]."""
-
-    def components(self, blocks_mm: np.ndarray) -> np.ndarray:
-        """(..., d) components of block means (..., d) [mm]."""
-        return (blocks_mm - self.mean_mm) @ self.axes
-
-    def squares(self, now: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """(..., 2 d) squares of levels and innovations, in units of their variances.
-
-        now, before: (..., d) components of a block and of the one before [mm].
-        """
-        level = now / self.level_mm
-        innovation = (now - self.phi * before) / self.innovation_mm
-        return np.concatenate([level, innovation], axis=-1) ** 2
-
-    @property
-    def weights(self) -> np.ndarray:
-        """(2 d,) independent values that one block counts for in each chart."""
-        return np.concatenate([self.worth, np.ones_like(self.worth)])
-
-
 def block_means(t_s: np.ndarray, residual_mm: np.ndarray, block_s: float) -> np.ndarray:
     """(J, D) means of values (T, ...) over whole blocks of time; t_s: (T,) of one run.
 
@@ -158,29 +152,168 @@ def _mean(rows: np.ndarray) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def whitening(
-    runs: Sequence[np.ndarray], design: AlarmDesign, elsewhere_mm2: np.ndarray | None = None
-) -> Whitening:
-    """Statistics of a reference: block means (J, d) of each run [mm].
+class Stretch(NamedTuple):
+    """T samples of a run without a reset or a gap."""
 
-    elsewhere_mm2: (d, d) covariance of the model's error over its whole range [mm^2], which is
-    added to that of the reference, because a run may go where the reference did not.
+    t_s: np.ndarray
+    """(T,) times [s]."""
+    residual_mm: np.ndarray
+    """(T, n, 3) measured less predicted key points [mm]; NaN where missing."""
+    actuation: np.ndarray
+    """(T, m) actuation [unit of the arm]."""
+
+
+class Blocks(NamedTuple):
+    """Means over J blocks of time of one run."""
+
+    residual_mm: np.ndarray
+    """(J, d) residual [mm]."""
+    position: np.ndarray
+    """(J, m) actuation [half ranges]."""
+    direction: np.ndarray
+    """(J, m) direction of its last change: -1, 1, or 0 before the first one."""
+
+    @property
+    def path(self) -> np.ndarray:
+        """(J - 1,) distance from each block to the next [half ranges]."""
+        return np.linalg.norm(np.diff(self.position, axis=0), axis=1)
+
+    def part(self, rows: np.ndarray) -> Blocks:
+        """Some consecutive blocks."""
+        return Blocks(*(values[rows] for values in self))
+
+
+def blocks_of(stretch: Stretch, half_range: np.ndarray, block_s: float) -> Blocks:
+    """The blocks of a run; half_range: (m,) half the actuation's range [unit]."""
+    position = block_means(stretch.t_s, stretch.actuation, block_s) / half_range
+    direction = np.zeros_like(position)
+    for j in range(1, len(position)):
+        direction[j] = turned(direction[j - 1], position[j] - position[j - 1])
+    return Blocks(block_means(stretch.t_s, stretch.residual_mm, block_s), position, direction)
+
+
+def turned(direction: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """(m,) direction after a change of position (m,) [half ranges] from a direction before it."""
+    return np.where(np.abs(change) > TURN, np.sign(change), direction)
+
+
+@dataclass(frozen=True, eq=False)
+class StaticError:
+    """The model's error as a function of position and direction, given a reference.
+
+    A Gaussian process with the covariance of `diagnosis.discrepancy`, by its values at a few blocks
+    of the reference (deterministic training conditional; Quinonero-Candela & Rasmussen 2005).
     """
-    every = np.concatenate(runs)
-    size = every.shape[1]
-    mean = every.mean(axis=0)
-    covariance = np.cov(every.T) + design.least_mm**2 * np.eye(size)
-    variance, axes = np.linalg.eigh(covariance)
-    parts = [(run - mean) @ axes for run in runs]
-    before = np.concatenate([part[:-1] for part in parts])
-    after = np.concatenate([part[1:] for part in parts])
-    phi = np.clip((before * after).sum(0) / (before**2).sum(0), 0.0, LARGEST_PHI)
-    worth = (1.0 - phi**2) / (1.0 + phi**2)
-    level = _upper(variance, len(every) * worth)
-    innovation = _upper(np.mean((after - phi * before) ** 2, axis=0), float(len(after)))
-    if elsewhere_mm2 is not None:
-        level = level + np.einsum("ki,kl,li->i", axes, elsewhere_mm2, axes)
-    return Whitening(mean, axes, np.sqrt(level), np.sqrt(innovation), phi, worth)
+
+    mean_mm: np.ndarray
+    """(d,) mean over the reference [mm]."""
+    centres: tuple[np.ndarray, np.ndarray]
+    """(C, m) positions and (C, m) directions of the blocks that carry it."""
+    root: np.ndarray
+    """(C, F) with which the covariances to the centres become unit-normal features."""
+    weights_mm: np.ndarray
+    """(F, d) weight of each feature [mm]."""
+    spread: np.ndarray
+    """(F, F) covariance of the weights, in units of the static error's variance [-]."""
+
+    @classmethod
+    def fitted(cls, runs: Sequence[Blocks], ridge: float) -> StaticError:
+        """The static error given runs; ridge: one of `RIDGES`."""
+        every = Blocks(*(np.concatenate(parts) for parts in zip(*runs, strict=True)))
+        count = len(every.position)
+        chosen = np.unique(np.linspace(0, count - 1, min(CENTRES, count)).round().astype(int))
+        centres = every.position[chosen], every.direction[chosen]
+        values, vectors = linalg.eigh(kernel(*centres, *centres))
+        kept = values > 1e-6 * values.max()
+        root = vectors[:, kept] / np.sqrt(values[kept])
+        features = kernel(every.position, every.direction, *centres) @ root
+        normal = features.T @ features / ridge + np.eye(features.shape[1])
+        spread = linalg.inv(normal)
+        mean = every.residual_mm.mean(axis=0)
+        weights = spread @ features.T @ (every.residual_mm - mean) / ridge
+        return cls(mean, centres, root, weights, spread)
+
+    def given(self, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
+        """What it leaves of a residual, (J, d) [mm], and (J,) its own variance there [0..1]."""
+        features = kernel(blocks.position, blocks.direction, *self.centres) @ self.root
+        left = blocks.residual_mm - self.mean_mm - features @ self.weights_mm
+        away = np.maximum(1.0 - (features**2).sum(axis=1), 0.0)
+        return left, away + ((features @ self.spread) * features).sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """How what the static error leaves is correlated from block to block, for d components."""
+
+    white: np.ndarray
+    """(d,) w, share of white noise in the variance [-]."""
+    reach: np.ndarray
+    """(d,) l, path length over which the rest decorrelates [half ranges]."""
+    time_s: np.ndarray
+    """(d,) tau, time in which it does [s]."""
+    block_s: float
+    """Length of a block [s]."""
+
+    @classmethod
+    def fitted(cls, parts: Sequence[np.ndarray], paths: Sequence[np.ndarray], block_s: float):
+        """The most likely memory of components (J, d) with paths (J - 1,) of each run.
+
+        The likelihood is that of each block given the one before, at the most likely variance.
+        """
+        before = np.concatenate([part[:-1] for part in parts])
+        after = np.concatenate([part[1:] for part in parts])
+        path = np.concatenate(paths)[:, None]
+        best, found = np.full(before.shape[1], np.inf), np.zeros((3, before.shape[1]))
+        for reach, time_s in itertools.product(REACHES, TIMES_S):
+            kept = np.exp(-path / reach - block_s / time_s)
+            for white in WHITE:
+                rho = (1.0 - white) * kept
+                left = 1.0 - rho**2
+                variance = np.mean((after - rho * before) ** 2 / left, axis=0)
+                cost = np.log(variance) + np.mean(np.log(left))
+                found[:, cost < best] = np.array([white, reach, time_s])[:, None]
+                best = np.minimum(best, cost)
+        return cls(*found, block_s)
+
+    def kept(self, path: np.ndarray) -> np.ndarray:
+        """(..., d) correlation of the slow part over a path (...,) in one block."""
+        return np.exp(-np.asarray(path)[..., None] / self.reach - self.block_s / self.time_s)
+
+    def worth(self, path: np.ndarray) -> np.ndarray:
+        """(..., d) 1 / T: independent values of the slow part in a block with a path (...,)."""
+        kept = self.kept(path)
+        return (1.0 - kept**2) / (1.0 + kept**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Statistics of a clean residual's block means: d = 3 n components."""
+
+    axes: np.ndarray
+    """(d, d) principal components of what the static error leaves, as columns."""
+    level_mm: np.ndarray
+    """(d,) standard deviation of each component, its upper confidence bound [mm]."""
+    memory: Memory
+    """How each component is correlated along the path."""
+    elsewhere_mm2: np.ndarray
+    """(d,) variance of the model's error over its whole range along each component [mm^2]."""
+
+    def squares(
+        self, now: np.ndarray, before: np.ndarray, path: np.ndarray, unknown: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(..., 2 d) squares of levels and innovations, and the independent values that each is.
+
+        The squares are in units of their variances. now, before: (..., d) what the static error
+        leaves of a block and of the one before [mm]; path: (...,) between them [half ranges];
+        unknown: (...,) variance of the static error in the block [0..1].
+        """
+        rho = (1.0 - self.memory.white) * self.memory.kept(path)
+        variance = self.level_mm**2 + np.asarray(unknown)[..., None] * self.elsewhere_mm2
+        level = (now @ self.axes) ** 2 / variance
+        step = now @ self.axes - rho * (before @ self.axes)
+        innovation = step**2 / (variance * (1.0 - rho**2))
+        counts = np.concatenate([self.memory.worth(path), np.ones_like(rho)], axis=-1)
+        return np.concatenate([level, innovation], axis=-1), counts
 
 
 def _upper(variance: np.ndarray, count: np.ndarray | float) -> np.ndarray:
@@ -195,8 +328,12 @@ class Detector:
 
     design: AlarmDesign
     """What is to be detected."""
+    half_range: np.ndarray
+    """(m,) half the actuation's range [unit]."""
+    static: StaticError
+    """The model's static error in the reference."""
     whitening: Whitening
-    """Statistics of the reference."""
+    """Statistics of what it leaves."""
     coverage: Coverage
     """The reference's motions."""
     enlargement: float
@@ -209,12 +346,17 @@ class Detector:
     @property
     def threshold(self) -> float:
         """h: value of a chart at which the alarm is raised [-]."""
-        return threshold(self.design, len(self.whitening.phi))
+        return threshold(self.design, len(self.whitening.level_mm))
 
-    def increments(self, squares: np.ndarray) -> np.ndarray:
-        """(..., 2 d) increments of the charts from squares as `Whitening.squares` gives them."""
-        design, weights = self.design, self.whitening.weights
-        return increments(squares / self.enlargement**2, weights, design, self.threshold)
+    def increments(self, squares: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """(..., 2 d) increments of the charts from what `Whitening.squares` gives.
+
+        No independent value, which may last for many blocks, adds more than `MOST_VALUE`. The
+        enlargement was found without that bound.
+        """
+        limit = self.threshold
+        steps = increments(squares / self.enlargement**2, counts, self.design, limit)
+        return np.minimum(steps, MOST_VALUE * counts * limit)
 
 
 def threshold(design: AlarmDesign, components: int) -> float:
@@ -224,27 +366,15 @@ def threshold(design: AlarmDesign, components: int) -> float:
 
 
 def increments(
-    squares: np.ndarray, weights: np.ndarray, design: AlarmDesign, limit: float
+    squares: np.ndarray, counts: np.ndarray, design: AlarmDesign, limit: float
 ) -> np.ndarray:
-    """Log-likelihood ratios of squares (..., K), times the weights (K,) of the charts.
+    """Log-likelihood ratios of squares (..., K), times the independent values that each counts for.
 
-    None is above a quarter of `limit`, so that no single block, such as a marker's glitch, which
-    counts on its way out and on its way back, raises an alarm.
+    None is above `MOST_BLOCK` of `limit`.
     """
     gain = 0.5 * (1.0 - design.scale**-2)
-    ratio = weights * (gain * squares - np.log(design.scale))
-    return np.minimum(ratio, limit / 4.0)
-
-
-class Stretch(NamedTuple):
-    """T samples of a run without a reset or a gap."""
-
-    t_s: np.ndarray
-    """(T,) times [s]."""
-    residual_mm: np.ndarray
-    """(T, n, 3) measured less predicted key points [mm]; NaN where missing."""
-    actuation: np.ndarray
-    """(T, m) actuation [unit of the arm]."""
+    ratio = counts * (gain * squares - np.log(design.scale))
+    return np.minimum(ratio, MOST_BLOCK * limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,40 +382,21 @@ class Coverage:
     """The motions of a reference."""
 
     tree: cKDTree
-    """Blocks of the reference: actuation and its change, in tolerances."""
-    tolerance: np.ndarray
-    """(m,) largest difference that counts as alike [unit of the arm]."""
+    """Blocks of the reference: position and its change [half ranges]."""
 
     @classmethod
-    def of(cls, runs: Sequence[np.ndarray], span: np.ndarray) -> Coverage:
-        """The motions of runs of blocks with actuations (J, m); span: (m,) its range."""
-        tolerance = LIKE_SHARE * np.asarray(span, np.float64)
-        return cls(
-            cKDTree(np.concatenate([motion(run) / np.tile(tolerance, 2) for run in runs])),
-            tolerance,
-        )
+    def of(cls, runs: Sequence[np.ndarray]) -> Coverage:
+        """The motions of runs of blocks with positions (J, m) [half ranges]."""
+        return cls(cKDTree(np.concatenate([motion(run) for run in runs])))
 
     def covers(self, moved: np.ndarray) -> np.ndarray:
         """(...,) whether motions (..., 2 m), as `motion` gives them, are in the reference."""
-        return self.tree.query(moved / np.tile(self.tolerance, 2), p=np.inf)[0] <= 1.0
+        return self.tree.query(moved, p=np.inf)[0] <= 2.0 * LIKE_SHARE
 
 
-def motion(actuation: np.ndarray) -> np.ndarray:
-    """(J - 1, 2 m) actuation of blocks (J, m) from the second on, and its change [unit]."""
-    return np.concatenate([actuation[1:], np.diff(actuation, axis=0)], axis=1)
-
-
-class _Run(NamedTuple):
-    """Blocks of one run."""
-
-    residual: np.ndarray
-    """(J, d) means of the residual [mm]."""
-    actuation: np.ndarray
-    """(J, m) means of the actuation [unit]."""
-
-
-def _blocks(stretch: Stretch, block_s: float) -> _Run:
-    return _Run(*(block_means(stretch.t_s, values, block_s) for values in stretch[1:]))
+def motion(position: np.ndarray) -> np.ndarray:
+    """(J - 1, 2 m) position of blocks (J, m) from the second on, and its change."""
+    return np.concatenate([position[1:], np.diff(position, axis=0)], axis=1)
 
 
 def fit_detector(
@@ -296,66 +407,120 @@ def fit_detector(
 ) -> Detector:
     """The detector that a clean reference gives, one stretch for each run.
 
-    span: (m,) range of the actuation [unit]. elsewhere_mm2: see `whitening`. Raises InputError
-    where the reference is too short.
+    span: (m,) range of the actuation [unit]. elsewhere_mm2: (d, d) covariance of the model's error
+    over its whole range [mm^2], which is added where the reference does not show the error. Raises
+    InputError where the reference is too short.
     """
     design = design or AlarmDesign()
-    blocks = [_blocks(stretch, design.block_s) for stretch in reference]
-    blocks = [run for run in blocks if len(run.residual) > 1]
-    runs = [run.residual for run in blocks]
-    count = sum(map(len, runs))
+    half_range = np.asarray(span, np.float64) / 2.0
+    runs = [blocks_of(stretch, half_range, design.block_s) for stretch in reference]
+    runs = [run for run in runs if len(run.position) > 1]
+    count = sum(len(run.position) for run in runs)
     if count < LEAST_BLOCKS:
         raise InputError(
             f"the clean reference has {count * design.block_s:g} s, expected at least "
             f"{LEAST_BLOCKS * design.block_s:g} s; record longer"
         )
-    found = whitening(runs, design, elsewhere_mm2)
+    folds = [[run] for run in runs] if len(runs) >= FOLDS else _fifths(runs)
+    held = {ridge: _held_out(folds, ridge) for ridge in RIDGES}
+    ridge = min(RIDGES, key=lambda each: sum((part.left**2).sum() for part in held[each]))
+    found, squares, counts = _whitened(held[ridge], design, elsewhere_mm2)
+    enlargement = _enlargement(squares, counts, design)
     distance = np.concatenate([stretch.residual_mm for stretch in reference])
-    reference_mm = float(np.sqrt(np.nanmean((distance**2).sum(-1))))
-    squares = _judged_by_others(blocks, span, design, elsewhere_mm2)
-    enlargement = _enlargement(squares, found.weights, design)
-    coverage = Coverage.of([run.actuation for run in blocks], span)
-    return Detector(design, found, coverage, enlargement, reference_mm, count * design.block_s)
+    return Detector(
+        design,
+        half_range,
+        StaticError.fitted(runs, ridge),
+        found,
+        Coverage.of([run.position for run in runs]),
+        enlargement,
+        float(np.sqrt(np.nanmean((distance**2).sum(-1)))),
+        count * design.block_s,
+    )
 
 
-def _judged_by_others(blocks, span, design: AlarmDesign, elsewhere_mm2) -> list[np.ndarray]:
-    """Squares (J, 2 d) of each part of a reference with statistics of the other parts.
+class _HeldOut(NamedTuple):
+    """A run, or a part of one, judged by the other parts of a reference."""
 
-    Blocks that the other parts do not cover are left out, as in a run.
-    """
-    folds = [[run] for run in blocks] if len(blocks) >= FOLDS else _fifths(blocks)
-    judged = []
+    fold: int
+    """Number of the fold that it belongs to."""
+    left: np.ndarray
+    """(J, d) what the others' static error leaves of its residual [mm]."""
+    unknown: np.ndarray
+    """(J,) variance of that static error [0..1]."""
+    path: np.ndarray
+    """(J - 1,) distance from each block to the next [half ranges]."""
+    covered: np.ndarray
+    """(J - 1,) whether the others cover the motion from the second block on."""
+
+
+def _held_out(folds: Sequence[Sequence[Blocks]], ridge: float) -> list[_HeldOut]:
+    """Every run of every fold, judged by the other folds."""
+    found = []
     for k, fold in enumerate(folds):
         others = [run for j, other in enumerate(folds) if j != k for run in other]
-        known = whitening([run.residual for run in others], design, elsewhere_mm2)
-        coverage = Coverage.of([run.actuation for run in others], span)
+        static = StaticError.fitted(others, ridge)
+        coverage = Coverage.of([run.position for run in others])
         for run in fold:
-            part = known.components(run.residual)
-            covered = coverage.covers(motion(run.actuation))
-            judged.append(known.squares(part[1:], part[:-1])[covered])
-    return [squares for squares in judged if len(squares)]
+            covered = coverage.covers(motion(run.position))
+            found.append(_HeldOut(k, *static.given(run), run.path, covered))
+    return found
 
 
-def _fifths(runs: Sequence[_Run]) -> list[list[_Run]]:
+def _whitened(
+    parts: Sequence[_HeldOut], design: AlarmDesign, elsewhere_mm2: np.ndarray | None
+) -> tuple[Whitening, list[np.ndarray], list[np.ndarray]]:
+    """Statistics of a reference, and its squares and counts with the scales of the other folds.
+
+    Blocks that the other folds do not cover are left out of the squares, as in a run.
+    """
+    every = np.concatenate([part.left for part in parts])
+    size = every.shape[1]
+    least = design.least_mm**2
+    _, axes = np.linalg.eigh(every.T @ every / len(every) + least * np.eye(size))
+    memory = Memory.fitted(
+        [part.left @ axes for part in parts], [part.path for part in parts], design.block_s
+    )
+    known = np.zeros((size, size)) if elsewhere_mm2 is None else elsewhere_mm2
+    elsewhere = np.einsum("ki,kl,li->i", axes, known, axes)
+
+    def of(some: Sequence[_HeldOut]) -> Whitening:
+        squares = np.concatenate([part.left @ axes for part in some]) ** 2
+        number = sum(memory.worth(part.path).sum(axis=0) for part in some)
+        level = np.sqrt(_upper(squares.mean(axis=0) + least, number))
+        return Whitening(axes, level, memory, elsewhere)
+
+    squares, counts = [], []
+    for part in parts:
+        others = of([other for other in parts if other.fold != part.fold])
+        rows, count = others.squares(part.left[1:], part.left[:-1], part.path, part.unknown[1:])
+        if part.covered.any():
+            squares.append(rows[part.covered])
+            counts.append(count[part.covered])
+    return of(parts), squares, counts
+
+
+def _fifths(runs: Sequence[Blocks]) -> list[list[Blocks]]:
     """Five folds of consecutive blocks of a few runs."""
-    folds: list[list[_Run]] = [[] for _ in range(FOLDS)]
+    folds: list[list[Blocks]] = [[] for _ in range(FOLDS)]
     for run in runs:
-        for k, rows in enumerate(np.array_split(np.arange(len(run.residual)), FOLDS)):
+        for k, rows in enumerate(np.array_split(np.arange(len(run.position)), FOLDS)):
             if len(rows) > 1:
-                folds[k].append(_Run(run.residual[rows], run.actuation[rows]))
+                folds[k].append(run.part(rows))
     return [fold for fold in folds if fold]
 
 
-def _enlargement(squares: list[np.ndarray], weights, design: AlarmDesign) -> float:
+def _enlargement(squares: list[np.ndarray], counts: list[np.ndarray], design: AlarmDesign) -> float:
     """Smallest tried factor on the scale with few enough alarms on the resampled reference."""
     if not squares:
         return 1.0
     accepted = max(1.0, design.resample_h / design.false_alarm_h)
-    draws = resampled(squares, design)
-    h = threshold(design, len(weights) // 2)
+    rows = resampled([len(each) for each in squares], design)
+    drawn, number = np.concatenate(squares)[rows], np.concatenate(counts)[rows]
+    h = threshold(design, drawn.shape[-1] // 2)
     factor = 1.0
     while factor < LARGEST_SCALE:
-        if alarms_in(increments(draws / factor**2, weights, design, h), h) <= accepted:
+        if alarms_in(increments(drawn / factor**2, number, design, h), h) <= accepted:
             return factor
         factor *= ENLARGE
     raise InputError(
@@ -364,24 +529,26 @@ def _enlargement(squares: list[np.ndarray], weights, design: AlarmDesign) -> flo
     )
 
 
-def resampled(squares: Sequence[np.ndarray], design: AlarmDesign) -> np.ndarray:
-    """(S, G, 2 d) squares of G chains of S blocks: random stretches of the reference, joined."""
+def resampled(lengths: Sequence[int], design: AlarmDesign) -> np.ndarray:
+    """(S, G) rows of a reference in G chains of S blocks: random stretches of its runs, joined.
+
+    lengths: blocks of each run.
+    """
     rng = np.random.default_rng(0)
     stretch = max(1, round(design.resample_s / design.block_s))
     total = round(design.resample_h * 3600.0 / design.block_s)
-    starts = np.array(
+    begins = np.cumsum([0, *lengths[:-1]])
+    starts = np.concatenate(
         [
-            first
-            for begin, run in zip(np.cumsum([0, *map(len, squares[:-1])]), squares, strict=True)
-            for first in range(begin, begin + max(1, len(run) - stretch + 1))
+            begin + np.arange(max(1, length - stretch + 1))
+            for begin, length in zip(begins, lengths, strict=True)
         ]
     )
-    every = np.concatenate(squares)
     joined = max(2, round(0.1 * 3600.0 / design.resample_s))
     chains = max(1, total // (joined * stretch))
     first = rng.choice(starts, (joined, chains))
-    rows = np.minimum(first[:, None] + np.arange(stretch)[None, :, None], len(every) - 1)
-    return every[rows.reshape(joined * stretch, chains)]
+    rows = np.minimum(first[:, None] + np.arange(stretch)[None, :, None], sum(lengths) - 1)
+    return rows.reshape(joined * stretch, chains)
 
 
 def alarms_in(steps: np.ndarray, h: float) -> int:
@@ -438,9 +605,10 @@ class Charts:
     """Blocks whose motion is not in the reference."""
     _charts: np.ndarray | None = None
     _zero_s: np.ndarray | None = None
-    _before: np.ndarray | None = None
     _mean: np.ndarray | None = None
-    _moved: np.ndarray | None = None
+    _before: np.ndarray | None = None
+    _position: np.ndarray | None = None
+    _direction: np.ndarray | None = None
     _rows: list[np.ndarray] = field(default_factory=list)
     _actuations: list[np.ndarray] = field(default_factory=list)
     _begin_s: float | None = None
@@ -466,7 +634,7 @@ class Charts:
     def pause(self) -> None:
         """The samples that follow do not continue those before: a reset, or a gap in time."""
         self._rows, self._actuations = [], []
-        self._before = self._moved = self._begin_s = None
+        self._before = self._position = self._direction = self._begin_s = None
 
     def _close(self, t_s: float) -> Alarm | None:
         """Let the charts take the block that ends at t_s."""
@@ -482,16 +650,26 @@ class Charts:
         if np.isfinite(distance).any():
             self._recent.append((t_s, float(np.nanmean(distance))))
         detector = self.detector
-        now = detector.whitening.components(self._mean)
-        before, self._before = self._before, now
-        moved, self._moved = self._moved, actuations.mean(axis=0)
-        if before is None or moved is None:
+        before, last_position = self._before, self._position
+        position = self._position = actuations.mean(axis=0) / detector.half_range
+        change = np.zeros_like(position) if last_position is None else position - last_position
+        if self._direction is None:
+            self._direction = np.zeros_like(position)
+        self._direction = turned(self._direction, change)
+        block = Blocks(*(each[None] for each in (self._mean, position, self._direction)))
+        (now,), unknown = detector.static.given(block)
+        self._before = now
+        if before is None or last_position is None:
             return None
-        if not detector.coverage.covers(motion(np.array([moved, self._moved])))[0]:
+        moved = np.concatenate([position, change])
+        if not detector.coverage.covers(moved):
             self.left_out += 1
             return None
         self.judged += 1
-        steps = detector.increments(detector.whitening.squares(now, before))
+        squares, counts = detector.whitening.squares(
+            now, before, np.linalg.norm(change), unknown[0]
+        )
+        steps = detector.increments(squares, counts)
         if self._charts is None or self._zero_s is None:
             self._charts = np.zeros_like(steps)
             self._zero_s = np.full_like(steps, t_s - detector.design.block_s)

@@ -1,24 +1,26 @@
 """A rig as LeRobot's robots are driven: named numbers out, named numbers in; no LeRobot needed.
 
-The plug-in package `lerobot_robot_surgisoft` (folder `plugins` of the repository) wraps
-`NamedRig` in LeRobot's own base class, so that `lerobot-record --robot.type=surgisoft_rig` finds
-it.
+The plug-in package `lerobot_robot_surgisoft` (folder `plugins` of the repository) wraps `NamedRig`
+and `NamedSchedule` in LeRobot's own base classes, so that `lerobot-record
+--robot.type=surgisoft_rig --teleop.type=surgisoft_schedule` finds them.
 """
 
 import math
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 
 import numpy as np
 
 from surgisoft.errors import InputError
+from surgisoft.measurement.protocols.schedule_file import load_schedule
 from surgisoft.rig.interface import Rig, vented
 from surgisoft.rig.registry import open_rig
 from surgisoft.rig.safety import guarded
 
 
 class NamedRig:
-    """A rig by the names that a recording's columns have: p1_kPa, k0_x_mm, temp_C; c1_kPa.
+    """A rig by the names that a recording's columns have: p1_kPa, k0_x_mm; c1_kPa.
 
     A real rig is driven inside its safety limits (`SafeRig`), and vented by `disconnect`.
     """
@@ -107,3 +109,35 @@ class NamedRig:
         if self._driven is None:
             raise InputError(f"rig '{self._text}': not connected; call connect() first")
         return self._driven
+
+
+class NamedSchedule:
+    """A schedule file (CSV; t_s, c1_kPa ...) as commands by name, in the place of a teleoperator.
+
+    Its clock begins with the first command that is asked for. Between rows the command is linear; a
+    schedule that is over begins again, and so does one that nobody asked for longer than GAP_S.
+    """
+
+    GAP_S = 1.0
+    """Longest time between two commands of one run through the schedule [s]."""
+
+    def __init__(self, path: str, clock: Callable[[], float] = time.monotonic):
+        """path: the CSV file; clock: time [s]. Raises InputError for several runs in the file."""
+        protocol = load_schedule(path)
+        if len(np.unique(protocol.run)) > 1:
+            raise InputError(f"{path}: {len(np.unique(protocol.run))} runs; expected one")
+        assert protocol.t_s is not None
+        self.names = [f"c{i + 1}_{protocol.unit}" for i in range(protocol.commands.shape[1])]
+        self._times, self._commands = protocol.t_s - protocol.t_s[0], protocol.commands
+        self._clock = clock
+        self._begun_s = self._last_s = -math.inf
+
+    def command(self) -> dict[str, float]:
+        """The command at this time [unit]."""
+        now_s = self._clock()
+        if now_s - self._last_s > self.GAP_S:
+            self._begun_s = now_s
+        self._last_s = now_s
+        at_s = (now_s - self._begun_s) % max(self._times[-1], 1e-9)
+        values = [float(np.interp(at_s, self._times, column)) for column in self._commands.T]
+        return dict(zip(self.names, values, strict=True))

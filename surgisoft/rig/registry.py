@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from surgisoft.errors import InputError, unknown_name
 from surgisoft.rig.drivers.serial_rig import SerialRig
@@ -261,6 +261,50 @@ def rig_about(name: str) -> str:
     return " ".join(text.partition("\n\n")[0].split())
 
 
+class _Asked(NamedTuple):
+    """What a text asks for, checked."""
+
+    name: str
+    """Name of the rig."""
+    factory: Callable[..., Rig]
+    """What makes it."""
+    own: dict[str, RigOption]
+    """Options of the rig itself."""
+    known: dict[str, RigOption]
+    """Those, and the safety limits of a real rig."""
+    values: dict[str, Any]
+    """Options that the text gives, with their types."""
+
+
+def _asked(text: str, beside: Iterable[str] = ()) -> _Asked:
+    """The rig and the options of a text; beside: names of options that are given apart from it."""
+    asked = parse_rig(text)
+    factory = rig_factory(asked.name)
+    own = _options(asked.name, factory)
+    known = (
+        own
+        if asked.name in SIMULATED
+        else own | {name: option for name, option in safety_options().items() if name not in own}
+    )
+    unknown = [name for name in (*asked.options, *beside) if name not in known]
+    if unknown:
+        has = ", ".join(known) or "none"
+        raise InputError(f"rig '{asked.name}': unknown option '{unknown[0]}'; its options: {has}")
+    values = {
+        option: _value(asked.name, known[option], written)
+        for option, written in asked.options.items()
+    }
+    return _Asked(asked.name, factory, own, known, values)
+
+
+def check_rig(text: str) -> None:
+    """Raise InputError for a text that names no rig, or options that it does not have.
+
+    Opens nothing, so that a command can refuse before it writes or waits.
+    """
+    _asked(text)
+
+
 def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any) -> Rig:
     """Open the rig that `NAME[:option=value,...]` or `package.module:object[:...]` names.
 
@@ -270,22 +314,8 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
     that count where the rig has them and nothing else gives them. Raises InputError for an unknown
     option, a value of another type, and what the rig itself refuses.
     """
-    asked = parse_rig(text)
-    factory = rig_factory(asked.name)
-    own = _options(asked.name, factory)
-    known = (
-        own
-        if asked.name in SIMULATED
-        else own | {name: option for name, option in safety_options().items() if name not in own}
-    )
-    unknown = [name for name in (*asked.options, *fields) if name not in known]
-    if unknown:
-        has = ", ".join(known) or "none"
-        raise InputError(f"rig '{asked.name}': unknown option '{unknown[0]}'; its options: {has}")
-    values = {
-        option: _value(asked.name, known[option], written)
-        for option, written in asked.options.items()
-    }
+    asked = _asked(text, fields)
+    own, known, values = asked.own, asked.known, asked.values
     for option, value in fields.items():
         if option in values and values[option] != value:
             raise InputError(
@@ -303,7 +333,7 @@ def open_rig(text: str, defaults: Mapping[str, Any] | None = None, **fields: Any
             f"expected {asked.name}:{','.join(f'{name}=...' for name in missing)}"
         )
     limits = {option: values.pop(option) for option in list(values) if option not in own}
-    rig = factory(**values)
+    rig = asked.factory(**values)
     if not is_simulated(rig):
         return SafeRig(rig, _safety(asked.name, limits))
     if limits:

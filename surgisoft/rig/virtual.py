@@ -1,7 +1,7 @@
 """The virtual rig: a simulation of the test bench with sensors and cameras.
 
-It is the independent plant on which arm models are evaluated, so it shares nothing with them: no
-code, no formulas.
+It is the independent plant on which arm models are evaluated, so it shares no code with them. Some
+of its formulas are theirs, where physics leaves one form (`docs/results/index.md` lists them).
 """
 
 import math

@@ -42,7 +42,8 @@ def read_parts(path: str | Path) -> tuple[Part, ...]:
         raise InputError(f"{path}: is a folder; expected a mesh file ({', '.join(SUFFIXES)})")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"{path}: file type '{path.suffix}' is not read; expected one of {', '.join(SUFFIXES)}"
+            f"{path}: file type '{path.suffix}' is not read; expected one of "
+            f"{', '.join(SUFFIXES)}, which 3D Slicer, ParaView and MeshLab write"
         )
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty; expected a mesh")

@@ -1,4 +1,4 @@
-"""The loop closed, small: what is kept, what is recorded, what comes of an effect, what is told."""
+"""From diagnosis to policy, small: what is kept and recorded, and what the page states."""
 
 from dataclasses import replace
 

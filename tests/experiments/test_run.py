@@ -4,18 +4,21 @@ import json
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from surgisoft.agents import session
 from surgisoft.agents.evaluate import Evaluation
+from surgisoft.agents.on_rig import RigConfig
 from surgisoft.cli import run
 from surgisoft.errors import InputError
 from surgisoft.experiments import run as experiment_run
 from surgisoft.experiments.plan import build_task, settings
 from surgisoft.experiments.results import sum_up
 from surgisoft.experiments.run import open_results, run_experiment
-from surgisoft.experiments.spec import load_experiment
+from surgisoft.experiments.session import ExperimentRules, with_policy
+from surgisoft.experiments.spec import Case, load_experiment
 from surgisoft.tasks.circle_ablation import CircleAblationConfig, success_rule
 from surgisoft.tasks.registry import spec_of
 from tests.experiments.tiny import TINY, write
@@ -164,6 +167,7 @@ def test_success_is_one_rule_in_experiment_and_evaluate(whole, tmp_path, monkeyp
 
     def stop(policies, task, **fields):
         asked.append((task, fields["config"]))
+        assert (fields["seed"], fields["rules"].spec) == (spec.seed, spec)
         raise InputError("stop here")
 
     monkeypatch.setattr(session, "evaluate", stop)
@@ -176,6 +180,26 @@ def test_success_is_one_rule_in_experiment_and_evaluate(whole, tmp_path, monkeyp
     assert "--config and --rules both" in capsys.readouterr().err
     assert run(["evaluate", "scripted", "--rules", "liver", "--task", "track_circle"]) == 2
     assert "is an experiment of circle_ablation, not of track_circle" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore:arm '.*its model is")  # the model of robot 0
+def test_an_experiment_and_evaluate_by_its_rules_give_the_same_episodes(tmp_path):
+    """The packaged policy on robot 1 of the rig: every number of an episode."""
+    brief = TINY.replace("[task]", "[task.world.randomisation]\nhistory = 1\n\n[task]")
+    spec = load_experiment(write(tmp_path, brief))
+    spec = replace(spec, cases=(Case(name="rig", plant="rig", specimen=1),))
+    *_, setting = settings(with_policy(spec, "ring"))
+    assert setting.case.policy != "scripted"
+    (row,) = experiment_run.roll_out_block(spec, setting, 0, 1).rows
+    rules, task = ExperimentRules(spec), replace(spec.task, scene=spec.scene)
+    found = session.evaluate(
+        "ring", rig=RigConfig(seed=1), config=task, rules=rules, seed=spec.seed, episodes=1
+    )
+    numbers = found.results[0].per_episode
+    assert {"success", "beam_error_mean_mm", "clearance_mm", "time_s"} <= set(numbers)
+    for name, values in numbers.items():
+        expected = np.nan if row[name] is None else row[name]
+        np.testing.assert_array_equal(values, [expected], err_msg=name)
 
 
 def test_evaluate_states_the_rule_of_success(monkeypatch):

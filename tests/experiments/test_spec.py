@@ -141,6 +141,13 @@ def test_rigs_of_the_command_line_replace_those_of_cases_on_rigs(tmp_path):
         with_rigs(simulated, ("virtual",))
     with pytest.raises(InputError, match="no arm 'knife'"):
         with_rigs(spec, ("knife=virtual",))
+    for text, message in (
+        ("nothere", "unknown rig 'nothere'"),
+        ("laser=virtual:sed=1", "unknown option 'sed'"),
+        ("virtual:seed=x", "seed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            with_rigs(spec, (text,))
 
 
 @pytest.mark.parametrize("value", ["[]", "{}", "1", '"cure"'])

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -282,8 +283,15 @@ def test_command_and_function_give_the_same(schedule, changed, tmp_path, monkeyp
 
 
 def test_ctrl_c_leaves_a_complete_recording(schedule, tmp_path, capsys):
-    output = tmp_path / "run.parquet"
-    ends = threading.Timer(4.0, os.kill, (os.getpid(), signal.SIGINT))
+    output, log = tmp_path / "run.parquet", tmp_path / "run.log.jsonl"
+
+    def end():
+        """Ctrl-C once the log on the disk has some samples, however busy the computer is."""
+        while not (log.exists() and log.read_text().count("\n") > 12):
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    ends = threading.Thread(target=end, daemon=True)
     ends.start()
     assert command(["run", schedule, "-o", str(output)]) == 130
     ends.join()

@@ -6,14 +6,13 @@ import tomllib
 import types
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from surgisoft.errors import InputError
 from surgisoft.rig import open_rig
-from surgisoft.rig.lerobot import NamedRig
+from surgisoft.rig.lerobot import NamedRig, NamedSchedule
 
 PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_robot_surgisoft"
 
@@ -89,34 +88,49 @@ def test_disconnected_rig_is_not_driven():
         named.observe()
 
 
+def test_a_schedule_by_names_is_linear_and_begins_again(tmp_path):
+    file, now = tmp_path / "s.csv", [100.0]
+    file.write_text("t_s,c1_kPa,c2_kPa\n5,0,8\n6,10,8\n7,10,0\n")
+    schedule = NamedSchedule(str(file), clock=lambda: now[0])
+    for passed, expected in ((0.0, [0, 8]), (0.5, [5, 8]), (1.0, [10, 4]), (1.0, [5, 8])):
+        now[0] += passed  # times since the first command: 0, 0.5, 1.5 and, after 2 s, 0.5 again
+        assert schedule.command() == dict(zip(["c1_kPa", "c2_kPa"], expected, strict=True))
+    now[0] += 1.1
+    assert schedule.command() == {"c1_kPa": 0.0, "c2_kPa": 8.0}, "a pause begins a new episode"
+    file.write_text("t_s,c1_kPa,run\n0,0,0\n1,10,0\n0,5,1\n1,5,1\n")
+    with pytest.raises(InputError, match="2 runs; expected one"):
+        NamedSchedule(str(file))
+
+
 @pytest.fixture
 def lerobot(monkeypatch):
     """LeRobot's convention in a few lines: base classes, and a registry of configurations."""
-    config = types.ModuleType("lerobot.robots.config")
+    known: dict[str, type] = {}
 
     @dataclass(kw_only=True)
-    class RobotConfig:
+    class Config:
         id: str | None = None
-        known: ClassVar[dict] = {}
 
         @classmethod
         def register_subclass(cls, name):
-            return lambda made: cls.known.setdefault(name, made)
+            return lambda made: known.setdefault(name, made)
 
-    config.RobotConfig = RobotConfig
-    robot = types.ModuleType("lerobot.robots.robot")
-
-    class Robot:
+    class Device:
         def __init__(self, config):
             self.id = config.id
 
-    robot.Robot = Robot
-    for name in ("lerobot", "lerobot.robots"):
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    monkeypatch.setitem(sys.modules, "lerobot.robots.config", config)
-    monkeypatch.setitem(sys.modules, "lerobot.robots.robot", robot)
+    for folder, kind in (("robots", "Robot"), ("teleoperators", "Teleoperator")):
+        modules = {
+            f"lerobot.{folder}": {},
+            f"lerobot.{folder}.config": {f"{kind}Config": Config},
+            f"lerobot.{folder}.{kind.lower()}": {kind: Device},
+        }
+        for name, content in {"lerobot": {}, **modules}.items():
+            module = types.ModuleType(name)
+            vars(module).update(content)
+            monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.syspath_prepend(str(PLUGIN))
-    yield RobotConfig.known
+    yield known
     for name in [name for name in sys.modules if name.startswith("lerobot_robot_surgisoft")]:
         del sys.modules[name]
 
@@ -137,3 +151,19 @@ def test_plugin_is_found_by_the_convention(lerobot):
     assert set(robot.get_observation()) == set(robot.observation_features)
     robot.disconnect()
     assert not robot.is_connected
+    assert robot.cameras == {}, "lerobot-record counts them"
+
+
+def test_the_plugins_schedule_drives_its_rig(lerobot, tmp_path):
+    importlib.import_module("lerobot_robot_surgisoft")
+    config = lerobot["surgisoft_schedule"]
+    parent = importlib.import_module(config.__module__.rpartition(".")[0])
+    (tmp_path / "s.csv").write_text("t_s,c1_kPa,c2_kPa,c3_kPa\n0,4,5,6\n9,4,5,6\n")
+    made = getattr(parent, config.__name__.removesuffix("Config"))
+    teleoperator = made(config(schedule=str(tmp_path / "s.csv")))
+    rig = parent.SurgisoftRig(lerobot["surgisoft_rig"](rig="virtual:seed=3"))
+    assert teleoperator.action_features == rig.action_features
+    teleoperator.connect()
+    rig.connect()
+    assert rig.send_action(teleoperator.get_action()) == {"c1_kPa": 4, "c2_kPa": 5, "c3_kPa": 6}
+    rig.disconnect()

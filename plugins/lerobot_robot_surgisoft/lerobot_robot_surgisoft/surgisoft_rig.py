@@ -19,6 +19,7 @@ class SurgisoftRig(Robot):
         super().__init__(config)
         self.config = config
         self.rig = NamedRig(config.rig, config.hold_missing)
+        self.cameras: dict[str, Any] = {}  # `lerobot-record` counts them; no rig has images
 
     @property
     def observation_features(self) -> dict[str, type]:

@@ -102,7 +102,8 @@ def _hint(name: str) -> str:
         return "expected a key point such as 'k0_x_mm'"
     if numbered:
         return f"expected an actuation with its unit such as '{numbered[1]}1_kPa'"
-    return f"expected one of {', '.join(_CONTEXT)}"
+    known = ", ".join(_CONTEXT)
+    return f"expected one of {known}; a lab's own names are converted by 'surgisoft import'"
 
 
 def _check_repeated(names: list[str], where: str) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
+    CHOSEN_COSTS,
     FEATURES,
     Curve,
     DecisionModel,
@@ -255,7 +256,8 @@ def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():
     assert found.probabilities.effects["creep"] == pytest.approx(0.5, abs=0.01)
 
 
-weights = st.lists(st.floats(0.0, 5.0), min_size=12, max_size=12)
+MOST_FEATURES = max(map(len, FEATURES.values()))
+weights = st.lists(st.floats(0.0, 5.0), min_size=MOST_FEATURES, max_size=MOST_FEATURES)
 
 
 @settings(max_examples=60, deadline=None)
@@ -313,6 +315,23 @@ def test_a_second_effect_that_mends_the_form_of_the_first_says_nothing_of_two():
     assert chances[0] < chances[1]
 
 
+@pytest.mark.parametrize(
+    ("free", "broken", "line"), [(0.5, 0.7, 0.8), (-math.log(2.0), 0.7 - math.log(2.0), 0.4)]
+)
+def test_where_an_effect_explains_them_there_is_no_break_and_no_line(free, broken, line):
+    """A break that gains 0.7 over a black box gains as much less over what is better than that.
+    Where an effect leaves half of what the black box does, half of the line is explained."""
+    names = [feature.name for feature in FEATURES["known"]]
+    worse = replace(ALONE, left_log_free=free + 1.0)
+    best = replace(ALONE, left_log_free=free)
+    evidence = replace(
+        GOOD, proposals=(worse, best), free_log_gain=1.8, break_log_gain=0.7, line=0.8
+    )
+    row = dict(zip(names, features_of("known", evidence), strict=True))
+    assert row["break"] == pytest.approx(broken)
+    assert row["line"] == pytest.approx(line)
+
+
 def test_the_weights_in_force_have_the_signs_of_their_features():
     model = load_decision()
     for name, features in FEATURES.items():
@@ -346,15 +365,38 @@ def test_a_damaged_asset_is_refused_in_one_line(tmp_path, change, told):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            lambda v: v["models"]["missing"].update(constant="1"),
+            "a weight that is no finite number",
+        ),
+        (
+            lambda v: v["calibration"].update(other={"constant": 0.0, "slope": 1.0}),
+            "'other' is not",
+        ),
+        (lambda v: v.update(wrong_unknown=None), "wrong_unknown is no finite number"),
+    ],
+)
+def test_an_asset_with_its_hash_but_no_numbers_is_refused(tmp_path, change, told):
+    values = json.loads(ASSET.read_text())
+    change(values)
+    bad = tmp_path / "decision.json"
+    bad.write_text(json.dumps(values | {"sha256": content_hash(values)}))
+    with pytest.raises(InputError, match=told):
+        load_decision(bad)
+
+
 def test_an_asset_of_the_first_schema_still_opens(tmp_path):
     """Without calibration; the features that are newer have no weight."""
     values = json.loads(ASSET.read_text())
     for name, features in FEATURES.items():
         for feature in features:
             if feature.since > 1:
-                del values["models"][name]["weights"][feature.name]
-    for key in ("calibration", "wrong_unknown"):
-        del values[key]
+                values["models"][name]["weights"].pop(feature.name, None)
+    for key in ("calibration", *CHOSEN_COSTS):
+        values.pop(key, None)
     values |= {"schema": 1}
     old = tmp_path / "decision.json"
     old.write_text(json.dumps(values | {"sha256": content_hash(values)}))

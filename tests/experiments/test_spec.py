@@ -155,3 +155,32 @@ def test_a_scenario_that_is_no_name_is_one_line(tmp_path, value):
     path = write(tmp_path, f"scenario = {value}\n{TINY}")
     with pytest.raises(InputError, match=r"tiny\.toml:1: scenario: got"):
         load_experiment(path)
+
+
+DRIVER = '[[drivers]]\nname = "{name}"\n{what}\n'
+CONTRADICTIONS = {
+    "task: got": ("", "task = 1\n"),
+    "task.scene: does not belong here": ("", '[task]\nscene = "x"\n'),
+    "phases: none is given": ("", "phases = []\n"),
+    "drivers[0].name: got 'policy'; expected none of": (
+        DRIVER.format(name="policy", what="waypoints = [[0.0, 1.0, 1.0, 1.0]]"),
+        "",
+    ),
+    "drivers[0]: got both or neither": (DRIVER.format(name="mine", what=""), ""),
+    "drivers[0].waypoints: times [1.0, 1.0]": (
+        DRIVER.format(name="mine", what="waypoints = [[1.0, 1.0, 1.0, 1.0], [1.0, 2.0, 2.0, 2.0]]"),
+        "",
+    ),
+    "faults[0].arm: got 'gripper'": (FAULT.replace("endoscope", "gripper"), ""),
+}
+
+
+@pytest.mark.parametrize("said", CONTRADICTIONS)
+def test_fields_that_do_not_fit_each_other_are_named(said, tmp_path):
+    """behind: added to the tiny experiment; instead: the whole file but its scene."""
+    behind, instead = CONTRADICTIONS[said]
+    head = 'name = "tiny"\nscene = "{scene}"\n'
+    path = write(tmp_path, head + instead if instead else TINY + behind)
+    with pytest.raises(InputError, match=re.escape(said)) as caught:
+        load_experiment(path)
+    assert "\n" not in str(caught.value)

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from surgisoft.errors import InputError
 from surgisoft.measurement.protocols import Protocol
 from surgisoft.measurement.recordings import ArmInfo
 from surgisoft.rig import RigStopped, SafeRig, Safety, VirtualRig, collect, guarded
@@ -262,6 +263,28 @@ def test_a_clock_that_goes_back_stops_the_run():
     bench.t_s = -5.0
     with pytest.raises(RigStopped, match="the clock of the samples went from"):
         rig.read()
+
+
+def test_limits_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="lowest is 5 and highest is 5"):
+        Safety(lowest=5.0, highest=5.0)
+    valves = Valves()
+    for limits in ([[0.0, np.nan], [0.0, 1.0]], [[0.0, 1.0]]):
+        valves.limits = np.array(limits)
+        with pytest.raises(InputError, match="the rig's limits are"):
+            SafeRig(valves)
+
+
+def test_commands_and_samples_of_another_number_of_chambers_do_not_pass():
+    valves = Valves()
+    rig = SafeRig(valves)
+    with pytest.raises(InputError, match=r"command has shape \(3,\), expected 2 pressures"):
+        rig.command(np.zeros(3))
+    assert not valves.sent
+    valves.measured = np.zeros(3)
+    with pytest.raises(RigStopped, match="a sample has 3 pressures, expected 2"):
+        rig.read()
+    assert valves.vents >= 1
 
 
 def test_a_dry_run_shows_and_sends_nothing():

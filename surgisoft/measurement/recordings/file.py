@@ -123,6 +123,7 @@ def _read(path: Path, warn: Warn) -> Recording:
     for name in layout.ignored:
         warn(f"{path}: column '{name}' is not part of the format and was left out")
     cells = table.numbers(layout.used)
+    pa.default_memory_pool().release_unused()
     if len(cells) == 0:
         raise InputError(f"{path}: the table is empty, expected at least one row of numbers")
     at = {column: i for i, column in enumerate(layout.used)}

@@ -71,7 +71,9 @@ def import_(
     )
     from surgisoft.measurement.recordings.lerobot import is_dataset
     from surgisoft.measurement.recordings.log import SUFFIX as LOG_SUFFIX
+    from surgisoft.memory import keep_freed_memory
 
+    keep_freed_memory()
     arm = None
     if model:
         check_model(model)
@@ -163,7 +165,9 @@ def recording_(
     """
     from surgisoft.measurement.recordings import summary
     from surgisoft.measurement.recordings.lerobot import TASK, save_lerobot
+    from surgisoft.memory import keep_freed_memory
 
+    keep_freed_memory()
     opened = read_recordings(recordings)
     for recording in opened:
         print(*summary(recording), sep="\n")

@@ -12,6 +12,8 @@ LEAST_FAR = 0.2
 """Least such distance, in half ranges of a chamber."""
 FAR_ROWS = 0.1
 """Share of rows at far actuations from which there is a warning."""
+LONG_ROWS = 100_000
+"""Training rows from which a diagnosis says how they are thinned."""
 SOURCE_OF_SMOOTH = "second differences"
 """Source of a noise floor that is neither stated nor shown by holds."""
 MOST_MISSING = 0.2
@@ -32,6 +34,17 @@ def far_share(known: np.ndarray, asked: np.ndarray) -> float:
     own = tree.query(known, k=2, p=np.inf)[0][:, 1]
     apart = tree.query(asked, p=np.inf)[0]
     return float(np.mean(apart > max(FAR_FROM_FIT * np.quantile(own, 0.97), LEAST_FAR)))
+
+
+def thinning_notes(problem: Problem) -> tuple[str, ...]:
+    """A note on the rows of long recordings that effects are fitted to."""
+    rows = int((problem.block_of_row >= 0).sum())
+    if rows < LONG_ROWS:
+        return ()
+    return (
+        f"{rows:,} rows are thinned: effects are fitted to {len(problem.index):,} of them, evenly "
+        "spaced; the model and the memories of effects follow every row",
+    )
 
 
 def data_quality_warnings(problem: Problem) -> list[str]:

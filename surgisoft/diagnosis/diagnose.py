@@ -22,7 +22,7 @@ from pathlib import Path
 
 from surgisoft.diagnosis.candidates import candidates
 from surgisoft.diagnosis.criteria import SEARCH
-from surgisoft.diagnosis.data_quality import data_quality_warnings
+from surgisoft.diagnosis.data_quality import data_quality_warnings, thinning_notes
 from surgisoft.diagnosis.decision import (
     Decision,
     Kind,
@@ -279,6 +279,7 @@ def diagnose(
         problem, notes = both.training(), (*notes, *both.notes)
     else:
         problem = with_known_residuals(table.training(), reference)
+    notes = (*notes, *thinning_notes(problem))
     reason = refit_reason(problem, refit)
     if both is not None and refit == "always":
         raise InputError(

@@ -314,7 +314,7 @@ def shares(problem: Problem) -> list[AxisShare]:
     found = known(table)
     rows = np.flatnonzero(problem.block_of_row >= 0)
     rows = rows[:: max(1, -(-len(rows) // MOST_ROWS))]
-    target = table.residual_mm.reshape(len(table.run), -1)[rows]
+    target = (table.measured_mm[rows] - table.predicted_mm[rows]).reshape(len(rows), -1)
     block = problem.block_of_row[rows]
     fold = problem.fold[block]
 

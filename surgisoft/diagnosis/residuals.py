@@ -337,7 +337,7 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         names=tuple(recording.name for recording in recordings),
         predicted_mm=predicted.double().numpy(),
         # Not through float32: the measured values are compared as they were recorded.
-        measured_mm=np.concatenate([recording.key_points_mm for recording in recordings]),
+        measured_mm=joined([recording.key_points_mm for recording in recordings]),
         pressure=np.concatenate([actuation_of(r, model.spec.actuation) for r in recordings]),
         commanded=each(lambda r: r.commanded, (model.spec.chambers,)),
         direction=direction.double().numpy(),
@@ -354,6 +354,11 @@ def residual_table(model: ArmModel, recordings: list[Recording]) -> ResidualTabl
         holds=hold_floor(recordings),
         taps=taps,
     )
+
+
+def joined(parts: list[np.ndarray]) -> np.ndarray:
+    """The rows of several arrays one after another; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def problem_of(

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from surgisoft.diagnosis import data_quality
+from surgisoft.diagnosis.data_quality import thinning_notes
 from surgisoft.diagnosis.residuals import (
     held_out_rows,
     model_discrepancy,
@@ -101,3 +103,12 @@ def test_a_view_shows_the_rows_of_its_part_alone():
         assert (inside == shown).all()
         assert shown[table.view(part).index.numpy()].all()
     assert not held[table.training().index.numpy()].any()
+
+
+def test_a_long_recording_is_thinned_and_the_note_says_so(monkeypatch):
+    """8,000 rows, of which three quarters are training rows."""
+    problem = problem_of(still_model(), [recording(np.zeros(8000), walk(8000))], part="training")
+    assert thinning_notes(problem) == ()
+    monkeypatch.setattr(data_quality, "LONG_ROWS", 6000)
+    (note,) = thinning_notes(problem)
+    assert note.startswith("6,000 rows are thinned: effects are fitted to 2,000 of them")

@@ -123,6 +123,7 @@ def _read(path: Path, warn: Warn) -> Recording:
     for name in layout.ignored:
         warn(f"{path}: column '{name}' is not part of the format and was left out")
     cells = table.numbers(layout.used)
+    pa.default_memory_pool().release_unused()
     if len(cells) == 0:
         raise InputError(f"{path}: the table is empty, expected at least one row of numbers")
     at = {column: i for i, column in enumerate(layout.used)}
@@ -314,7 +315,8 @@ def save_recordings(recordings: Iterable[Recording], folder: str | Path) -> list
 
 def _write_table(content: pa.Table, part: Path, suffix: str) -> None:
     if suffix == ".parquet":
-        pq.write_table(content, part, compression="zstd")
+        # Measured values hardly repeat: a dictionary of them costs time and saves nothing.
+        pq.write_table(content, part, compression="zstd", use_dictionary=["run"])
         return
     with part.open("wb") as file:
         file.write((",".join(content.column_names) + "\n").encode())

@@ -117,11 +117,12 @@ def frozen_channels(recording: Recording) -> list[tuple[list[int], slice]]:
     channels = [
         _changes(recording.measured[:, i : i + 1], recording.run) for i in range(recording.chambers)
     ]
-    points = _key_point_changes(recording)
+    points: list[np.ndarray] = []
     frozen: list[tuple[int, slice]] = []
     for i, changed in enumerate(channels):
-        others = [*channels[:i], *channels[i + 1 :], *points]
         for stretch in _long_repeats(changed):
+            points = points or _key_point_changes(recording)
+            others = [*channels[:i], *channels[i + 1 :], *points]
             alive = any(_lives(other, stretch) for other in others)
             if alive and _channel_froze(recording, i, changed, stretch):
                 frozen.append((i, stretch))
@@ -254,7 +255,7 @@ class _Track:
 
 def _track(points: np.ndarray, start: int) -> _Track:
     """The track of positions (R, 3) [mm] of a run that begins at sample `start`."""
-    known = np.flatnonzero(~np.isnan(points).any(axis=1))
+    known = np.flatnonzero(~np.isnan(points[:, 0]))  # missing ones are missing as a whole
     fresh = known[_changes(points[known], np.zeros(len(known)))] if len(known) else known
     steps = np.linalg.norm(np.diff(points[fresh], axis=0), axis=1)
     return _Track(fresh + start, steps / np.diff(fresh) if len(fresh) > 1 else steps)
@@ -416,7 +417,7 @@ def _ranges(values: np.ndarray) -> str:
 
 def _key_point(recording: Recording, j: int) -> str:
     points = recording.key_points_mm[:, j]
-    missing = int(np.isnan(points).any(axis=1).sum())
+    missing = int(np.isnan(points[:, 0]).sum())  # missing ones are missing as a whole
     if missing == recording.samples:
         return f"  k{j}: missing in every row"
     axes = zip("xyz", np.nanmin(points, axis=0), np.nanmax(points, axis=0), strict=True)

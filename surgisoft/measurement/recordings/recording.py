@@ -129,6 +129,8 @@ class Recording:
 def _with_whole_key_points(points: np.ndarray) -> np.ndarray:
     """The key points (T, n, 3) with a partly missing one missing as a whole."""
     missing = np.isnan(points)
+    if not missing.any():
+        return points
     partly = missing.any(axis=-1) & ~missing.all(axis=-1)
     return np.where(partly[..., None], np.nan, points) if partly.any() else points
 

@@ -191,6 +191,14 @@ def decision(
         int, typer.Option(min=0, help="Number of cases of the own rig; 0: those that are stored.")
     ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the own rig's cases.")] = 1,
+    without_truth: Annotated[
+        bool,
+        typer.Option(
+            "--without-truth",
+            help="Every case of a known effect takes part once more, without that effect among the "
+            "candidates: as one of an unknown effect.",
+        ),
+    ] = False,
     processes: Processes = 2,
     work: Work = Path("runs/benchmark-decision"),
     asset: Annotated[
@@ -208,7 +216,7 @@ def decision(
     plan = own_rig.Plan(_numbers("--robots", robots), _numbers("--undertrained", undertrained))
     with _kept("decision", work) as report:
         some, aside, values = run(
-            plan, count, seed, cases or [], work, processes, report, judge or []
+            plan, count, seed, cases or [], work, processes, report, judge or [], without_truth
         )
     if asset:
         write_atomically(asset, json.dumps(values, indent=1) + "\n")
@@ -508,6 +516,14 @@ def cases(
     only: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Only cases whose path has this text.")
     ] = None,
+    without_truth: Annotated[
+        bool,
+        typer.Option(
+            "--without-truth",
+            help="Every case of a known effect once more, without that effect among the "
+            "candidates: the right answer is `unknown_effect` then.",
+        ),
+    ] = False,
     processes: Processes = 2,
     output: Output = None,
     json_file: JsonFile = None,
@@ -521,11 +537,14 @@ def cases(
     some = [case for case in found if only is None or only in str(case.place)]
     if not some:
         raise InputError(f"--only '{only}': none of {len(found)} cases has it in its path")
+    if without_truth:
+        some += [twin for case in some if (twin := case.without_truth)]
     with _kept("cases", folder) as report:
         judged = run(some, processes, report)
     if json_file:
         write_json(json_file, to_json(judged))
     command = "surgisoft benchmark cases DIR" + (f" --only {only}" if only else "")
+    command += " --without-truth" if without_truth else ""
     _show("Cases with a known truth", command, markdown(judged), output)
 
 

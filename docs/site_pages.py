@@ -55,6 +55,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Take off the fences what only docs/run_tutorials.py reads; else a block shows as prose."""
+    return re.sub(r'^( *```\w+) needs="[^"]*"$', r"\1", markdown, flags=re.M)
+
+
 def _parts() -> list[str]:
     """The modules of the ground, then each part, by name."""
     return ["", *sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))]

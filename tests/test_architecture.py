@@ -72,7 +72,7 @@ FLOORS = {
         ("discrepancy", "data_quality", "error_axes", "inputs", "known_error"),
         ("pairs",),
         ("cross_validation",),
-        ("black_box", "candidates", "setup"),
+        ("black_box", "beyond_history", "candidates", "setup"),
         ("testability", "estimation"),
         ("selection", "refit"),
         ("evidence",),

@@ -1,6 +1,7 @@
 """The documentation's links, commands, snippets and drawn picture are those of the code."""
 
 import ast
+import importlib.util
 import re
 import shlex
 import subprocess
@@ -123,3 +124,20 @@ def test_an_unknown_option_in_a_page_is_found():
     assert known == ["replay", "a.rrd", "--screenshot", "a.png"]
     assert unknown(known) is None
     assert "No such option" in unknown(wrong)
+
+
+def test_the_site_shows_blocks_as_code():
+    """A fence with an option that the site does not know is set as prose."""
+    pytest.importorskip("mkdocs", reason="builds the site; pip install -e '.[docs]'")
+    spec = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site_pages.py")
+    site_pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(site_pages)
+    block = 'A\n\n```python needs="supersuit"\nx = 1\n```\n\n```toml title="a.toml"\n```\n'
+    shown = site_pages.on_page_markdown(block)
+    assert shown == block.replace(' needs="supersuit"', "")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_no_bar_is_escaped_inside_code(page):
+    """The site shows the backslash of `a\\|b` in a table."""
+    assert not re.findall(r"`[^`\n]*\\\|[^`\n]*`", without_code(page.read_text()))

@@ -6,15 +6,17 @@ repeating a diagnosis.
 """
 
 import json
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from surgisoft.diagnosis.candidates import candidates
+from surgisoft.diagnosis.candidates import Candidate, candidates
 from surgisoft.diagnosis.evidence import VERSION, Evidence, evidence_of
 from surgisoft.diagnosis.inputs import open_inputs, with_known_residuals
 from surgisoft.diagnosis.pairs import before_and_after
-from surgisoft.diagnosis.residuals import residual_table
+from surgisoft.diagnosis.residuals import Problem, residual_table
 from surgisoft.diagnosis.selection import find
 from surgisoft.diagnosis.testability import testable
 from surgisoft.files import json_safe
@@ -59,6 +61,9 @@ class Labelled:
     than what was injected: its residual there is no less without an injection."""
     version: int = VERSION
     """Version of the evidence."""
+    left_out: tuple[str, ...] = ()
+    """Missing effects that were no candidates (`without_truth`): of such a diagnosis the truth is
+    unknown, though it is in the list."""
 
     @property
     def size(self) -> float:
@@ -70,13 +75,31 @@ class Labelled:
         return json_safe(asdict(self))
 
 
-def evidence_on(
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """The identification problem of a case, and the candidates that its recordings can show."""
+
+    problem: Problem
+    """The problem."""
+    tried: list[Candidate]
+    """The candidates of all effects."""
+
+    def evidence(self, without: Sequence[str] = ()) -> Evidence:
+        """The evidence of a diagnosis, as `diagnose` computes it.
+
+        without: effects that are no candidates, as `diagnose --without` takes them.
+        """
+        tried = [each for each in self.tried if each.name not in without]
+        return evidence_of(find(self.problem, tried, lambda text: None))
+
+
+def posed_on(
     model: ArmModel,
     recordings: list[Recording],
     known: TrainingResiduals | None = None,
     before: list[Recording] | None = None,
-) -> Evidence:
-    """The evidence of a diagnosis, as `diagnose` computes it.
+) -> Posed:
+    """The problem that `diagnose` poses.
 
     known: residuals of the model from before; before: recordings from before a change.
     """
@@ -88,7 +111,34 @@ def evidence_on(
         problem = before_and_after(table, before).training()
     names = list(known_effects())
     tried, _ = testable(problem, candidates(problem, names), names)
-    return evidence_of(find(problem, tried, lambda text: None))
+    return Posed(problem, tried)
+
+
+def twin_name(case: Labelled) -> str:
+    """Name of a case without its truth among the candidates."""
+    return f"{case.case}/without-{'+'.join(case.truth)}"
+
+
+def without_truth(case: Labelled, posed: Posed) -> Labelled | None:
+    """The same case where its missing effects are no candidates; None where none is in the list.
+
+    What is missing is then unknown to the diagnosis. So every case of a known effect is also one of
+    an unknown effect (leave one class out: Scheirer et al. 2013, "Toward open set recognition"): of
+    the same arm, noise and size, and from the same generator as the known ones. Of two missing
+    effects both are left out.
+    """
+    if case.label != "known":
+        return None
+    begin = time.process_time()
+    evidence = posed.evidence(case.truth)
+    return replace(
+        case,
+        case=twin_name(case),
+        label="unknown",
+        left_out=case.truth,
+        evidence=evidence,
+        seconds=time.process_time() - begin,
+    )
 
 
 def read(path: Path) -> list[Labelled]:
@@ -102,13 +152,34 @@ def read(path: Path) -> list[Labelled]:
         if values.get("version") != VERSION:
             continue
         values["truth"] = tuple(values["truth"])
+        values["left_out"] = tuple(values.get("left_out", ()))
         values["evidence"] = Evidence.from_json(values["evidence"])
         answer[values["case"]] = Labelled(**values)
     return list(answer.values())
 
 
-def append(path: Path, one: Labelled) -> None:
-    """Store a case at the end of a file."""
+def append(path: Path, *some: Labelled) -> None:
+    """Store cases at the end of a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
-        file.write(json.dumps(one.to_json()) + "\n")
+        file.write("".join(json.dumps(one.to_json()) + "\n" for one in some))
+
+
+def twin_of(done: Mapping[str, Labelled], name: str) -> Labelled | None:
+    """The stored case of the same recording without its truth among the candidates."""
+    return done.get(twin_name(done[name]))
+
+
+def is_stored(done: Mapping[str, Labelled], name: str, twins: bool) -> bool:
+    """Whether a case is stored, and with `twins` the one without its truth too."""
+    known = name in done and done[name].label == "known"
+    return name in done and not (twins and known and twin_of(done, name) is None)
+
+
+def with_twins(done: Mapping[str, Labelled], names: Sequence[str], twins: bool) -> list[Labelled]:
+    """The stored cases of these names, each with the one without its truth behind it."""
+    answer = []
+    for name in names:
+        twin = twin_of(done, name) if twins else None
+        answer += [done[name]] if twin is None else [done[name], twin]
+    return answer

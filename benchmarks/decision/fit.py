@@ -11,21 +11,25 @@ that is judged enters any choice.
 
 import datetime
 import hashlib
+import itertools
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize
 
 from benchmarks.decision.evidence_log import Labelled
-from surgisoft.diagnosis.criteria import WORTH
+from surgisoft.diagnosis.criteria import WORTH, Worth
 from surgisoft.diagnosis.decision import (
     CALIBRATED,
+    CHOSEN_COSTS,
     FEATURES,
     LEAST_CHANCE,
     SCHEMA,
     Curve,
+    Decision,
     DecisionModel,
     Logistic,
     Probabilities,
@@ -42,6 +46,8 @@ PENALTIES = (0.3, 1.0, 3.0, 10.0, 30.0)
 features of order 1."""
 CONSTANT_PENALTY = 0.01
 """Ridge penalty on the constant."""
+NAMING = ("identified", "several", "ambiguous")
+"""Kinds of result that name an effect."""
 OFF = ("network", "other_robot")
 """Labels of cases whose model is off."""
 WEAK = 0.5
@@ -49,14 +55,24 @@ WEAK = 0.5
 cases take no part in the fit of `missing`."""
 MOST_WEIGHT = 3.0
 """Most weight of one case, in units of the mean: a few cases of a source do not outweigh many."""
-PRIORS = {"two": 0.3}
-"""Shares of cases of which a statement is true, for which its probability is calibrated. Stated:
-how many pairs were drawn for a source says nothing of real arms, and it was a tenth of the cases in
-one source and a quarter in another. The other models take the sources' shares."""
+PRIORS = {"two": 0.3, "known": 0.5}
+"""Shares of cases of which a statement is true, in the fit of its model. Stated: how many pairs and
+unknown effects were drawn for a source says nothing of real arms. Pairs were a tenth of the cases
+in one source and a quarter in another; unknown effects are a fifth, and with half of the weight
+they count as much as known ones do. The other models take the sources' shares, and so do the curves
+that calibrate names."""
 ROBOT_FOLDS = 5
 """Groups of robots that are left out in turn inside the cases of a fit."""
 CURVE_PENALTY = 1.0
 """Ridge penalty on constant and log slope of a calibration, in cases: a weak pull to no change."""
+TWIN_WEIGHTS = (0.0, 0.1, 0.3, 1.0)
+"""Weights that are tried of a case whose truth was no candidate, in units of a real case."""
+NAME_COSTS = (1.0, 1.5, 2.0, 3.0, 4.0)
+"""Costs of a wrong and of a needless name that are tried, in units of what a right one gains: no
+less than that."""
+NAMED_LOST = 0.03
+"""Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
+wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""
 UNKNOWN_COSTS = (0.25, 0.5, 1.0, 2.0)
 """Costs of a wrong "unknown" that are tried, in units of what a right one is worth."""
 MOST_CALLED_UNKNOWN = 0.05
@@ -100,21 +116,32 @@ def sample(name: str, cases: Sequence[Labelled]) -> list[tuple[np.ndarray, np.nd
     return answer
 
 
-def case_weights(name: str, some: Sequence) -> np.ndarray:
-    """(N,) weights of a model's sample, of mean 1.
+def case_weights(name: str, some: Sequence, twin: float = 1.0) -> np.ndarray:
+    """(N,) weights of a model's sample, of mean 1 over real cases.
 
     Every source has the same sum, unless it has few cases. Where PRIORS has the model, the
     statement is true for that share of every source; cases of a source that has one kind only have
-    the share of that kind.
+    the share of that kind. twin: weight of a case whose truth was no candidate, in units of a real
+    one. Such cases share the weight of the real ones of their source for which the statement is as
+    right, so they do not change how often anything holds.
     """
     prior = PRIORS.get(name)
     kinds = [(case.source, prior is None or bool(right)) for _, right, case in some]
-    number = {kind: kinds.count(kind) for kind in kinds}
+    alike = [(case.source, bool(np.any(right))) for _, right, case in some]
+    units = np.array([twin if case.left_out else 1.0 for _, _, case in some])
+    real, both = Counter[tuple[str, bool]](), dict.fromkeys(alike, 0.0)
+    for group, unit, (_, _, case) in zip(alike, units, some, strict=True):
+        real[group] += not case.left_out
+        both[group] += unit
+    units = units * [real[g] / both[g] if real[g] and both[g] else 1.0 for g in alike]
+    number = dict.fromkeys(kinds, 0.0)
+    for kind, unit in zip(kinds, units, strict=True):
+        number[kind] += unit
     sources = len({source for source, _ in kinds})
     share = {True: 1.0 if prior is None else prior, False: 0.0 if prior is None else 1.0 - prior}
-    weights = [share[kind[1]] * len(kinds) / sources / number[kind] for kind in kinds]
-    weights = np.minimum(np.array(weights, float), MOST_WEIGHT)
-    return weights / weights.mean()
+    each = [share[kind[1]] * units.sum() / sources / max(number[kind], 1e-9) for kind in kinds]
+    weights = np.minimum(np.array(each, float), MOST_WEIGHT) * units
+    return weights * units.sum() / weights.sum()
 
 
 def log_losses(name: str, model: Logistic, some: Sequence) -> np.ndarray:
@@ -141,13 +168,14 @@ def _padded(some: Sequence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x, y, there
 
 
-def fit_one(name: str, some: Sequence, penalty: float) -> Logistic:
-    """One logistic model of given penalty."""
+def fit_one(name: str, some: Sequence, penalty: float, twin: float = 1.0) -> Logistic:
+    """One logistic model of given penalty and weight of the cases without their truth."""
     features = FEATURES[name]
     signs = np.array([feature.sign for feature in features], float)
+    some = [one for one in some if twin > 0.0 or not one[2].left_out]
     if not some:
         return Logistic(tuple(0.0 for _ in features))
-    weights = case_weights(name, some)
+    weights = case_weights(name, some, twin)
     joint = name == "first"
     if joint:
         x, y, there = _padded(some)
@@ -210,42 +238,65 @@ def _split(some: Sequence, left_out: np.ndarray) -> tuple[list, list]:
     return [one for one, out in both if not out], [one for one, out in both if out]
 
 
-def penalty_of(name: str, some: Sequence) -> float:
-    """The penalty with the least held-out loss, one source or group of robots left out in turn.
+@dataclass(frozen=True)
+class Setting:
+    """What is chosen for one model inside its cases."""
+
+    penalty: float
+    """Ridge penalty."""
+    twin: float
+    """Weight of a case whose truth was no candidate."""
+
+
+def setting_of(name: str, some: Sequence) -> Setting:
+    """The setting with the least held-out loss, one source or group of robots left out in turn.
 
     A source is left out too since the decision is asked of robots that are like none of its cases.
+    Cases without their truth among the candidates help to fit and do not judge.
     """
     cases = [case for _, _, case in some]
     folds = [*_source_folds(cases), *_robot_folds(cases)]
     if not folds:
-        return PENALTIES[-1]
-    weights = case_weights(name, some)
-    totals = []
-    for penalty in PENALTIES:
-        total = 0.0
-        for fold in folds:
-            train, left = _split(some, fold)
-            model = fit_one(name, train, penalty)
-            total += float(weights[fold] @ log_losses(name, model, left))
-        totals.append(total)
-    return PENALTIES[int(np.argmin(totals))]
+        return Setting(PENALTIES[-1], TWIN_WEIGHTS[-1])
+    real = np.array([not case.left_out for case in cases])
+    weights = np.zeros(len(cases))
+    weights[real] = case_weights(name, [one for one in some if not one[2].left_out])
+    tried = {}
+    for twin in TWIN_WEIGHTS if not real.all() else TWIN_WEIGHTS[-1:]:
+        for penalty in PENALTIES:
+            total = 0.0
+            for fold in folds:
+                train = _split(some, fold)[0]
+                model = fit_one(name, train, penalty, twin)
+                judged = _split(some, ~(fold & real))[0]
+                total += float(weights[fold & real] @ log_losses(name, model, judged))
+            tried[Setting(penalty, twin)] = total
+    return min(tried, key=lambda each: tried[each])
 
 
-def _models(cases: Sequence[Labelled], penalties: dict[str, float]) -> dict[str, Logistic]:
-    """The five models of given penalties."""
-    return {name: fit_one(name, sample(name, cases), penalties[name]) for name in FEATURES}
+Settings = dict[str, Setting]
+"""Setting of each model by its name."""
+
+
+def _models(cases: Sequence[Labelled], settings: Settings) -> dict[str, Logistic]:
+    """The five models of given settings."""
+    return {
+        name: fit_one(name, sample(name, cases), each.penalty, each.twin)
+        for name, each in settings.items()
+    }
 
 
 Predicted = list[tuple[Labelled, Probabilities]]
 
 
-def held_out(cases: Sequence[Labelled], penalties: dict[str, float]) -> Predicted:
-    """What models that were fitted without a robot say of its cases, before calibration."""
+def held_out(cases: Sequence[Labelled], settings: Settings) -> Predicted:
+    """What models that were fitted without a robot say of its real cases, before calibration."""
     answer = []
     for fold in _robot_folds(cases):
         train, left = _split(cases, fold)
-        model = DecisionModel(_models(train, penalties), {})
-        answer += [(case, probabilities(case.evidence, model)) for case in left]
+        model = DecisionModel(_models(train, settings), {})
+        real = [case for case in left if not case.left_out]
+        answer += [(case, probabilities(case.evidence, model)) for case in real]
     return answer
 
 
@@ -273,41 +324,71 @@ def curve_of(count: int, predicted: Predicted) -> Curve:
     return Curve(float(found.x[0]), float(np.exp(found.x[1])))
 
 
-def wrong_unknown_of(predicted: Predicted, curves: dict[str, Curve]) -> float:
-    """The worth of a wrong "unknown": the least cost that calls few known effects or arms so.
+def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
+    """The costs of wrong results, from cases of robots that were left out.
 
-    The mean over sources of the share of known effects and unchanged arms that are called unknown
-    is at most `MOST_CALLED_UNKNOWN`.
+    First those of a wrong name and of a needless one: with which the fewest names are wrong, and at
+    most `NAMED_LOST` fewer known effects are named than with the costs of `Worth`. Of equal ones
+    the least. Then the least cost of a wrong "unknown" with which at most `MOST_CALLED_UNKNOWN` of
+    known effects and unchanged arms are called unknown. Shares are means over the sources.
     """
-    some = [(c, calibrated(p, curves)) for c, p in predicted if c.label in ("known", "clean")]
-    sources = sorted({case.source for case, _ in some})
+    some = [(case, calibrated(chances, curves)) for case, chances in predicted]
+    known = [one for one in some if one[0].label == "known" and one[0].size >= WEAK]
+    kept = [one for one in some if one[0].label in ("known", "clean")]
+
+    def share(of: Predicted, worth: Worth, hit: Callable[[Labelled, Decision], bool]) -> float:
+        rates = []
+        for source in sorted({case.source for case, _ in of}):
+            own = [(c, chosen(c.evidence, p, worth)) for c, p in of if c.source == source]
+            rates.append(np.mean([hit(*one) for one in own]))
+        return float(np.mean(rates)) if rates else 0.0
+
+    least = share(known, WORTH, names_truth) - NAMED_LOST
+    tried = []
+    for wrong, needless in itertools.product(NAME_COSTS, repeat=2):
+        worth = replace(WORTH, wrong_name=-wrong, needless_name=-needless)
+        if share(known, worth, names_truth) >= least:
+            tried.append((share(some, worth, names_wrongly), wrong + needless, worth))
+    worth = min(tried, key=lambda each: each[:2])[2]
     for cost in UNKNOWN_COSTS:
-        worth = replace(WORTH, wrong_unknown=-cost)
-        shares = []
-        for source in sources:
-            own = [(case.evidence, p) for case, p in some if case.source == source]
-            shares.append(np.mean([chosen(e, p, worth).kind == "unknown_effect" for e, p in own]))
-        if not shares or np.mean(shares) <= MOST_CALLED_UNKNOWN:
-            return -cost
-    return -UNKNOWN_COSTS[-1]
+        worth = replace(worth, wrong_unknown=-cost)
+        called = share(kept, worth, lambda case, found: found.kind == "unknown_effect")
+        if called <= MOST_CALLED_UNKNOWN:
+            break
+    return worth
+
+
+def names_truth(case: Labelled, found: Decision) -> bool:
+    """Whether a result names a missing effect, alone, as one of two, or in a set of two."""
+    return found.kind in NAMING and bool(set(found.effects) & set(case.truth))
+
+
+def names_wrongly(case: Labelled, found: Decision) -> bool:
+    """Whether a result names effects none of which is missing, or two of which one is not."""
+    if found.kind not in NAMING:
+        return False
+    hit = [case.label == "known" and name in case.truth for name in found.effects]
+    return not (all(hit) if found.kind == "several" else any(hit))
 
 
 def fit(cases: Sequence[Labelled], command: str = "") -> dict:
     """The asset's values: a decision fitted to cases."""
     samples = {name: sample(name, cases) for name in FEATURES}
-    penalties = {name: penalty_of(name, some) for name, some in samples.items()}
+    settings = {name: setting_of(name, some) for name, some in samples.items()}
     models = {}
-    for name, model in _models(cases, penalties).items():
+    for name, model in _models(cases, settings).items():
         models[name] = {
             "constant": round(model.constant, 6),
             "weights": {
                 feature.name: round(weight, 6)
                 for feature, weight in zip(FEATURES[name], model.weights, strict=True)
             },
-            "penalty": penalties[name],
-            "cases": len(samples[name]),
+            "penalty": settings[name].penalty,
+            "twin_weight": settings[name].twin,
+            "cases": sum(not case.left_out for _, _, case in samples[name]),
+            "without_truth": sum(bool(case.left_out) for _, _, case in samples[name]),
         }
-    predicted = held_out(cases, penalties)
+    predicted = held_out(cases, settings)
     curves = {name: curve_of(count, predicted) for count, name in enumerate(CALIBRATED, 1)}
     values = {
         "schema": SCHEMA,
@@ -319,8 +400,9 @@ def fit(cases: Sequence[Labelled], command: str = "") -> dict:
             name: {"constant": round(one.constant, 6), "slope": round(one.slope, 6)}
             for name, one in curves.items()
         },
-        "wrong_unknown": wrong_unknown_of(predicted, curves),
     }
+    worth = costs_of(predicted, curves)
+    values |= {name: getattr(worth, name) for name in CHOSEN_COSTS}
     return values | {"sha256": content_hash(values)}
 
 

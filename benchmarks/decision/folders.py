@@ -25,8 +25,11 @@ from benchmarks.decision.evidence_log import (
     Label,
     Labelled,
     append,
-    evidence_on,
+    is_stored,
+    posed_on,
     read,
+    with_twins,
+    without_truth,
 )
 from benchmarks.diagnosis.cases import MEMORY
 from surgisoft.errors import InputError
@@ -67,15 +70,18 @@ def model_folder(folder: Path, robot: str, work: Path, undertrained: bool = Fals
     return own
 
 
-def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelled:
-    """The evidence of one case."""
+def run_case(
+    source: str, folder: Path, truth_file: Path, work: Path, twin: bool = False
+) -> list[Labelled]:
+    """The evidence of one case; twin: and of it without its truth among the candidates."""
     torch.set_num_threads(1)
     truth = json.loads(truth_file.read_text())
     model = load_model(model_folder(folder, truth["robot"], work))
     recordings = load_recordings(truth_file.parent / "after")
     before = load_recordings(robot_folder(folder, truth["robot"]) / "before")
     begin = time.process_time()
-    evidence = evidence_on(model, recordings, before=before)
+    posed = posed_on(model, recordings, before=before)
+    evidence = posed.evidence()
     seconds = time.process_time() - begin
     named = tuple(truth["truth"])
     label: Label = "clean"
@@ -84,7 +90,7 @@ def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelle
     hidden = tuple(each["effect"] for each in truth["hidden"])
     moving = [r for r in recordings if r.kind == "continuous"]
     minutes = sum(float(r.t_s[run][-1] - r.t_s[run][0]) for r in moving for run in r.runs) / 60.0
-    return Labelled(
+    one = Labelled(
         source=source,
         robot=truth["robot"],
         case=str(truth_file.parent.relative_to(folder)),
@@ -98,6 +104,8 @@ def run_case(source: str, folder: Path, truth_file: Path, work: Path) -> Labelle
         seconds=seconds,
         complete=bool(truth.get("same_rows", True)),
     )
+    left_out = without_truth(one, posed) if twin else None
+    return [one] if left_out is None else [one, left_out]
 
 
 def run_off(source: str, folder: Path, clean: Labelled, asked: str | None, work: Path) -> Labelled:
@@ -110,7 +118,7 @@ def run_off(source: str, folder: Path, clean: Labelled, asked: str | None, work:
     model = load_model(model_folder(folder, robot, work, undertrained=asked is None))
     recordings = load_recordings(folder / clean.case / "after")
     begin = time.process_time()
-    evidence = evidence_on(model, recordings)
+    evidence = posed_on(model, recordings).evidence()
     return replace(
         clean,
         source=source,
@@ -149,10 +157,12 @@ def run(
     processes: int,
     report: Progress,
     off: bool = True,
+    twins: bool = False,
 ) -> list[Labelled]:
     """Collect the evidence of all cases of a folder; those that the log has are not repeated.
 
-    off: whether models that are off give cases too.
+    off: whether models that are off give cases too; twins: whether every case of a known effect
+    gives one more, without its truth among the candidates.
     """
     done = {one.case: one for one in read(log)}
     files = sorted(folder.glob("**/truth.json"))
@@ -161,14 +171,14 @@ def run(
     with workers(processes) as pool:
         for job in [pool.submit(model_folder, folder, robot, work) for robot in robots]:
             job.result()
-        missing = [path for path in files if names[path] not in done]
-        jobs = [pool.submit(run_case, source, folder, path, work) for path in missing]
+        missing = [path for path in files if not is_stored(done, names[path], twins)]
+        jobs = [pool.submit(run_case, source, folder, path, work, twins) for path in missing]
         for number, job in enumerate(as_completed(jobs)):
-            one = job.result()
-            append(log, one)
-            done[one.case] = one
+            some = job.result()
+            append(log, *some)
+            done |= {one.case: one for one in some}
             report(number + 1, len(missing), f"{source}: {len(done)} cases")
-    answer = [done[names[path]] for path in files]
+    answer = with_twins(done, [names[path] for path in files], twins)
     for clean, asked in models_that_are_off(folder, answer, work) if off else []:
         name = f"{clean.case}/{'undertrained' if asked is None else f'model-{asked}'}"
         if name not in done:

@@ -13,9 +13,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.decision.evidence_log import Label, Labelled, append, evidence_on, read
+from benchmarks.decision.evidence_log import (
+    Label,
+    Labelled,
+    append,
+    is_stored,
+    posed_on,
+    read,
+    with_twins,
+    without_truth,
+)
 from benchmarks.diagnosis.cases import EXCITATIONS, KNOWN, MEMORY, PAIRS, UNKNOWN, Case
-from benchmarks.diagnosis.robots import base_model, bent, record, validation_of
+from benchmarks.diagnosis.robots import Recorded, base_model, bent, record, validation_of
 from surgisoft.progress import Progress
 from surgisoft.workers import workers
 
@@ -90,16 +99,23 @@ def name_of(case: Case, asked: int) -> str:
     return f"{case.robot}/{case.take}/{hidden}/{case.excitation}/model-{asked}"
 
 
-def run_case(case: Case, asked: int, folder: Path) -> Labelled:
-    """Record, deform the surrogate, and collect the evidence."""
+def run_case(case: Case, asked: int, folder: Path, twin: bool = False) -> list[Labelled]:
+    """Record, and collect the evidence; twin: also without the truth among the candidates."""
+    return labelled(case, asked, record(case), folder, twin)
+
+
+def labelled(
+    case: Case, asked: int, recorded: Recorded, folder: Path, twin: bool = False
+) -> list[Labelled]:
+    """Deform the surrogate, and collect the evidence of a recorded case."""
     torch.set_num_threads(1)
-    recorded = record(case)
     model = base_model(asked, folder, case.undertrained)
     if case.discrepancy_mm > model.validation.rmse_mm:
         model = bent(model, asked, case.discrepancy_mm, case.take)
     known = model.residuals_on([validation_of(asked)])
     begin = time.process_time()
-    evidence = evidence_on(model, [recorded.recording], known)
+    posed = posed_on(model, [recorded.recording], known)
+    evidence = posed.evidence()
     seconds = time.process_time() - begin
     label: Label = "network" if case.undertrained else "clean"
     if asked != case.robot:
@@ -107,7 +123,7 @@ def run_case(case: Case, asked: int, folder: Path) -> Labelled:
     elif case.hidden:
         label = "unknown" if "unknown" in case.truth else "known"
     names = tuple(name for name, _ in case.hidden)
-    return Labelled(
+    one = Labelled(
         source=SOURCE,
         robot=str(case.robot),
         case=name_of(case, asked),
@@ -120,6 +136,8 @@ def run_case(case: Case, asked: int, folder: Path) -> Labelled:
         evidence=evidence,
         seconds=seconds,
     )
+    left_out = without_truth(one, posed) if twin else None
+    return [one] if left_out is None else [one, left_out]
 
 
 def run(
@@ -130,16 +148,21 @@ def run(
     log: Path,
     processes: int,
     report: Progress,
+    twins: bool = False,
 ) -> list[Labelled]:
-    """Collect the evidence of so many cases; those that the log has are not repeated."""
+    """Collect the evidence of so many cases; those that the log has are not repeated.
+
+    twins: whether every case of a known effect gives one more, without its truth among the
+    candidates.
+    """
     done = {one.case: one for one in read(log)}
     drawn = draw(plan, count, seed)
-    missing = [(case, asked) for case, asked in drawn if name_of(case, asked) not in done]
+    missing = [pair for pair in drawn if not is_stored(done, name_of(*pair), twins)]
     with workers(processes) as pool:
-        jobs = [pool.submit(run_case, case, asked, folder) for case, asked in missing]
+        jobs = [pool.submit(run_case, case, asked, folder, twins) for case, asked in missing]
         for number, job in enumerate(as_completed(jobs)):
-            one = job.result()
-            append(log, one)
-            done[one.case] = one
+            some = job.result()
+            append(log, *some)
+            done |= {one.case: one for one in some}
             report(number + 1, len(missing), f"{len(done)} cases")
-    return [done[name_of(case, asked)] for case, asked in drawn]
+    return with_twins(done, [name_of(*pair) for pair in drawn], twins)

@@ -19,11 +19,13 @@ def run(
     processes: int,
     report: Progress,
     judged: Sequence[str] = (),
+    twins: bool = False,
 ) -> tuple[list[Labelled], list[Labelled], dict]:
     """(all cases of the fit, those that are judged only, the values of the asset that is fitted).
 
     sources: `NAME=FOLDER`; the evidence of each is stored in `work/evidence/NAME.jsonl`. judged:
-    the same, of cases that take no part in any fit.
+    the same, of cases that take no part in any fit. twins: whether every case of a known effect
+    also takes part without its truth among the candidates, as one of an unknown effect.
     """
     logs = work / "evidence"
     command = "surgisoft benchmark decision"
@@ -31,14 +33,16 @@ def run(
     if count:
         robots, poor = (",".join(map(str, some)) for some in (plan.robots, plan.undertrained))
         command += f" --robots {robots} --undertrained {poor} --count {count} --seed {seed}"
-        some = own_rig.run(plan, count, seed, work / "models", own, processes, report)
+        some = own_rig.run(plan, count, seed, work / "models", own, processes, report, twins)
     else:
-        some = read(own)
+        some = [one for one in read(own) if twins or not one.left_out]
     for given in sources:
         name, folder = _source("--cases", given)
         log = logs / f"{name}.jsonl"
-        some += folders.run(name, folder, work / "models", log, processes, report)
+        some += folders.run(name, folder, work / "models", log, processes, report, True, twins)
         command += f" --cases {name}={folder.name}"
+    if twins:
+        command += " --without-truth"
     aside: list[Labelled] = []
     for given in judged:
         name, folder = _source("--judge", given)

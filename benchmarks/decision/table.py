@@ -9,9 +9,17 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.decision.evidence_log import Labelled
-from benchmarks.decision.fit import OFF, WEAK, fit, model_of
-from surgisoft.diagnosis.criteria import WORTH, Worth
-from surgisoft.diagnosis.decision import Decision, DecisionModel, decide
+from benchmarks.decision.fit import (
+    NAMING,
+    OFF,
+    WEAK,
+    fit,
+    model_of,
+    names_truth,
+    names_wrongly,
+)
+from surgisoft.diagnosis.criteria import Worth
+from surgisoft.diagnosis.decision import CHOSEN_COSTS, Decision, DecisionModel, decide
 
 BINS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0)
 """Bins of the reliability table."""
@@ -21,8 +29,6 @@ COSTS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0)
 """Costs of a wrong name of the trade-off, in units of what a right one gains."""
 SERIOUS = 0.8
 """Least confidence from which a wrong name is serious."""
-NAMING = ("identified", "several", "ambiguous")
-"""Kinds of result that name an effect."""
 QUIET = ("nothing_missing", "surrogate_undertrained")
 """Kinds of result that say that nothing is missing from the list."""
 
@@ -38,10 +44,9 @@ class Judged:
     def right(self) -> bool:
         """Whether the statement is right: the named effect is missing, one of the set, both of two;
         something unknown; nothing, or too little to be seen."""
-        kind, effects, case = self.decision.kind, self.decision.effects, self.case
+        kind, case = self.decision.kind, self.case
         if kind in NAMING:
-            hit = [name in case.truth for name in effects]
-            return case.label == "known" and (all(hit) if kind == "several" else any(hit))
+            return not names_wrongly(case, self.decision)
         if kind == "unknown_effect":
             return case.label == "unknown"
         return case.label not in ("known", "unknown") or case.size < WEAK
@@ -54,7 +59,7 @@ class Judged:
     @property
     def names_truth(self) -> bool:
         """Whether the result names the missing effect, alone, as one of two, or in a set of two."""
-        return bool(set(self.decision.effects) & set(self.case.truth))
+        return names_truth(self.case, self.decision)
 
 
 def judged(
@@ -195,8 +200,29 @@ ROWS: tuple[tuple[str, str, Test, Test], ...] = (
         lambda j: j.decision.kind == "nothing_missing",
     ),
     ("`cannot_tell`", "", lambda j: True, lambda j: j.decision.kind == "cannot_tell"),
+    (
+        "wrong statements of any kind",
+        "",
+        lambda j: True,
+        lambda j: j.decision.kind != "cannot_tell" and not j.right,
+    ),
 )
-"""(what is counted, goal, of which cases, which of them)."""
+"""(what is counted, goal, of which real cases, which of them)."""
+TWIN_ROWS: tuple[tuple[str, str, Test, Test], ...] = (
+    (
+        "a known effect that was no candidate: called unknown",
+        "",
+        lambda j: True,
+        lambda j: j.decision.kind == "unknown_effect",
+    ),
+    (
+        "a known effect that was no candidate: another one named",
+        "",
+        lambda j: True,
+        lambda j: j.decision.kind in NAMING,
+    ),
+)
+"""The same of cases whose truth was no candidate (`without_truth`)."""
 
 
 def _single(one: Judged) -> bool:
@@ -204,15 +230,24 @@ def _single(one: Judged) -> bool:
     return one.case.label == "known" and len(one.case.truth) == 1 and one.case.size >= 1.0
 
 
+def real(some: Sequence[Judged]) -> list[Judged]:
+    """Without the cases whose truth was no candidate."""
+    return [one for one in some if not one.case.left_out]
+
+
 def goals(columns: dict[str, list[Judged]]) -> str:
     """Table of the goals, one column for each group of cases."""
     head = "| measure | goal | " + " | ".join(columns) + " |"
     lines = [head, "|---|---|" + "---|" * len(columns)]
-    for what, goal, of, hit in ROWS:
-        cells = [rate([hit(one) for one in some if of(one)]) for some in columns.values()]
-        lines.append(f"| {what} | {goal} | {' | '.join(cells)} |")
+    parts = [(ROWS, [real(some) for some in columns.values()])]
+    twins = [[one for one in some if one.case.left_out] for some in columns.values()]
+    parts += [(TWIN_ROWS, twins)] if any(twins) else []
+    for rows, groups in parts:
+        for what, goal, of, hit in rows:
+            cells = [rate([hit(one) for one in some if of(one)]) for some in groups]
+            lines.append(f"| {what} | {goal} | {' | '.join(cells)} |")
     errors, seconds = [], []
-    for some in columns.values():
+    for some in parts[0][1]:
         named = [one for one in some if one.decision.kind in NAMING]
         sure = np.array([one.decision.confidence for one in named])
         errors.append(f"{calibration_error(sure, np.array([one.right for one in named])):.3f}")
@@ -225,7 +260,7 @@ def goals(columns: dict[str, list[Judged]]) -> str:
 def reliability(some: Sequence[Judged]) -> str:
     """How often statements of each confidence were right."""
     lines = ["| confidence | statements | mean confidence | right |", "|---|---|---|---|"]
-    stated = [one for one in some if one.decision.kind in NAMING]
+    stated = [one for one in real(some) if one.decision.kind in NAMING]
     for low, high in itertools.pairwise(BINS):
         rows = [
             one
@@ -242,7 +277,7 @@ def reliability(some: Sequence[Judged]) -> str:
 def kinds(some: Sequence[Judged]) -> str:
     """What is true by what was said."""
     table: dict[str, Counter] = {}
-    for one in some:
+    for one in real(some):
         label = one.case.label
         if label == "known":
             label = "two effects" if len(one.case.truth) == 2 else "one effect"
@@ -257,25 +292,53 @@ def kinds(some: Sequence[Judged]) -> str:
     return "\n".join(lines)
 
 
+def neighbours(some: Sequence[Judged]) -> str:
+    """What was said where the missing effect was no candidate, by that effect."""
+    table: dict[str, list[Judged]] = {}
+    for one in some:
+        if len(one.case.left_out) == 1:
+            table.setdefault(one.case.left_out[0], []).append(one)
+    lines = ["| no candidate | cases | called unknown | named in its place (times) |"]
+    lines += ["|---|---|---|---|"]
+    for name in sorted(table):
+        own = table[name]
+        unknown = sum(one.decision.kind == "unknown_effect" for one in own)
+        named = Counter(
+            " or ".join(sorted(one.decision.effects))
+            if one.decision.kind != "several"
+            else " and ".join(sorted(one.decision.effects))
+            for one in own
+            if one.decision.kind in NAMING
+        )
+        text = ", ".join(f"{effects} {count}" for effects, count in named.most_common())
+        lines.append(f"| {name} | {len(own)} | {unknown} | {text or '-'} |")
+    return "\n".join(lines)
+
+
 def weights(values: dict) -> str:
     """The fitted weights of an asset's values."""
-    lines = ["| model | cases | ridge | constant and weights |", "|---|---|---|---|"]
+    lines = ["| model | cases | without truth (weight of each) | ridge | constant and weights |"]
+    lines += ["|---|---|---|---|---|"]
     for name, one in values["models"].items():
         text = ", ".join(f"{key} {value:+.2f}" for key, value in one["weights"].items())
+        twins = f"{one['without_truth']} ({one['twin_weight']:g})" if one["without_truth"] else "-"
         lines.append(
-            f"| {name} | {one['cases']} | {one['penalty']:g} | {one['constant']:+.2f}; {text} |"
+            f"| {name} | {one['cases']} | {twins} | {one['penalty']:g} "
+            f"| {one['constant']:+.2f}; {text} |"
         )
     return "\n".join(lines)
 
 
 def sources(cases: Sequence[Labelled]) -> str:
     """Number of cases of each source by what is true."""
-    lines = ["| source | robots | cases | of them |", "|---|---|---|---|"]
+    lines = ["| source | robots | cases | of them | more without their truth |"]
+    lines += ["|---|---|---|---|---|"]
     for source in sorted({case.source for case in cases}):
         own = [case for case in cases if case.source == source]
-        count = Counter(case.label.replace("_", " ") for case in own)
+        count = Counter(c.label.replace("_", " ") for c in own if not c.left_out)
         text = ", ".join(f"{label} {number}" for label, number in count.most_common())
-        lines.append(f"| {source} | {len({c.robot for c in own})} | {len(own)} | {text} |")
+        robots, twins = len({case.robot for case in own}), sum(bool(c.left_out) for c in own)
+        lines.append(f"| {source} | {robots} | {len(own) - twins} | {text} | {twins} |")
     return "\n".join(lines)
 
 
@@ -290,7 +353,7 @@ def trade_off(cases: Sequence[Labelled], models: dict[str, DecisionModel]) -> st
     for cost in COSTS:
         some = []
         for source, model in models.items():
-            own = [case for case in cases if case.source == source]
+            own = [case for case in cases if case.source == source and not case.left_out]
             worth = replace(model.worth, wrong_name=-cost, needless_name=-cost)
             some += judged(own, model, worth)
         wrong = [one for one in some if one.decision.kind in NAMING and not one.right]
@@ -304,7 +367,7 @@ def trade_off(cases: Sequence[Labelled], models: dict[str, DecisionModel]) -> st
             return id(one) in named
 
         cells = [
-            f"{cost:g}" + (" (in force)" if cost == -WORTH.wrong_name else ""),
+            f"{cost:g}",
             f"{cost / (1.0 + cost):.2f}",
             share(_single, lambda one: one.names_truth),
             f"{len(wrong)} of {len(some)}",
@@ -324,8 +387,18 @@ def curves(values: dict) -> str:
         f"`{name}` {one['constant']:+.2f} {one['slope']:+.2f} x log odds"
         for name, one in values["calibration"].items()
     ]
-    cost = values["wrong_unknown"]
-    return f"Calibration: {'; '.join(texts)}. Worth of a wrong `unknown_effect`: {cost:g}."
+    costs = ", ".join(f"`{name}` {values[name]:g}" for name in CHOSEN_COSTS)
+    return f"Calibration: {'; '.join(texts)}. Worths that the fit chose: {costs}."
+
+
+def chosen_costs(models: dict[str, DecisionModel]) -> str:
+    """The costs that each fit without a source chose inside its cases."""
+    lines = ["| source left out | " + " | ".join(f"`{name}`" for name in CHOSEN_COSTS) + " |"]
+    lines += ["|---|" + "---|" * len(CHOSEN_COSTS)]
+    for source, model in models.items():
+        cells = [f"{getattr(model.worth, name):g}" for name in CHOSEN_COSTS]
+        lines.append(f"| {source} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] = ()) -> str:
@@ -339,6 +412,9 @@ def markdown(cases: Sequence[Labelled], values: dict, aside: Sequence[Labelled] 
         parts += ["## Each source left out of the fit", goals(columns)]
         parts += ["### What was said", kinds(together)]
         parts += ["### Reliability", reliability(together)]
+        if any(case.left_out for case in cases):
+            parts += ["### Known effects that were no candidates", neighbours(together)]
+        parts += ["### Costs chosen", chosen_costs(models)]
         parts += ["### More or fewer names", trade_off(cases, models)]
     if aside:
         new = {f"{name}, fitted to all": some for name, some in _asides(aside, values).items()}

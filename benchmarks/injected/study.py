@@ -9,7 +9,7 @@ FOLDER/cases/CASE/truth.json          what changed, and the name of the robot
 import json
 from collections.abc import Sequence
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from benchmarks.cache import Cache
@@ -50,6 +50,15 @@ class CaseFolder:
     """Names of the injected effects."""
     size: float
     """RMS change over the validated error that the change was scaled by."""
+    left_out: tuple[str, ...] = ()
+    """Missing effects that are no candidates: the truth is `unknown` then."""
+
+    @property
+    def without_truth(self) -> "CaseFolder | None":
+        """The case without its truth among the candidates; None where none is in the list."""
+        if not self.truth or UNKNOWN in self.truth:
+            return None
+        return replace(self, truth=(UNKNOWN,), left_out=self.truth)
 
 
 @dataclass(frozen=True)
@@ -99,14 +108,14 @@ def judge(case: CaseFolder) -> Judged:
     model = load_model(case.robot / "model")
     before = load_recordings(case.robot / "before", lambda text: None)
     after = load_recordings(case.place / "after", lambda text: None)
-    return Judged(case, asked(model, after, before))
+    return Judged(case, asked(model, after, before, case.left_out))
 
 
 def run(cases: Sequence[CaseFolder], processes: int, report: Progress) -> list[Judged]:
     """The diagnoses of all cases, models first, in order."""
     robots = sorted({case.robot for case in cases})
     total, done = len(robots) + len(cases), 0
-    judged: dict[Path, Judged] = {}
+    judged: dict[CaseFolder, Judged] = {}
     with workers(processes) as pool:
         for future in as_completed([pool.submit(model_of, robot) for robot in robots]):
             future.result()
@@ -114,20 +123,22 @@ def run(cases: Sequence[CaseFolder], processes: int, report: Progress) -> list[J
             report(done, total, "models")
         for future in as_completed([pool.submit(judge, case) for case in cases]):
             one = future.result()
-            judged[one.case.place] = one
+            judged[one.case] = one
             done += 1
             report(done, total, one.case.place.name)
-    return [judged[case.place] for case in cases]
+    return [judged[case] for case in cases]
 
 
 def markdown(judged: Sequence[Judged]) -> str:
     """Tables of all cases, and counts beside the goals."""
-    known = [j for j in judged if j.case.truth and UNKNOWN not in j.case.truth]
+    real = [j for j in judged if not j.case.left_out]
+    known = [j for j in real if j.case.truth and UNKNOWN not in j.case.truth]
     single = [j for j in known if len(j.case.truth) == 1]
     pairs = [j for j in known if len(j.case.truth) > 1]
-    strange = [j for j in judged if UNKNOWN in j.case.truth]
+    strange = [j for j in real if UNKNOWN in j.case.truth]
+    without = [j for j in judged if j.case.left_out]
     clean = [j for j in judged if not j.case.truth]
-    sure = [j for j in judged if j.answer.kind in NAMING and j.answer.confidence >= SURE]
+    sure = [j for j in real if j.answer.kind in NAMING and j.answer.confidence >= SURE]
     first = [j for j in single if j.answer.ranking[:1] == j.case.truth]
     rows = [
         ("right effect first in the ranking", len(first), len(single), ".95"),
@@ -138,11 +149,15 @@ def markdown(judged: Sequence[Judged]) -> str:
         (f"confidence >= {SURE} and right", _right(sure), len(sure), ".97"),
         (
             f"wrong name with confidence >= {CLAIMED}",
-            sum(misleads(j.answer, j.case.truth) for j in judged),
-            len(judged),
+            sum(misleads(j.answer, j.case.truth) for j in real),
+            len(real),
             "0",
         ),
     ]
+    if without:
+        what, count = "a known effect that is no candidate: ", len(without)
+        rows.append((f"{what}called unknown", _right(without), count, ""))
+        rows.append((f"{what}another one named", _claiming(without), count, ""))
     lines = ["| | found | goal |", "|---|---|---|"]
     lines += [f"| {what} | {count} of {of} | {goal} |" for what, count, of, goal in rows]
     lines += ["", "| robot | case | size | verdict | names | conf. | right |"]
@@ -151,10 +166,15 @@ def markdown(judged: Sequence[Judged]) -> str:
         names = ", ".join(j.answer.names) if j.answer.kind in NAMING else ""
         good = "yes" if right(j.answer, j.case.truth) else "no"
         lines.append(
-            f"| {j.case.robot.name} | {j.case.place.name} | {j.case.size:g} | {j.answer.kind} "
+            f"| {j.case.robot.name} | {_name(j.case)} | {j.case.size:g} | {j.answer.kind} "
             f"| {names} | {j.answer.confidence:.2f} | {good} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _name(case: CaseFolder) -> str:
+    """Name of a case, with the effects that are no candidates."""
+    return case.place.name + (f", without {' and '.join(case.left_out)}" if case.left_out else "")
 
 
 def _right(some: Sequence[Judged]) -> int:
@@ -174,6 +194,7 @@ def to_json(judged: Sequence[Judged]) -> dict:
             "truth": list(j.case.truth),
             "hidden": list(j.case.hidden),
             "size": j.case.size,
+            "left_out": list(j.case.left_out),
             **asdict(j.answer),
         }
         for j in judged

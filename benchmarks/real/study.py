@@ -165,10 +165,13 @@ Ask = Callable[[ArmModel, Sequence[Recording], Sequence[Recording] | None], Diag
 
 
 def ask(
-    model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
+    model: ArmModel,
+    after: Sequence[Recording],
+    before: Sequence[Recording] | None,
+    without: Sequence[str] = (),
 ) -> Diagnosis:
-    """The diagnosis of `surgisoft diagnose MODEL AFTER --before BEFORE`."""
-    return diagnose(model, after, before=before)
+    """The diagnosis of `surgisoft diagnose MODEL AFTER --before BEFORE --without EFFECT`."""
+    return diagnose(model, after, before=before, without=without)
 
 
 def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
@@ -192,12 +195,18 @@ def answer_of(model: ArmModel, found: Diagnosis, seconds: float) -> Answer:
 
 
 def asked(
-    model: ArmModel, after: Sequence[Recording], before: Sequence[Recording] | None
+    model: ArmModel,
+    after: Sequence[Recording],
+    before: Sequence[Recording] | None,
+    without: Sequence[str] = (),
 ) -> Answer:
-    """The answer of a diagnosis, or why it was refused."""
+    """The answer of a diagnosis, or why it was refused.
+
+    without: effects that are no candidates.
+    """
     begin = time.process_time()
     try:
-        found = ask(model, after, before)
+        found = ask(model, after, before, without)
     except InputError as error:
         nan, seconds = float("nan"), time.process_time() - begin
         known = model.validation.rmse_mm

@@ -53,8 +53,10 @@ def task_config(
 class Rules(Protocol):
     """Rules that an experiment lays over a task: its phases, interlock and limits."""
 
-    without: Collection[str]
-    """Measures of single steps whose means mean nothing."""
+    @property
+    def without(self) -> Collection[str]:
+        """Measures of single steps whose means mean nothing."""
+        ...
 
     def over(self, task: Task) -> Task:
         """The task, in simulation or on rigs, under the rules."""

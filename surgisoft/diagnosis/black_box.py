@@ -44,6 +44,8 @@ class BlackBox:
     free black box reaches without memory."""
     p_value: float
     """Probability of such a gain over the model discrepancy alone without a cause."""
+    features: np.ndarray
+    """(S, F) what the free black box mixes: functions of actuation, its past and the time."""
 
 
 def black_box(problem: Problem) -> BlackBox:
@@ -75,7 +77,9 @@ def black_box(problem: Problem) -> BlackBox:
     floor = null.counts * problem.floor_mm**2
     gain = np.log((tried[0] + floor) / (best + floor))[None]
     chance = float(sign_flip_p_values(problem.by_motion(gain))[0]) if gain.any() else 1.0
-    return BlackBox(best, min(free, key=np.sum), min(memoryless, key=np.sum), chance)
+    least = min(free, key=np.sum), min(memoryless, key=np.sum)
+    features = np.concatenate([static, FREE_SCALE * wide], axis=1)
+    return BlackBox(best, *least, chance, features)
 
 
 def principal(wide: np.ndarray, most: int) -> np.ndarray:

@@ -3,8 +3,8 @@
 What a diagnosis names is decided by a fitted model (`decision`); its numbers stand in
 `assets/decision/decision.json` with the cases that they were fitted to. Here stand the settings of
 the search that proposes effects, generously, to that model, and the costs that its probabilities
-are weighed with. None of them was fitted to cases whose results are reported, but for the cost of
-a wrong "unknown", which every fit chooses inside its own cases.
+are weighed with. None of them was fitted to cases whose results are reported, but for the costs of
+a wrong name, a needless name and a wrong "unknown", which every fit chooses inside its own cases.
 
 Gains are shares of what can be explained of the held-out squared error (what lies above the noise
 floor). Sizes are errors above the noise floor in units of the model discrepancy, which is the
@@ -61,13 +61,16 @@ class Search:
 class Worth:
     """What a result is worth to its reader: 1 right, 0 "cannot tell".
 
-    Stated, not fitted, but for the cost of a wrong "unknown". A wrong name costs what a right one
-    gains, so a name is given where it is more probably right than wrong, and says with its
-    confidence how probably; `amend` shows on held-out data whether it does what was promised.
+    Stated, not fitted, but for the three costs that a fit chooses (`CHOSEN_COSTS`). A wrong name
+    costs at least what a right one gains, so a name is given where it is more probably right than
+    wrong, and says with its confidence how probably; `amend` shows on held-out data whether it does
+    what was promised.
     """
 
     needless_name: float = -1.0
-    """An effect is named, alone or in a set, and none of the list is missing."""
+    """An effect is named, alone or in a set, and none of the list is missing. The fit chooses it
+    with the next one: with the fewest wrong names, and at most 3 % of the effects unnamed that
+    these two costs would name (`NAMED_LOST` in `benchmarks/decision/fit.py`)."""
     wrong_name: float = -1.0
     """An effect is named, alone or in a set, and another one of the list is missing."""
     right_set: float = 0.7

@@ -51,9 +51,9 @@ Reason = Literal["network", "learned", "few_data", "schedule"]
 """Why a diagnosis cannot tell: the model is not that of this arm; the model has learned part of
 what is missing; there are too few motions; the schedule does not tell effects apart."""
 
-SCHEMA = 2
-"""Version of the asset's format and of the features. An asset of schema 1 still opens: it has no
-calibration, and the features that are newer have no weight."""
+SCHEMA = 3
+"""Version of the asset's format and of the features. Assets of earlier schemas still open: features
+that are newer have no weight, and one of schema 1 has no calibration."""
 ASSET = Path(__file__).parents[1] / "assets" / "decision" / "decision.json"
 """The fitted decision that is in force."""
 FEW_MOTIONS = 24
@@ -139,6 +139,28 @@ def _box_better(evidence: Evidence) -> float:
     """Log gain of the black box over the best proposal."""
     some = [each.left_log_box for each in evidence.proposals]
     return _between(min([evidence.box_log_gain, *some]), -1.0, 1.0)
+
+
+def _free_better(evidence: Evidence) -> float:
+    """Log gain of the free black box over the best proposal."""
+    return min([evidence.free_log_gain, *(each.left_log_free for each in evidence.proposals)])
+
+
+def _break(evidence: Evidence) -> float:
+    """Log gain of one break over the black box, or over the best proposal where that is better.
+
+    An effect that sets in fast and fades is no function that the black box knows: where the effect
+    itself explains it, there is no break.
+    """
+    return _between(evidence.break_log_gain + min(_free_better(evidence), 0.0), 0.0, 1.0)
+
+
+def _line(evidence: Evidence) -> float:
+    """Share in one line, by as much as the best proposal leaves no less than the black box does.
+
+    A line that an effect of the list explains, such as a user-defined one, is none.
+    """
+    return _between(evidence.line * math.exp(min(_free_better(evidence), 0.0)), 0.0, 1.0)
 
 
 def lack_of_fit(gain: float | None, log_gain: float | None) -> float:
@@ -331,6 +353,20 @@ MISSING = (
         "log of the share of the error above the floor that the best proposal leaves",
         since=2,
     ),
+    Feature(
+        "break",
+        +1,
+        _break,
+        "log gain of one break in time over a black box with memory, or over the best proposal",
+        since=3,
+    ),
+    Feature(
+        "line",
+        +1,
+        _line,
+        "share of what a black box with memory leaves in one line of its spectrum",
+        since=3,
+    ),
 )
 KNOWN = (
     Feature(
@@ -363,6 +399,20 @@ KNOWN = (
         +1,
         lambda e: _z(e.effects[0].z) if e.effects else 0.0,
         "normal quantile of the best effect's family-wise p-value",
+    ),
+    Feature(
+        "break",
+        -1,
+        _break,
+        "log gain of one break in time over a black box with memory, or over the best proposal",
+        since=3,
+    ),
+    Feature(
+        "line",
+        -1,
+        _line,
+        "share of what a black box with memory leaves in one line of its spectrum",
+        since=3,
     ),
 )
 FIRST = (
@@ -502,6 +552,20 @@ NETWORK = (
         lambda e: _log(e.error_over_box, 0.0, 3.0),
         "log of the error over what a black box with memory reaches",
     ),
+    Feature(
+        "break",
+        -1,
+        _break,
+        "log gain of one break in time over a black box with memory, or over the best proposal",
+        since=3,
+    ),
+    Feature(
+        "line",
+        -1,
+        _line,
+        "share of what a black box with memory leaves in one line of its spectrum",
+        since=3,
+    ),
 )
 FEATURES = {"missing": MISSING, "known": KNOWN, "first": FIRST, "two": TWO, "network": NETWORK}
 """The features of each fitted model."""
@@ -543,6 +607,8 @@ CALIBRATED = ("name", "set")
 """Probabilities that have a curve: that of the most probable effect, of the two most probable."""
 LEAST_CHANCE = 1e-6
 """Least probability whose log odds are taken."""
+CHOSEN_COSTS = ("wrong_name", "needless_name", "wrong_unknown")
+"""Fields of `Worth` that a fit chooses inside its own cases."""
 
 
 @dataclass(frozen=True)
@@ -556,7 +622,7 @@ class DecisionModel:
     curves: dict[str, Curve] = field(default_factory=dict)
     """The calibrations by name; one that is not there changes nothing."""
     worth: Worth = WORTH
-    """What results are worth; the cost of a wrong "unknown" is chosen with the fit."""
+    """What results are worth; CHOSEN_COSTS of it are chosen with the fit."""
 
 
 def content_hash(values: dict[str, Any]) -> str:
@@ -605,9 +671,9 @@ def load_decision(path: Path = ASSET) -> DecisionModel:
         given = _table(one)
         if name not in CALIBRATED or not all(_finite(given.get(k)) for k in ("constant", "slope")):
             raise InputError(f"{path.name}: calibration '{name}' is not readable; fit it again")
-    cost = values.get("wrong_unknown", WORTH.wrong_unknown)
-    if not _finite(cost):
-        raise InputError(f"{path.name}: wrong_unknown is no finite number; fit it again")
+    for name in CHOSEN_COSTS:
+        if not _finite(values.get(name, getattr(WORTH, name))):
+            raise InputError(f"{path.name}: {name} is no finite number; fit it again")
     return decision_of(models, values)
 
 
@@ -622,7 +688,8 @@ def decision_of(models: dict[str, Logistic], values: dict[str, Any]) -> Decision
         name: Curve(one["constant"], one["slope"])
         for name, one in values.get("calibration", {}).items()
     }
-    worth = replace(WORTH, wrong_unknown=values.get("wrong_unknown", WORTH.wrong_unknown))
+    costs = {name: values[name] for name in CHOSEN_COSTS if name in values}
+    worth = replace(WORTH, **costs)
     about = {key: value for key, value in values.items() if key not in fitted}
     return DecisionModel(models, about, curves, worth)
 

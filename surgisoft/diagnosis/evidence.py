@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from surgisoft.diagnosis.beyond_history import beyond_history
 from surgisoft.diagnosis.selection import Findings, ModelSelection, Score
 from surgisoft.diagnosis.statistics import block_sums, studentised
 from surgisoft.surrogate.effects import hypothesis_of, known_effects
 
-VERSION = 1
+VERSION = 2
 """Version of the evidence, raised when a number gets another meaning: stored evidence of another
 version is collected again."""
 COLLINEAR_RIDGE = 1e-6
@@ -106,6 +107,9 @@ class ProposalEvidence:
     """Log of what is left with it over what the two leave, the noise added to both."""
     instead_margin: tuple[float, ...] = ()
     """Studentised mean over motions of the log of block errors with it over those with the two."""
+    left_log_free: float = 0.0
+    """Mean over blocks of log(error with them / error of the free black box), the noise in both:
+    of an effect's own form a learner without physics leaves no less."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,13 @@ class Evidence:
     """The best effect and the best two, as far as they are worth a look."""
     paired: bool = False
     """Whether the paired difference of two sets of recordings is explained."""
+    free_log_gain: float = 0.0
+    """Log gain of the free black box over the model discrepancy of its validated size."""
+    break_log_gain: float = 0.0
+    """Log gain of one break over the free black box (`beyond_history`)."""
+    line: float = 0.0
+    """Share of what the free black box leaves above the noise in one line of its spectrum that is
+    none of the actuation or the predicted motion."""
 
     def to_json(self) -> dict:
         """Plain values."""
@@ -182,6 +193,7 @@ def evidence_of(found: Findings) -> Evidence:
     free = min(box.free_losses, raw, null, key=np.sum)
     above = selection.explainable(raw, [free])
     beside = selection.explainable(null, [box.losses, *(s.losses for s in found.first)])
+    beyond = beyond_history(problem, box.features)
     stated = problem.discrepancy_mm**2 + problem.noise_mm**2
     validated = float((seen.sum(0) * stated).sum())
     return Evidence(
@@ -199,8 +211,11 @@ def evidence_of(found: Findings) -> Evidence:
         blocks=len(selection.validation.counts),
         motions=int(problem.motion.max()) + 1,
         effects=tuple(_effect(found, found.first[0], score) for score in found.first),
-        proposals=tuple(_proposal(found, place) for place in range(len(found.proposals))),
+        proposals=tuple(_proposal(found, each, free) for each in range(len(found.proposals))),
         paired=problem.table.paired_discrepancy_mm is not None,
+        free_log_gain=float(selection.log_ratio(null, free).mean()),
+        break_log_gain=float(selection.log_ratio(beyond.losses, beyond.break_losses).mean()),
+        line=beyond.line,
     )
 
 
@@ -252,8 +267,11 @@ def collinearity(selection: ModelSelection, best: Score, other: Score) -> float:
     return _share(moment @ np.linalg.solve(gram + ridge, moment), max(target @ target, 1e-30))
 
 
-def _proposal(found: Findings, place: int) -> ProposalEvidence:
-    """One proposal against those with fewer effects, and against the black box."""
+def _proposal(found: Findings, place: int, free: np.ndarray) -> ProposalEvidence:
+    """One proposal against those with fewer effects, and against the black boxes.
+
+    free: (B,) held-out squared error of the free black box, mm^2.
+    """
     selection, proposal = found.selection, found.proposals[place]
     null, after = selection.losses(), selection.losses(proposal.chosen)
     floor, last, form = float(selection.floor.sum()), proposal.scores[-1], proposal.relaxed
@@ -285,4 +303,5 @@ def _proposal(found: Findings, place: int) -> ProposalEvidence:
             math.log((score.losses.sum() + floor) / (after.sum() + floor)) for score in others
         ),
         instead_margin=tuple(float(studentised(gap)[0]) if gap.any() else 0.0 for gap in gaps),
+        left_log_free=float(selection.log_ratio(after, free).mean()),
     )

@@ -255,7 +255,9 @@ class Memory:
     """Length of a block [s]."""
 
     @classmethod
-    def fitted(cls, parts: Sequence[np.ndarray], paths: Sequence[np.ndarray], block_s: float):
+    def fitted(
+        cls, parts: Sequence[np.ndarray], paths: Sequence[np.ndarray], block_s: float
+    ) -> Memory:
         """The most likely memory of components (J, d) with paths (J - 1,) of each run.
 
         The likelihood is that of each block given the one before, at the most likely variance.
@@ -273,7 +275,7 @@ class Memory:
                 cost = np.log(variance) + np.mean(np.log(left))
                 found[:, cost < best] = np.array([white, reach, time_s])[:, None]
                 best = np.minimum(best, cost)
-        return cls(*found, block_s)
+        return cls(found[0], found[1], found[2], block_s)
 
     def kept(self, path: np.ndarray) -> np.ndarray:
         """(..., d) correlation of the slow part over a path (...,) in one block."""
@@ -667,7 +669,7 @@ class Charts:
             return None
         self.judged += 1
         squares, counts = detector.whitening.squares(
-            now, before, np.linalg.norm(change), unknown[0]
+            now, before, np.asarray(np.linalg.norm(change)), unknown[0]
         )
         steps = detector.increments(squares, counts)
         if self._charts is None or self._zero_s is None:

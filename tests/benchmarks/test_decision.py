@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.decision.evidence_log import Labelled, append, read
+from benchmarks.decision.evidence_log import Labelled, append, posed_on, read, without_truth
 from benchmarks.decision.fit import (
     PRIORS,
     case_weights,
+    costs_of,
     curve_of,
     fit,
     fit_one,
     log_losses,
     model_of,
     sample,
-    wrong_unknown_of,
 )
 from benchmarks.decision.own_rig import ROUND, Plan, draw
 from benchmarks.decision.table import (
@@ -26,6 +26,7 @@ from benchmarks.decision.table import (
     goals,
     left_out,
     markdown,
+    neighbours,
     rate,
 )
 from surgisoft.diagnosis.decision import (
@@ -37,6 +38,8 @@ from surgisoft.diagnosis.decision import (
     content_hash,
     features_of,
 )
+from surgisoft.diagnosis.diagnose import diagnose
+from tests.diagnosis.synthetic import recording, still_model, walk
 from tests.diagnosis.test_decision import ALONE, CREEP, GOOD, LAG
 
 NOTHING = replace(GOOD, effects=(replace(CREEP, gain=0.02, log_gain=0.01, z=0.0),), proposals=())
@@ -176,8 +179,70 @@ def test_the_cost_of_a_wrong_unknown_keeps_known_effects_known(chance, cost):
             effects = {f"effect {place}": (1.0 - chance) / 5 for place in range(5)}
         rest = 1.0 - unknown - sum(effects.values())
         predicted.append((case(number), Probabilities(rest, 0.0, unknown, effects, 0.0, ())))
-    assert wrong_unknown_of(predicted, {}) == -cost
-    assert wrong_unknown_of(predicted[2:], {}) == -0.25
+    assert costs_of(predicted, {}).wrong_unknown == -cost
+    assert costs_of(predicted[2:], {}).wrong_unknown == -0.25
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right", "needless", "costs"),
+    [
+        (0, 0, 0, (1.0, 1.0)),
+        (2, 0, 0, (1.5, 1.0)),
+        (2, 1, 0, (1.5, 1.0)),
+        (2, 2, 0, (1.0, 1.0)),
+        (0, 0, 5, (1.0, 3.0)),
+        (2, 1, 5, (1.5, 3.0)),
+    ],
+)
+def test_the_fewest_wrong_names_that_cost_few_right_ones(wrong, right, needless, costs):
+    """Of 40 known effects some would be named wrongly, and some rightly, with a probability of
+    0.53, and some of ten unchanged arms be given a name with 0.7. A name of probability p is given
+    where p > cost (1 - p), and a fortieth of the right ones may be lost for it, but not two."""
+    predicted = []
+    for number in range(40):
+        sure = 0.99 if number >= wrong + right else 0.53
+        names = {"drift" if number < wrong else "creep": sure}
+        names |= {f"other {place}": (1.0 - sure) / 9 for place in range(9)}
+        predicted.append((case(number), Probabilities(0.0, 0.0, 0.0, names, 0.0, ())))
+    for number in range(10):
+        chance = 0.7 if number < needless else 0.0
+        clean = case(number, label="clean", truth=(), size=0.0)
+        chances = Probabilities(1 - chance, 0.0, 0.0, {"creep": chance}, 0.0, ())
+        predicted.append((clean, chances))
+    found = costs_of(predicted, {})
+    assert (-found.wrong_name, -found.needless_name) == costs
+
+
+def test_cases_without_their_truth_share_the_weight_of_unknown_ones():
+    """Six known cases, four of an unknown effect and ten without their truth, at 0.3 of a real one.
+
+    The two kinds count alike (PRIORS), 5 of 10 each, and of the unknown ones' 5 the ten have 3 / 7.
+    Where no share is stated, in `missing`, they take nothing from cases where nothing is missing.
+    """
+    known = [case(n) for n in range(6)]
+    unknown = [case(n, label="unknown", truth=("leak",)) for n in range(6, 10)]
+    twins = [replace(case(n, label="unknown"), left_out=("creep",)) for n in range(10, 20)]
+    weights = case_weights("known", sample("known", known + unknown + twins), 0.3)
+    assert weights[:6] == pytest.approx(6 * [5 / 6])
+    assert weights[6:10] == pytest.approx(4 * [5 * 4 / 7 / 4])
+    assert weights[10:] == pytest.approx(10 * [5 * 3 / 7 / 10])
+    clean = [case(n, label="clean", truth=(), size=0.0) for n in range(20, 30)]
+    weights = case_weights("missing", sample("missing", known + unknown + twins + clean), 0.3)
+    assert weights[-10:] == pytest.approx(10 * [1.0])
+    assert weights[:20].sum() == pytest.approx(10.0)
+
+
+def test_the_table_counts_cases_without_their_truth_apart():
+    some = [
+        said("unknown_effect", (), label="unknown", truth=("leak",)),
+        said("unknown_effect", (), label="unknown", left_out=("creep",)),
+        said("identified", ("drift",), label="unknown", left_out=("creep",)),
+    ]
+    lines = {line.split("|")[1].strip(): line for line in goals({"all": some}).splitlines()}
+    assert "100 % (1 of 1" in lines["unknown called unknown"]
+    assert "50 % (1 of 2" in lines["a known effect that was no candidate: called unknown"]
+    assert "50 % (1 of 2" in lines["a known effect that was no candidate: another one named"]
+    assert "| creep | 2 | 1 | drift 1 |" in neighbours(some)
 
 
 def test_a_source_is_judged_without_its_own_cases(monkeypatch):
@@ -193,9 +258,11 @@ def test_a_source_is_judged_without_its_own_cases(monkeypatch):
     assert all({one.case.source for one in some} == {name} for name, some in found.items())
 
 
-def said(kind, effects, sure=0.9, **about):
+def said(kind, effects, sure=0.9, left_out=(), **about):
     chances = Probabilities(0.0, 0.0, 0.0, dict.fromkeys(effects, sure), 0.0, ())
-    return Judged(case(0, **about), Decision(kind, effects, sure, chances))
+    return Judged(
+        replace(case(0, **about), left_out=left_out), Decision(kind, effects, sure, chances)
+    )
 
 
 @pytest.mark.parametrize(
@@ -261,3 +328,17 @@ def test_rounds_of_cases_have_the_shares_that_are_stated():
     assert sum(asked != case.robot for case, asked in drawn) == 4
     assert len({case.take for case, _ in drawn}) == len(drawn)
     assert draw(Plan([1, 2, 3], [1]), 7, 5) == drawn[:7]
+
+
+def test_without_its_truth_a_case_is_diagnosed_as_without_the_effect():
+    """The effect is no candidate, alone, in pairs or relaxed: as `diagnose --without` finds it."""
+    recorded = recording(np.linspace(0.0, 1.0, 240), walk(240))
+    posed = posed_on(still_model(), [recorded])
+    one = case(1, truth=("drift",))
+    twin = without_truth(one, posed)
+    assert (twin.label, twin.left_out, twin.robot) == ("unknown", ("drift",), one.robot)
+    found = diagnose(still_model(), [recorded], without=["drift"], setup_tests=False)
+    assert twin.evidence == found.statistics
+    names = {each.name for each in posed.tried}
+    assert {each.effect for each in twin.evidence.effects} == names - {"drift"} < names
+    assert without_truth(twin, posed) is None

@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from benchmarks.cache import Cache
+from benchmarks.injected import study
 from benchmarks.injected.cases import (
     ROBOTS,
     SCALE_TOLERANCE,
@@ -372,7 +373,7 @@ def test_bad_folders_of_cases_are_one_line(bench, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-def test_a_case_is_judged_by_its_robots_model(bench, tmp_path):
+def test_a_case_is_judged_by_its_robots_model(bench, tmp_path, monkeypatch):
     written_cases(bench, tmp_path)
     quick = FitOptions(inputs="pressure", widths=(16, 16), epochs=60)
     model = fitted(bench.before, quick, "measured", Cache(tmp_path / "fits"), silent)
@@ -383,12 +384,18 @@ def test_a_case_is_judged_by_its_robots_model(bench, tmp_path):
     assert turned.answer.validated_mm == pytest.approx(model.validation.rmse_mm)
     assert turned.answer.before_mm > 2.5  # 3 mm were injected, and the training rows hold them
     assert turned.answer.ranking[0] == "misalignment"
+    twin, seen = find_cases(tmp_path)[0].without_truth, []
+    assert (twin.truth, twin.left_out) == (("unknown",), ("misalignment",))
+    monkeypatch.setattr(study, "asked", lambda *given: seen.append(given[3]))
+    judge(twin)
+    assert seen == [("misalignment",)]
+    assert find_cases(tmp_path)[2].without_truth is None
 
 
 def test_counts_of_judged_cases():
-    def judged(truth: tuple[str, ...], kind: str, names: tuple[str, ...], confidence: float):
+    def judged(truth, kind, names, confidence, left_out=()):
         answer = Answer(kind, names, confidence, names, "", 2.0, 0.1, 1.0, 1.0, 0.1)
-        return Judged(CaseFolder(Path("c"), Path("r"), truth, truth, 1.0), answer)
+        return Judged(CaseFolder(Path("c"), Path("r"), truth, truth, 1.0, left_out), answer)
 
     table = cases_table(
         [
@@ -398,8 +405,12 @@ def test_counts_of_judged_cases():
             judged(("unknown",), "unknown_effect", ("unknown",), 0.0),
             judged((), "identified", ("drift",), 0.5),
             judged((), "nothing_missing", (), 0.0),
+            judged(("unknown",), "unknown_effect", ("unknown",), 0.4, ("creep",)),
+            judged(("unknown",), "identified", ("drift",), 0.99, ("creep",)),
         ]
     )
+    assert "| a known effect that is no candidate: called unknown | 1 of 2 |  |" in table
+    assert "| a known effect that is no candidate: another one named | 1 of 2 |  |" in table
     assert "| right effect first in the ranking | 1 of 2 | .95 |" in table
     assert "| two effects, both named | 1 of 1 | .85 |" in table
     assert "| unknown called unknown | 1 of 1 | .80 |" in table

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from surgisoft.diagnosis.criteria import CLAIM, Worth
 from surgisoft.diagnosis.decision import (
     ASSET,
+    CHOSEN_COSTS,
     FEATURES,
     Curve,
     DecisionModel,
@@ -255,7 +256,8 @@ def test_two_that_do_the_same_are_named_as_a_set_and_never_one_of_them():
     assert found.probabilities.effects["creep"] == pytest.approx(0.5, abs=0.01)
 
 
-weights = st.lists(st.floats(0.0, 5.0), min_size=12, max_size=12)
+MOST_FEATURES = max(map(len, FEATURES.values()))
+weights = st.lists(st.floats(0.0, 5.0), min_size=MOST_FEATURES, max_size=MOST_FEATURES)
 
 
 @settings(max_examples=60, deadline=None)
@@ -311,6 +313,23 @@ def test_a_second_effect_that_mends_the_form_of_the_first_says_nothing_of_two():
     assert rows[1]["own_gain"] == pytest.approx(0.5 * 0.2 / 0.22)
     assert rows[0]["better"] == pytest.approx(math.log(0.03 / 0.025))
     assert chances[0] < chances[1]
+
+
+@pytest.mark.parametrize(
+    ("free", "broken", "line"), [(0.5, 0.7, 0.8), (-math.log(2.0), 0.7 - math.log(2.0), 0.4)]
+)
+def test_where_an_effect_explains_them_there_is_no_break_and_no_line(free, broken, line):
+    """A break that gains 0.7 over a black box gains as much less over what is better than that.
+    Where an effect leaves half of what the black box does, half of the line is explained."""
+    names = [feature.name for feature in FEATURES["known"]]
+    worse = replace(ALONE, left_log_free=free + 1.0)
+    best = replace(ALONE, left_log_free=free)
+    evidence = replace(
+        GOOD, proposals=(worse, best), free_log_gain=1.8, break_log_gain=0.7, line=0.8
+    )
+    row = dict(zip(names, features_of("known", evidence), strict=True))
+    assert row["break"] == pytest.approx(broken)
+    assert row["line"] == pytest.approx(line)
 
 
 def test_the_weights_in_force_have_the_signs_of_their_features():
@@ -375,9 +394,9 @@ def test_an_asset_of_the_first_schema_still_opens(tmp_path):
     for name, features in FEATURES.items():
         for feature in features:
             if feature.since > 1:
-                del values["models"][name]["weights"][feature.name]
-    for key in ("calibration", "wrong_unknown"):
-        del values[key]
+                values["models"][name]["weights"].pop(feature.name, None)
+    for key in ("calibration", *CHOSEN_COSTS):
+        values.pop(key, None)
     values |= {"schema": 1}
     old = tmp_path / "decision.json"
     old.write_text(json.dumps(values | {"sha256": content_hash(values)}))

@@ -333,6 +333,7 @@ def test_a_network_that_needs_no_training_stays_as_it_is(problem, lagging, found
     assert amended.claimed
     assert any("it stays as it is" in note for note in amended.notes)
     monkeypatch.setattr(amending, "refit_effects", judged(0.5 * apart))
+    monkeypatch.setattr(amending, "apart_mm", lambda *given: apart)
     with pytest.raises(AssertionError, match="fitted together"):
         amending.amend(clean, [lagging[0]], "line_lag")
 

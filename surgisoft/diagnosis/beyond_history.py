@@ -1,0 +1,200 @@
+"""What no function of the actuation and its past explains: breaks and periodic motion.
+
+Every effect of the list acts through the actuation, its past or the time since the start, and all
+the while. Much of what is not in the list does not: a knock or a torn fibre changes the arm at one
+moment, a marker slips once, a body that breathes moves the arm whatever the actuation is. Two tests
+look for that in what a black box with memory leaves, without asking what it is:
+
+- a *break*: one moment from which on the residual is another function of the actuation, to first
+  order. The moment is searched (Andrews 1993, "Tests for parameter instability and structural
+  change with unknown change point"; with a known moment: Chow 1960), and held-out blocks judge;
+- a *line*: one frequency that holds much of what is left, and neither of the actuation nor of the
+  predicted motion (Fisher 1929, "Tests of significance in harmonic analysis").
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from surgisoft.diagnosis.residuals import Problem
+from surgisoft.diagnosis.statistics import block_sums
+
+RIDGES = (0.5, 5.0, 50.0)
+"""Ridges on the features of the black box that are tried, for features of mean square 1 in all: up
+to the weight of as many rows. The best on held-out blocks is taken."""
+BREAK_RIDGE = 1.0
+"""Ridge on the columns of a break, of order 1 in each row: the weight of one row."""
+BREAKS = 24
+"""Moments that are tried. The nearest one is off by a fiftieth of the time at most."""
+MARGIN = 0.04
+"""Share of the rows before the first moment, and behind the last one."""
+LEAST_PERIODS = 4.0
+"""Fewest periods in a recording: below, a line is not told from a slow drift."""
+OVERSAMPLED = 2
+"""Points of the spectrum for each of its independent ones: a line between two points would lose
+half of its power, and loses a fifth."""
+LEAST_ABOVE = 0.25
+"""Least share of the squared remainder that counts as above the noise: how large the noise is, is
+not known better, and of next to nothing any line is all."""
+
+
+@dataclass(frozen=True, eq=False)
+class BeyondHistory:
+    """What a black box with memory leaves, and what breaks and lines explain of that."""
+
+    losses: np.ndarray
+    """(B,) held-out sum of squared distances by block of the black box, mm^2."""
+    break_losses: np.ndarray
+    """(B,) the same with the best break beside it."""
+    break_at: float
+    """Place of that break, as a share of the rows, 0 to 1."""
+    line: float
+    """Share of the remainder's power above the noise in its strongest line, less the shares that
+    actuation and predicted motion have there, 0 to 1."""
+
+
+def beyond_history(problem: Problem, features: np.ndarray) -> BeyondHistory:
+    """Look for a break and for a line in what the features (S, F) of a black box leave."""
+    seen = np.isfinite(problem.residual).all(2)
+    target = np.where(seen[..., None], problem.residual, 0.0).reshape(len(seen), -1)
+    ones = np.ones((len(target), 1))
+    columns = np.concatenate([ones, features], axis=1).astype(np.float32)
+    folds = _Folds(columns, target.astype(np.float32), problem.fold[problem.block])
+    tried = [folds.remainder(ridge) for ridge in RIDGES]
+    best = int(np.argmin([np.square(each, dtype=float).sum() for each in tried]))
+    remainder = tried[best]
+    state = np.concatenate([ones, problem.pressure], axis=1).astype(np.float32)
+    places = np.linspace(MARGIN, 1.0 - MARGIN, BREAKS)
+    broken = folds.with_breaks(RIDGES[best], state, (places * len(target)).astype(int))
+    sums = [np.square(each, dtype=float).sum() for each in broken]
+    place = int(np.argmin(sums))
+
+    def losses(rows: np.ndarray) -> np.ndarray:
+        return block_sums(np.square(rows, dtype=float).sum(1), problem.block)
+
+    return BeyondHistory(
+        losses=losses(remainder),
+        break_losses=losses(broken[place]),
+        break_at=float(places[place]),
+        line=strongest_line(problem, remainder),
+    )
+
+
+class _Folds:
+    """Ridge regressions of a target on columns, one fold left out in turn.
+
+    The first column is constant and has no penalty. Breaks enter by blockwise elimination: their
+    few columns cost no further factorisation.
+    """
+
+    def __init__(self, columns: np.ndarray, target: np.ndarray, fold: np.ndarray):
+        """columns (S, F) and target (S, C), mm; fold: (S,) fold of each row."""
+        self.columns, self.target = columns, target
+        self.held = [np.flatnonzero(fold == number) for number in np.unique(fold)]
+        parts = [(columns[rows].T @ columns[rows]).astype(float) for rows in self.held]
+        moments = [(columns[rows].T @ target[rows]).astype(float) for rows in self.held]
+        self.grams = [sum(parts) - part for part in parts]
+        self.moments = [sum(moments) - moment for moment in moments]
+
+    def _factor(self, number: int, ridge: float) -> tuple:
+        penalty = np.full(self.columns.shape[1], ridge)
+        penalty[0] = 1e-3
+        return cho_factor(self.grams[number] + np.diag(penalty), check_finite=False)
+
+    def remainder(self, ridge: float) -> np.ndarray:
+        """(S, C) what the columns leave of the rows that are left out, mm."""
+        answer = np.empty_like(self.target)
+        for number, rows in enumerate(self.held):
+            solved = cho_solve(self._factor(number, ridge), self.moments[number])
+            answer[rows] = self.target[rows] - self.columns[rows] @ solved.astype(np.float32)
+        return answer
+
+    def with_breaks(
+        self, ridge: float, state: np.ndarray, rows_before: Sequence[int] | np.ndarray
+    ) -> list[np.ndarray]:
+        """For each number of rows before a break (S, C) what is left with the state (S, k) behind
+        the break as further columns, mm."""
+        behind = [np.arange(len(state)) >= first for first in rows_before]
+        wide = np.concatenate([state * each[:, None] for each in behind], axis=1)
+        answer = [np.empty_like(self.target) for _ in behind]
+        size = state.shape[1]
+        crossed, grams, moments = (
+            (other.T @ wide).astype(float) for other in (self.columns, wide, self.target)
+        )
+        for number, rows in enumerate(self.held):
+            factor, out = self._factor(number, ridge), wide[rows]
+            solved = cho_solve(factor, self.moments[number])
+            own_crossed = crossed - self.columns[rows].T @ out
+            freed = cho_solve(factor, own_crossed)
+            gram = grams - out.T @ out - own_crossed.T @ freed
+            moment = (moments - self.target[rows].T @ out).T - own_crossed.T @ solved
+            left = self.target[rows] - self.columns[rows] @ solved.astype(np.float32)
+            own = out - self.columns[rows] @ freed.astype(np.float32)
+            for place, one in enumerate(answer):
+                at = slice(place * size, (place + 1) * size)
+                ridged = gram[at, at] + BREAK_RIDGE * np.eye(size)
+                amplitudes = np.linalg.solve(ridged, moment[at])
+                one[rows] = left - own[:, at] @ amplitudes.astype(np.float32)
+        return answer
+
+
+def strongest_line(problem: Problem, remainder: np.ndarray) -> float:
+    """Share of the power above the noise (S, C) in the strongest line that is only there."""
+    spectrum = _Spectrum.of(problem)
+    if spectrum is None:
+        return 0.0
+    power = float(np.square(remainder - remainder.mean(0), dtype=float).sum(1).mean())
+    noise = float(np.square(problem.noise_mm).sum())
+    above = max(power - noise, LEAST_ABOVE * power, 1e-30)
+    own = spectrum.power(remainder) / above
+    others = np.zeros_like(own)
+    predicted = problem.predicted.reshape(len(remainder), -1)
+    for each in (problem.pressure, problem.direction, predicted):
+        spread = float(np.square(each - each.mean(0)).sum(1).mean())
+        if spread > 0:
+            others = np.maximum(others, spectrum.power(each) / spread)
+    return float(np.clip((own - others).max(initial=0.0), 0.0, 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """Power of series on a grid of frequencies, the recordings' phases independent."""
+
+    groups: list[tuple[np.ndarray, np.ndarray]]
+    """For each recording its rows, and their places on an even grid of time."""
+    points: int
+    """Points of the transform."""
+    first: int
+    """First frequency that counts."""
+
+    @classmethod
+    def of(cls, problem: Problem) -> "_Spectrum | None":
+        """The spectrum of a problem's rows; None where they do not follow each other in time."""
+        index = problem.index.numpy()
+        timed = problem.table.timed[index]
+        recording, time = problem.table.recording[index], problem.time_s
+        steps = np.diff(time)[(np.diff(recording) == 0) & (np.diff(time) > 0)]
+        if not timed.all() or not len(steps):
+            return None
+        step = float(np.median(steps))
+        groups, longest = [], 0
+        for number in np.unique(recording):
+            rows = np.flatnonzero(recording == number)
+            places = np.rint((time[rows] - time[rows[0]]) / step).astype(int)
+            groups.append((rows, places))
+            longest = max(longest, int(places.max()) + 1)
+        points = 1 << int(np.ceil(np.log2(max(OVERSAMPLED * longest, 2))))
+        return cls(groups, points, int(np.ceil(LEAST_PERIODS * points / longest)))
+
+    def power(self, series: np.ndarray) -> np.ndarray:
+        """(F,) power of a series (S, C) in each line: its own mean square for a sine."""
+        series = series - series.mean(0)
+        total = np.zeros(self.points // 2 + 1)
+        for rows, places in self.groups:
+            even = np.zeros((self.points, series.shape[1]), np.float32)
+            even[np.minimum(places, self.points - 1)] = series[rows]
+            found = np.abs(np.fft.rfft(even, axis=0)) ** 2
+            total += 2.0 * found.sum(1) / len(rows)
+        return total[self.first :] / sum(len(rows) for rows, _ in self.groups)

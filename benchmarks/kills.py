@@ -71,7 +71,7 @@ class Command:
     finish: Callable[[Path, int], object] | None = None
     """Continues what was killed; the output must then be the new one."""
     varies: tuple[str, ...] = ()
-    """Files of the output that state times or versions and are only looked at."""
+    """Files of the output whose content differs from run to run and that are only looked at."""
     share: float = 1.0
     """Share of the kills, relative to the other commands."""
 
@@ -310,7 +310,14 @@ COMMANDS: dict[str, Command] = {
         share=0.5,
     ),
     "scene new": Command(_scene, "scene", _open_scene, replaces=False, share=0.4),
-    "export": Command(_export, "exported", _open_exported, replaces=False, share=0.4),
+    "export": Command(
+        _export,
+        "exported",
+        _open_exported,
+        replaces=False,
+        varies=("arm.pt",),  # holds the lines of this program that led to it; is opened instead
+        share=0.4,
+    ),
 }
 """The commands that are killed, beside `train`."""
 

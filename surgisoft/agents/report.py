@@ -108,7 +108,7 @@ def verdict(task: str, results: Sequence[Evaluation]) -> str:
         parts.append(f"{Path(result.policy).name}: {', '.join(words) or 'see the table'}")
     episodes = len(next(iter(results[0].per_episode.values())))
     plural = "s" if episodes > 1 else ""
-    return f"{task}, {episodes} episode{plural} each. {'; '.join(parts)}."
+    return f"Task {task}, {episodes} episode{plural} each. {'; '.join(parts)}."
 
 
 def cell(value: Summary | None, rate: bool) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,8 @@ SUFFIX = ".rrd"
 """Suffix of a Rerun recording."""
 STEP = "step"
 """Timeline of the rows of the log; that of seconds is `contents.TIME`."""
+_IMPORTED_IN = os.getpid()
+"""The process that imported this module: a fork of it cannot flush recordings of its parent."""
 
 
 @contextlib.contextmanager
@@ -34,7 +37,8 @@ def new_recording(
     path = Path(path)
     if path.suffix != SUFFIX:
         raise InputError(f"{path}: suffix '{path.suffix}', expected {SUFFIX}")
-    flush_and_cleanup_orphaned_recordings()  # the last recording's threads, which no one holds now
+    if os.getpid() == _IMPORTED_IN:
+        flush_and_cleanup_orphaned_recordings()  # ends threads of recordings that no one holds now
     with new_file(path) as fresh:
         recording = rr.RecordingStream(application, recording_id=identity, send_properties=False)
         content = recording.memory_recording()

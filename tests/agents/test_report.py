@@ -37,7 +37,7 @@ def test_evaluate_writes_one_self_contained_page(tmp_path, capsys):
     assert "report.html" in capsys.readouterr().out
     assert [path.name for path in (tmp_path / "r").iterdir()] == ["report.html"]
     text = (tmp_path / "r" / "report.html").read_text()
-    assert "track_circle, 2 episodes each. scripted: " in text
+    assert "Task track_circle, 2 episodes each. scripted: " in text
     assert "First episode of random" in text
     with chromium() as browser:
         for width in (1280, 400):
@@ -70,4 +70,4 @@ def test_an_error_that_never_applied_is_no_number_of_the_verdict():
         )
     ]
     said = verdict("t", found)
-    assert said == "t, 9 episodes each. a: 0% success; b: 0% success, mean error 0.4 mm."
+    assert said == "Task t, 9 episodes each. a: 0% success; b: 0% success, mean error 0.4 mm."

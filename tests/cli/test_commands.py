@@ -258,7 +258,7 @@ def test_several_models_on_the_same_recording(lab, tmp_path, capsys):
     assert f"default  {values['models'][1]['rmse_mm']:10.4f}" in out
     page = (tmp_path / "page" / "report.html").read_text()
     assert "1/report.html" in page
-    assert "arm has the smallest error" in page
+    assert "Model arm has the smallest error" in page
     assert (tmp_path / "page" / "2" / "report.html").is_file()
     for wrong, said in (
         (["compare", arm, test, "default"], "give all models first"),

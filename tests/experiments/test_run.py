@@ -90,7 +90,7 @@ def test_results_are_not_overwritten(whole, tmp_path, capsys):
         open_results(load_experiment(other), folder, resume=True)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_text("x")
-    with pytest.raises(InputError, match="already there and no results"):
+    with pytest.raises(InputError, match="holds no results of an experiment"):
         open_results(load_experiment(other), tmp_path / "full", force=True)
     assert _rows(folder) == before
 

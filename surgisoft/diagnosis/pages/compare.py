@@ -338,7 +338,7 @@ def together_page(compared: Sequence[Compared], title: str, drawn: Sequence[Path
     best = min(compared, key=lambda one: one.result.rmse_mm)
     worst = max(compared, key=lambda one: one.result.rmse_mm)
     verdict = (
-        f"{best.name} has the smallest error, {_mm(best.result.rmse_mm)}; "
+        f"Model {best.name} has the smallest error, {_mm(best.result.rmse_mm)}; "
         f"{worst.name} has {_mm(worst.result.rmse_mm)}. {_upper(best.result.sentence)}."
     )
     rows = [

@@ -87,6 +87,27 @@ def limited(call, path, size: int = 300) -> str:
     return said if os.waitpid(pid, 0)[1] == 0 else "its process was ended"
 
 
+def limited_alone(writer, path, *sizes):
+    """As `limited` for each size, in a new process: Rerun's threads do not survive a fork."""
+    code = f"""
+import resource, sys
+from pathlib import Path
+from surgisoft.errors import InputError
+from tests import test_disks
+for size in sys.argv[2:]:
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), hard))
+    try:
+        test_disks.{writer}(Path(sys.argv[1]))
+        said = "written"
+    except (InputError, OSError) as error:
+        said = "one line, " + str("File too large" in str(error))
+    print(said, Path(sys.argv[1]).stat().st_size, file=sys.stderr)
+"""
+    command = [sys.executable, "-c", code, str(path), *map(str, sizes)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60).stderr.split("\n")
+
+
 def a_graph(path):
     with new_file(path) as fresh:
         write_torch_script(nn.Linear(9, 9), [torch.zeros(1, 9)], fresh)
@@ -98,12 +119,18 @@ def a_replay(path):
         stream.log("points", rr.Points3D(np.arange(900.0).reshape(-1, 3)))
 
 
+def a_live_view(path):
+    live_view.FLUSH_S = 1.0
+    bench = live_view.LiveBench(3, 2, "kPa", 70.0, "a bench", False)
+    with live_view.live_view(bench, file=path):
+        pass
+
+
 MADE = recording(np.zeros(400), walk(400))
 WRITERS = {
     "a.csv": lambda path: save_recording(MADE, path, force=True),
     "a.parquet": lambda path: save_recording(MADE, path, force=True),
     "arm.pt": a_graph,
-    "a.rrd": a_replay,
     "a.json": lambda path: write_json(path, list(range(900))),
 }
 """What writes a file of more than 300 bytes, by the file's name."""
@@ -120,19 +147,23 @@ def test_a_write_that_ends_in_the_middle_leaves_the_old_file(tmp_path, name):
     assert path.stat().st_size > 300
 
 
-@pytest.mark.parametrize("size", [0, 300])
-def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path, monkeypatch, size):
-    monkeypatch.setattr(live_view, "FLUSH_S", 1.0)
-    path, bench = tmp_path / "a.rrd", live_view.LiveBench(3, 2, "kPa", 70.0, "a bench", False)
-
-    def view(path):
-        with live_view.live_view(bench, file=path):
-            pass
-
+def test_a_replay_that_ends_in_the_middle_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.rrd"
     path.write_text("old")
-    assert limited(view, path, size).startswith("one line")
+    said = limited_alone("a_replay", path, 300, 1 << 30)
+    assert said[0] == "one line, True 3"
+    assert said[1].startswith("written ")
+    assert path.stat().st_size > 300
+    assert [file.name for file in tmp_path.iterdir()] == ["a.rrd"]
+
+
+def test_a_live_view_ends_where_its_file_cannot_be_written(tmp_path):
+    path = tmp_path / "a.rrd"
+    path.write_text("old")
+    said = limited_alone("a_live_view", path, 0)
+    assert said[-2].startswith("one line")
     assert path.read_text() == "old"
-    assert limited(view, path, 1 << 30) == "written"
+    assert limited_alone("a_live_view", path, 1 << 30)[-2].startswith("written ")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -49,6 +49,10 @@ BLOCK = re.compile(r"^```(?P<info>[^\n]*)\n(?P<body>.*?)^```\n", re.S | re.M)
 
 def main(arguments: list[str]) -> int:
     """Run the pages that are named, or all of them."""
+    unknown = [one for one in arguments if one.startswith("-") and one != "--write"]
+    if unknown:
+        print(__doc__)
+        return 0 if unknown[0] in ("-h", "--help") else 2
     write = "--write" in arguments
     names = [name.removesuffix(".md") for name in arguments if not name.startswith("-")]
     for guide in guides():

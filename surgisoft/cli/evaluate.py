@@ -53,7 +53,9 @@ def evaluate(
     seed: Annotated[
         int | None,
         typer.Option(
-            min=0, max=SEED_MAX, help="Seed of the episodes; default 0, with --rules its seed."
+            min=0,
+            max=SEED_MAX,
+            help="Seed of the episodes; default 0, with --rules the experiment's.",
         ),
     ] = None,
     on: Annotated[

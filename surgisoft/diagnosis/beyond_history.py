@@ -47,7 +47,7 @@ class BeyondHistory:
     losses: np.ndarray
     """(B,) held-out sum of squared distances by block of the black box, mm^2."""
     break_losses: np.ndarray
-    """(B,) the same with the best break beside it."""
+    """(B,) held-out sum of squared distances by block with the best break besides, mm^2."""
     break_at: float
     """Place of that break, as a share of the rows, 0 to 1."""
     line: float

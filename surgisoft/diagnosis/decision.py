@@ -368,6 +368,23 @@ MISSING = (
         since=3,
     ),
 )
+BEYOND_HISTORY = (
+    Feature(
+        "break",
+        -1,
+        _break,
+        "log gain of one break in time over a black box with memory, or over the best proposal",
+        since=3,
+    ),
+    Feature(
+        "line",
+        -1,
+        _line,
+        "share of what a black box with memory leaves in one line of its spectrum",
+        since=3,
+    ),
+)
+"""Features of two models: signs of what no function of the actuation and its past explains."""
 KNOWN = (
     Feature(
         "explained",
@@ -400,20 +417,7 @@ KNOWN = (
         lambda e: _z(e.effects[0].z) if e.effects else 0.0,
         "normal quantile of the best effect's family-wise p-value",
     ),
-    Feature(
-        "break",
-        -1,
-        _break,
-        "log gain of one break in time over a black box with memory, or over the best proposal",
-        since=3,
-    ),
-    Feature(
-        "line",
-        -1,
-        _line,
-        "share of what a black box with memory leaves in one line of its spectrum",
-        since=3,
-    ),
+    *BEYOND_HISTORY,
 )
 FIRST = (
     Feature(
@@ -552,20 +556,7 @@ NETWORK = (
         lambda e: _log(e.error_over_box, 0.0, 3.0),
         "log of the error over what a black box with memory reaches",
     ),
-    Feature(
-        "break",
-        -1,
-        _break,
-        "log gain of one break in time over a black box with memory, or over the best proposal",
-        since=3,
-    ),
-    Feature(
-        "line",
-        -1,
-        _line,
-        "share of what a black box with memory leaves in one line of its spectrum",
-        since=3,
-    ),
+    *BEYOND_HISTORY,
 )
 FEATURES = {"missing": MISSING, "known": KNOWN, "first": FIRST, "two": TWO, "network": NETWORK}
 """The features of each fitted model."""

@@ -249,6 +249,29 @@ def test_lengths_that_a_file_claims_take_no_memory(tmp_path, bag):
         assert not isinstance(caught.value.__cause__, MemoryError)
 
 
+def frame_head(compression: str, size: int) -> bytes:
+    """Begin of a packed frame that claims to unpack to so many bytes."""
+    if compression == "zstd":  # magic number, "one segment, size in 8 bytes", the size (RFC 8878)
+        return struct.pack("<IBQ", 0xFD2FB528, 0xE0, size)
+    return pytest.importorskip("lz4.frame").LZ4FrameCompressor().begin(source_size=size)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_a_packed_frame_claims_takes_no_memory(tmp_path, bag, compression):
+    """The chunk states a harmless size, and the frame inside, which the library goes by, 16 GB."""
+    text = MAP.replace("TOPICS", 'topic = "/tip"').replace("POSITIONS", "[['x', 'y', 'z']]")
+    (tmp_path / "map.toml").write_text(text)
+    frame = frame_head(compression, 1 << 34) + bytes(40)
+    name = compression.encode()
+    chunk = struct.pack("<QQQII", 0, 1, 1000, 0, len(name)) + name + struct.pack("<Q", len(frame))
+    chunk += frame
+    whole = bag.read_bytes()
+    record = struct.pack("<BQ", 6, len(chunk)) + chunk
+    (tmp_path / "bag.mcap").write_bytes(whole[:8] + record + whole[8:])
+    with pytest.raises(InputError, match="claims to unpack to 17179869184"):
+        import_files([tmp_path / "bag.mcap"], load_map(str(tmp_path / "map.toml")), "r")
+
+
 def test_a_clock_that_jumps_by_years_takes_no_memory(tmp_path):
     """The delay's search puts runs on an even clock: not over a gap of 3 billion samples."""
     t_s = 0.05 * np.arange(400.0)

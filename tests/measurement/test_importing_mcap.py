@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -241,12 +242,23 @@ def test_lengths_that_a_file_claims_take_no_memory(tmp_path, bag):
     while whole[chunk] != 6:
         chunk += 9 + struct.unpack_from("<Q", whole, chunk + 1)[0]
     (summary,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
-    for at, said in ((summary + 1, "cannot be read"), (chunk + 9 + 16, "claims to unpack to")):
-        damaged = whole[:at] + struct.pack("<Q", 1 << 62) + whole[at + 8 :]
+    long_name = (1 << 32) - 1 << 32  # length of the compression's name, behind a checksum
+    for damages, said in (
+        ([(summary + 1, 1 << 62)], "cannot be read"),
+        ([(chunk + 9 + 16, 1 << 62)], "claims to unpack to"),
+        ([(chunk + 1, 1 << 62), (chunk + 9 + 24, long_name)], "cannot be read|no column"),
+    ):
+        damaged = bytearray(whole)
+        for at, number in damages:
+            struct.pack_into("<Q", damaged, at, number)
         (tmp_path / "bag.mcap").write_bytes(damaged)
+        tracemalloc.start()
         with pytest.raises(InputError, match=said) as caught:
             import_files([tmp_path / "bag.mcap"], load_map(str(tmp_path / "map.toml")), "r")
+        _, most = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
         assert not isinstance(caught.value.__cause__, MemoryError)
+        assert most < 1 << 27
 
 
 def frame_head(compression: str, size: int) -> bytes:

@@ -36,6 +36,8 @@ RECORD, CHUNK, CHUNK_HEAD = struct.Struct("<BQ"), 6, struct.Struct("<QQQII")
 """Begin of a record (kind, length), the kind of a chunk, and the begin of a chunk (first and last
 time, unpacked size, checksum, length of the compression's name): MCAP specification,
 https://mcap.dev/spec."""
+LONGEST_NAME = 16
+"""Most bytes of a compression's name that is looked at; `zstd` and `lz4` are the known ones."""
 FRAME_HEAD = 32
 """Bytes of a chunk's packed records that hold the header of a Zstandard or LZ4 frame; the longest
 has 19 (RFC 8878; LZ4 frame format 1.6)."""
@@ -132,9 +134,8 @@ def _check_chunks(path: Path, file: Any) -> None:
         begin = file.tell()
         if kind == CHUNK and len(about := file.read(CHUNK_HEAD.size)) == CHUNK_HEAD.size:
             *_, claimed, _, length = CHUNK_HEAD.unpack(about)
-            name = file.read(min(length, size))
-            file.seek(8, os.SEEK_CUR)  # the length of the packed records
-            claimed = max(claimed, _frame_claims(name, file.read(FRAME_HEAD)))
+            packed = file.read(length + 8 + FRAME_HEAD) if length <= LONGEST_NAME else b""
+            claimed = max(claimed, _frame_claims(packed[:length], packed[length + 8 :]))
             if claimed > max(MOST_UNPACKED, MOST_PACKED * size):
                 raise InputError(
                     f"{path}: a chunk of {size} bytes claims to unpack to {claimed}; expected an "

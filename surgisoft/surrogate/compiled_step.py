@@ -34,6 +34,7 @@ class CompiledStep:
     ):
         """Parts of the model: network, and name and effect of its hysteresis, None without."""
         self.model, self.name, self._network, self._hysteresis = model, name, network, hysteresis
+        *self._hidden, self._out = network.layers
         self._tensors = [*model.parameters(), *model.buffers()]
         self._seen: list[tuple[int, int]] = []
         self._constants: list[np.ndarray] = []
@@ -79,7 +80,7 @@ class CompiledStep:
             _advance(*arrays, *self._constants)
         else:
             _advance_with_plays(*arrays, *self._constants, _array(memory), _array(after))
-        for layer in network.layers[:-1]:
+        for layer in self._hidden:
             if isinstance(layer, nn.Linear):
                 x = torch.addmm(layer.bias, x, layer.weight.t())
             else:
@@ -99,7 +100,7 @@ class CompiledStep:
 
         A product with 15 outputs takes three times as long as one with 16.
         """
-        layer = self._network.layers[-1]
+        layer = self._out
         assert isinstance(layer, nn.Linear)
         more = -layer.out_features % LANES
         weight, bias = layer.weight.detach().t(), layer.bias.detach()

@@ -284,11 +284,13 @@ def test_a_signal_does_not_break_off_the_venting():
             os.kill(os.getpid(), signal.SIGINT)
             super().vent()
 
-    bench = Slow()
-    with pytest.raises(Terminated), SafeRig(bench) as rig:
-        rig.command([10.0, 10.0])
+    def signalled(rig):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(30.0)
+
+    bench = Slow()
+    with pytest.raises(Terminated):
+        run(bench, signalled)
     assert (bench.vents, bench.closes) == (1, 1)
     bench = Slow()
     with SafeRig(bench):

@@ -494,6 +494,17 @@ class Chain:
         signal = self.walk(Signal(history.pressure), mode, links, behind)
         return Taps(*signal.behind_chambers(), mode.memory, behind)
 
+    @torch.no_grad()
+    def inputs(self, history: History, first: Tensor) -> tuple[Tensor, Tensor]:
+        """(R, T, m) actuation and direction of change that the network sees along a history.
+
+        first: (R, m) actuation at which each run begins. Memories are followed and not kept.
+        """
+        start = self.standing(first, signals=False)[0].memory
+        mode = Scanning(start, context_of(history), lambda tensor: tensor, history=history)
+        signal = self.walk(Signal(history.pressure), mode, self.inner)
+        return signal.value, signal.behind_chambers()[1]
+
     def hold(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         """Key points (..., n, 3) in mm behind the network, of given memories.
 

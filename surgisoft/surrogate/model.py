@@ -244,6 +244,15 @@ class ArmModel(nn.Module):
         chain = self.chain
         return chain.scan(history, self.first_pressure(history), chain.inner)
 
+    @property
+    def row_wise(self) -> bool:
+        """Whether the key points of a row follow from what the network sees in it (`inputs`)."""
+        return not (self.remembers or self.chain.outer)
+
+    def inputs(self, history: History) -> tuple[Tensor, Tensor]:
+        """(R, T, m) actuation and direction of change that the network sees in each row."""
+        return self.chain.inputs(history, self.first_pressure(history))
+
     def shape(self, pressure: Tensor, direction: Tensor, memory: dict[str, Tensor]) -> Tensor:
         """Key points (..., n, 3) in mm before body and sensor effects, of a static network.
 

@@ -155,7 +155,7 @@ class Sample:
 
 
 class RowPredictions:
-    """Predicted key points of a sample's rows, mm; the network computes the rows that are asked for.
+    """Predicted key points of a sample's rows, mm; the network computes those that are asked for.
 
     Memories follow every row. A network of whole runs, and effects behind the network, which may
     remember key points, need every row computed.

@@ -262,11 +262,14 @@ class ArmModel(nn.Module):
 
     def predict(self, history: History) -> Tensor:
         """Key points (R, T, n, 3) in mm, base frame, for whole runs; padding rows are void."""
-        return self.scan(history).behind["sensor"]
+        return self.scan(history, memories=False).behind["sensor"]
 
-    def scan(self, history: History) -> Taps:
-        """Signals behind each stage, key points too, and memories in each row of a history."""
-        return self.chain.scan(history, self.first_pressure(history))
+    def scan(self, history: History, memories: bool = True) -> Taps:
+        """Signals behind each stage, key points too, and memories in each row of a history.
+
+        memories: whether those are kept where there are very many rows.
+        """
+        return self.chain.scan(history, self.first_pressure(history), memories=memories)
 
     @property
     def states_interval(self) -> bool:

@@ -89,7 +89,7 @@ def demo(
 
 
 def _five_steps(folder: Path, policy: str | Path, progress: Progress) -> Demonstration:
-    """Run the steps into a folder that is there."""
+    """Run the five steps and write their files into an existing folder."""
     progress(0, 100, "step 1 of 5: two arms cut a ring")
     cut = evaluate(policy, "circle_ablation", episodes=1, log=(str(policy),))
     log = cut.logs[str(policy)]

@@ -220,7 +220,8 @@ def dose_map(log: EpisodeLog) -> Picture | None:
         return chart(
             figure,
             "dose on the organ",
-            f"Solid: the lesion. Dashed: healthy tissue begins. Treated from {least:.3g} on",
+            "Solid: the lesion. Dashed: healthy tissue begins. Treated from "
+            f"{least:.3g} times the threshold of ablation on",
         )
 
 
@@ -246,7 +247,8 @@ def spread_chart(
         if "[" not in label and every.min() >= 0.0 and every.max() <= 1.0:  # a share
             axis.set_xlim(-0.02, 1.02)
         axis.set_xlabel(label)
-        axis.set_title(title)
+        if title != label:
+            axis.set_title(title)
         return chart(figure, title, "One dot per episode; red: the mean")
 
 

@@ -282,7 +282,8 @@ def sweep_chart(field: str, label: str, lines: Mapping[str, Sequence[tuple]]) ->
     """
     colours = (BLUE, RED, GREEN, AMBER)
     name = field.split(".")[-1]
-    apart, most, known = name in UNORDERED, 0.0, set()
+    apart, most = name in UNORDERED, 0.0
+    known: set[float] = set()
     with drawing():
         figure, axis = plt.subplots()
         for k, ((title, points), colour) in enumerate(

@@ -16,7 +16,7 @@ from surgisoft.compiled import compiled
 
 
 def network_config(preset: Preset) -> dict:
-    """rsl-rl's arguments of an actor or critic; fresh each time, for rsl-rl writes into them."""
+    """rsl-rl's arguments of an actor or critic: a new dict each time, because rsl-rl changes it."""
     return {
         "hidden_dims": list(preset.hidden),
         "activation": preset.activation,
@@ -35,7 +35,7 @@ def noise_config(preset: Preset) -> dict:
 
 
 def empty_actor(agent: str, width: int, chambers: int, preset: Preset) -> MLPModel:
-    """An actor without its weights: (B, width) observations in, (B, chambers) outputs out."""
+    """An untrained actor: (B, width) observations in, (B, chambers) outputs out."""
     seen = TensorDict({agent: torch.zeros(1, width)}, batch_size=[1])
     config = {**network_config(preset), "distribution_cfg": noise_config(preset)}
     return MLPModel(seen, {"actor": [agent]}, "actor", chambers, **config)

@@ -58,6 +58,27 @@ def _looped(loop, bands: tuple[Tensor, Tensor], start: Tensor) -> Tensor | None:
     return out
 
 
+def stepped(
+    loop: Callable[..., None],
+    rows: tuple[Tensor, ...],
+    constants: tuple[Tensor, ...],
+    start: Tensor,
+) -> Tensor | None:
+    """A memory (R, T, ...) that a compiled loop steps; None where that does not apply.
+
+    It does not with gradients or on another device. loop: function of rows (R, T, ...), constants,
+    memory before the first row (R, ...) and the array that it fills.
+    """
+    parts = (*rows, *constants, start)
+    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    plain = all(p.device.type == "cpu" and p.dtype == start.dtype for p in parts)
+    if wanted or not plain or start.dtype not in (torch.float32, torch.float64):
+        return None
+    out = start.new_empty(*rows[0].shape[:2], *start.shape[1:])
+    loop(*(p.detach().contiguous().numpy() for p in parts), out.numpy())
+    return out
+
+
 def clamp_scan(low: Tensor, high: Tensor, start: Tensor) -> Tensor:
     """Recurrence y[:, t] = clamp(y[:, t-1], low[:, t], high[:, t]) with y[:, -1] = start.
 

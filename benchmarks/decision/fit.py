@@ -73,8 +73,6 @@ less than that."""
 NAMED_LOST = 0.03
 """Most known effects, as a share of them, that fewer wrong names may cost: that are named where a
 wrong name costs what a right one gains, and no more with the costs that are chosen. Stated."""
-MOST_CLEAN_NAMED = 0.02
-"""Most unchanged arms, as a share of each source, on which an effect may be named. Stated."""
 UNKNOWN_COSTS = (0.25, 0.5, 1.0, 2.0)
 """Costs of a wrong "unknown" that are tried, in units of what a right one is worth."""
 MOST_CALLED_UNKNOWN = 0.05
@@ -331,15 +329,12 @@ def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
 
     First those of a wrong name and of a needless one: with which the fewest names are wrong, and at
     most `NAMED_LOST` fewer known effects are named than with the costs of `Worth`. Of equal ones
-    the least. Only such costs count with which at most `MOST_CLEAN_NAMED` of unchanged arms are
-    given a name, as far as there are any. Then the least cost of a wrong "unknown" with which at
-    most `MOST_CALLED_UNKNOWN` of known effects and unchanged arms are called unknown. Shares are
-    means over the sources.
+    the least. Then the least cost of a wrong "unknown" with which at most `MOST_CALLED_UNKNOWN` of
+    known effects and unchanged arms are called unknown. Shares are means over the sources.
     """
     some = [(case, calibrated(chances, curves)) for case, chances in predicted]
     known = [one for one in some if one[0].label == "known" and one[0].size >= WEAK]
     kept = [one for one in some if one[0].label in ("known", "clean")]
-    clean = [one for one in some if one[0].label == "clean"]
 
     def share(of: Predicted, worth: Worth, hit: Callable[[Labelled, Decision], bool]) -> float:
         rates = []
@@ -353,9 +348,8 @@ def costs_of(predicted: Predicted, curves: dict[str, Curve]) -> Worth:
     for wrong, needless in itertools.product(NAME_COSTS, repeat=2):
         worth = replace(WORTH, wrong_name=-wrong, needless_name=-needless)
         if share(known, worth, names_truth) >= least:
-            clean_named = share(clean, worth, names_wrongly) > MOST_CLEAN_NAMED
-            tried.append((clean_named, share(some, worth, names_wrongly), wrong + needless, worth))
-    worth = min(tried, key=lambda each: each[:3])[3]
+            tried.append((share(some, worth, names_wrongly), wrong + needless, worth))
+    worth = min(tried, key=lambda each: each[:2])[2]
     for cost in UNKNOWN_COSTS:
         worth = replace(worth, wrong_unknown=-cost)
         called = share(kept, worth, lambda case, found: found.kind == "unknown_effect")

@@ -347,6 +347,18 @@ def test_a_lack_of_fit_counts_by_how_often_it_is_what_a_formula_gets_wrong(gain,
     assert chances[1] < chances[0]
 
 
+@pytest.mark.parametrize(
+    ("effect", "by_definition"), [("creep", True), ("creep", False), ("drift", True)]
+)
+def test_what_is_a_formula_by_definition_is_refuted_by_its_relaxed_form(effect, by_definition):
+    """Its quantile, 2.4 of 3, counts once more for the best single proposal, and for no other."""
+    place = [feature.name for feature in FEATURES["known"]].index("definition_z")
+    effects = (replace(CREEP, effect=effect, by_definition=by_definition), LAG)
+    proposals = (replace(ALONE, form_z=2.4), replace(PAIR, form_z=3.0))
+    row = features_of("known", replace(GOOD, effects=effects, proposals=proposals))
+    assert row[place] == pytest.approx(0.8 if effect == "creep" and by_definition else 0.0)
+
+
 def test_a_second_effect_that_few_motions_show_puts_neither_of_the_two_first():
     """What the second explains counts by its quantile, 1.5 of 3 here; none where it is chance."""
     place = [feature.name for feature in FEATURES["first"]].index("proposed")

@@ -205,6 +205,8 @@ def test_a_knock_is_told_where_a_turn_at_one_moment_explains_more(found):
     assert turned.sudden_margin < 0.0
     assert knock(turned) == ""
     assert found["creep"].statistics.sudden_log_gain == 0.0
+    defined = {row.effect for row in turned.effects if row.by_definition}
+    assert defined == {"misalignment", "gain_mismatch"}
     told = knock(replace(turned, sudden_margin=3.0))
     assert told.endswith("at one moment, as by a knock, explains more than misalignment")
 

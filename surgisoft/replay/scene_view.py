@@ -123,13 +123,14 @@ def scene_legend(scene: Scene) -> str:
 
 
 def _log_bar(recording, scene: Scene, towards: np.ndarray) -> None:
-    """Log a bar of a round length in front of the organ; towards: (3,) direction to the eye."""
-    low, high = scene.organ.world_mesh.bounds_mm
-    size = float(np.linalg.norm(high - low))
+    """Log a bar of a round length right of the organ; towards: (3,) direction to the eye."""
+    mesh = scene.organ.world_mesh
+    low, high = mesh.bounds_mm
+    size, middle = float(np.linalg.norm(high - low)), 0.5 * (low + high)
     length = bar_length(BAR_SHARE * size)
-    across = np.cross([0.0, 0.0, 1.0], towards)
-    middle = 0.5 * (low + high) * [1.0, 1.0, 0.0] + [0.0, 0.0, low[2]] + 0.5 * size * towards
-    ends = middle + np.array([[-0.5], [0.5]]) * length * across
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    beyond = float(((mesh.vertices_mm - middle) @ right).max()) + 0.08 * size
+    ends = middle + (beyond + np.array([[0.0], [length]])) * right
     bar = rr.LineStrips3D(
         [ends], colors=[MEASURED_COLOUR], radii=[0.004 * size], labels=[f"{length:g} mm"]
     )

@@ -65,11 +65,29 @@ class CompiledStep:
     def __call__(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
         """State and key points (B, n, 3) mm, base frame, after a step at `pressure` (B, m)."""
         network = self._network
+        state, x = self._followed(state, pressure)
+        for layer in self._hidden:
+            if isinstance(layer, nn.Linear):
+                x = torch.addmm(layer.bias, x, layer.weight.t())
+            else:
+                x = nn.functional.silu(x, inplace=True)
+        assert self._last is not None
+        x = torch.addmm(self._last[1], x, self._last[0])[:, : len(network.mean)]
+        points = torch.addcmul(network.mean, x, network.scale)
+        return state, points.view(len(pressure), network.key_points, 3)
+
+    @torch.no_grad()
+    def follow(self, state: ArmState, pressure: Tensor) -> ArmState:
+        """State after a step at `pressure` (B, m), where nobody asks for its key points."""
+        return self._followed(state, pressure)[0]
+
+    def _followed(self, state: ArmState, pressure: Tensor) -> tuple[ArmState, Tensor]:
+        """State after a step at `pressure` (B, m), and the network's inputs (B, m or 2 m) there."""
         count, chambers = pressure.shape
         memory = pressure.new_empty(count, 0) if self.name is None else state.memory[self.name]
         after, anchor = torch.empty_like(memory), torch.empty_like(pressure)
         direction = torch.empty_like(pressure)
-        x = pressure.new_empty(count, chambers * (2 if network.directions else 1))
+        x = pressure.new_empty(count, chambers * (2 if self._network.directions else 1))
         arrays = [
             _array(t) for t in (pressure, state.anchor, state.direction, anchor, direction, x)
         ]
@@ -80,16 +98,8 @@ class CompiledStep:
             _advance(*arrays, *self._constants)
         else:
             _advance_with_plays(*arrays, *self._constants, _array(memory), _array(after))
-        for layer in self._hidden:
-            if isinstance(layer, nn.Linear):
-                x = torch.addmm(layer.bias, x, layer.weight.t())
-            else:
-                x = nn.functional.silu(x, inplace=True)
-        assert self._last is not None
-        x = torch.addmm(self._last[1], x, self._last[0])[:, : len(network.mean)]
-        points = torch.addcmul(network.mean, x, network.scale).view(count, network.key_points, 3)
         held = {} if self.name is None else {self.name: after}
-        return ArmState(pressure, anchor, direction, held), points
+        return ArmState(pressure, anchor, direction, held), x
 
     def alone(self, state: ArmState, pressure: np.ndarray) -> LoneArmModel:
         """Steps of the one arm (B = 1) of a state; see `LoneArmModel`."""

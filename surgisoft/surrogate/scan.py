@@ -33,6 +33,30 @@ def clamp_loop(low: np.ndarray, high: np.ndarray, start: np.ndarray, out: np.nda
 
 
 @compiled
+def play_loop(signal: np.ndarray, radius: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
+    """`clamp_loop` between signal - radius and signal + radius, for signals that share radii.
+
+    signal (R, T, ...), radius (J,), start (R, ..., J) and out (R, T, ..., J).
+    """
+    runs, steps, radii = out.shape[0], out.shape[1], len(radius)
+    loads = signal.reshape(runs, steps, -1)
+    plays = out.reshape(runs, steps, -1, radii)
+    first = start.reshape(runs, -1, radii)
+    for r in range(runs):
+        before = first[r]
+        for t in range(steps):
+            after = plays[r, t]
+            for c in range(loads.shape[2]):
+                load = loads[r, t, c]
+                for j in range(radii):
+                    last, bottom, top = before[c, j], load - radius[j], load + radius[j]
+                    value = last if last > bottom else bottom
+                    value = value if value < top else top
+                    after[c, j] = value if last == last and bottom == bottom else last + bottom
+            before = after
+
+
+@compiled
 def linear_loop(factor: np.ndarray, addend: np.ndarray, start: np.ndarray, out: np.ndarray) -> None:
     """y[r, t, c] = factor y[r, t - 1, c] + addend into out; start (R, C), the rest (R, T, C)."""
     for r in range(out.shape[0]):
@@ -110,8 +134,12 @@ def play_scan(signal: Tensor, radius: Tensor, start: Tensor) -> Tensor:
     a play last moved, at step s, it is u[s] -+ r, so its gradient is that of a gather at s, and
     that of the start where it has not moved yet.
     """
+    plays = None
+    if radius.ndim == 1 and signal.ndim > 2 and signal.stride(-1) == 0:
+        # Plays of several radii on one signal: nothing as large as the result is made beside it.
+        plays = stepped(play_loop, (signal[..., 0],), (radius,), start)
     with torch.no_grad():
-        plays = clamp_scan(signal - radius, signal + radius, start)
+        plays = clamp_scan(signal - radius, signal + radius, start) if plays is None else plays
     if not (torch.is_grad_enabled() and (signal.requires_grad or start.requires_grad)):
         return plays
     moved = plays != torch.cat([start.detach().unsqueeze(1), plays[:, :-1]], dim=1)

@@ -37,7 +37,7 @@ from surgisoft.tasks.registry import config_of, make_task, with_fields
 
 TASK = "circle_ablation"
 """The task that is judged."""
-DEVELOPMENT = range(11)
+DEVELOPMENT = range(19)
 """Seeds of robots on which the observer's constants were chosen, or that earlier results show."""
 MINUTES_POINTS = 12_000
 """Samples of a robot's own recording: ten minutes of `mixed` at 20 Hz."""

@@ -167,7 +167,8 @@ class Observer:
         assert self.learner is not None
         turn = part.mount[:, :3, :3]
         off = (measured - part.points_mm) @ turn
-        memory, now = self.learner.updated(part.plant.adaptation, off, pressure)
+        body = (part.points_mm - part.mount[:, None, :3, 3]) @ turn
+        memory, now, lead = self.learner.updated(part.plant.adaptation, off, pressure, body)
         offset = self.learner.expected(memory, pressure) @ turn.mT
         plant = replace(part.plant, adaptation=memory)
-        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset)
+        return now @ turn.mT, replace(part, plant=plant, offset_mm=offset, lead_mm=lead @ turn.mT)

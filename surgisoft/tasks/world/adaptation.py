@@ -194,12 +194,13 @@ class DisturbanceEstimator:
         self.dt_s, self.steady, self.late = dt_s, m + 1, slice(m + 1, m + 1 + lags)
         self.left = tensor(np.exp(-dt_s / tau_s / (1.0 + USUAL / turn)))[:, None]
         self.turn_mm = tensor(turn * _range_mm(model, low, high))[:, None]
+        self.rest_mm = tensor(steady_key_points(model, rest[None]).reshape(1, -1)) @ self.shapes
 
     def start(self, count: int) -> Adaptation:
-        """Memory of `count` arms of which nothing was measured yet."""
+        """Memory of `count` arms at rest of which nothing was measured yet."""
         size, k = self.deviation.shape
         covariance = torch.eye(k, device=self.keep.device).expand(count, size, k, k).clone()
-        behind = self.keep.new_zeros(count, len(LAGS), size)
+        behind = self.rest_mm.expand(count, len(LAGS), size).clone()
         return Adaptation(
             torch.zeros_like(covariance[..., 0]), covariance, behind, torch.zeros_like(behind[:, 0])
         )

@@ -209,7 +209,9 @@ class DisturbanceEstimator:
         """(B, n, 3) mm, base frame: the disturbance that controllers expect at (B, m) kPa."""
         some = slice(0, self.steady)
         known = memory.mean[..., some] * self._loads(pressure) * self.deviation[:, some]
-        return self._body(known.sum(2) + memory.shown_mm)
+        transient = memory.mean[..., -1] * self.deviation[:, -1]
+        decayed = (1.0 / self.keep[-1] - 1.0) * transient
+        return self._body(known.sum(2) + memory.shown_mm - decayed)
 
     def updated(
         self,

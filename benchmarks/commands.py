@@ -376,6 +376,7 @@ def robust(
 
     from benchmarks.robust import FILTER, LEARNS, Method, Study, draw, markdown, run
     from surgisoft.errors import unknown_name
+    from surgisoft.rig.hidden import HIDDEN
 
     check_free(json_file, "cases")
     check_folder(work)
@@ -403,8 +404,8 @@ def robust(
         best,
         seeds("--hidden-robots", hidden_robots),
         hidden_episodes,
-        **({"hidden": tuple(hidden.split(","))} if hidden else {}),
-        exact=exact,
+        tuple(hidden.split(",")) if hidden else tuple(HIDDEN),
+        exact,
     )
     torch.set_num_threads(1)
     with progress("robust") as report:

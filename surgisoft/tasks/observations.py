@@ -96,7 +96,7 @@ TIME = Block("time", "elapsed share of the episode", "-", "x", 0.0, 1.0)
 
 def body_blocks(arm: Arm, part: ArmPart) -> ObservationBlocks:
     """Observation blocks of an arm's body: measured key points and pressures."""
-    shape = ((part.seen_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
+    shape = ((part.steered_mm - arm.pose[:3, 3])[:, 1:] / 50.0).flatten(1)
     return {SHAPE: shape, **pressure_blocks(arm, part)}
 
 

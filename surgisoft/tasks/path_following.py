@@ -226,10 +226,10 @@ class Follow:
         two and the predicted one are also scaled with `fine_mm`.
         """
         part, history = state.world.arms["arm"], state.goal.history
-        point = self.marker(part.seen_mm)
+        point = self.marker(part.steered_mm)
         errors = [self.target_mm(state, ahead) - point for ahead in range(self.config.preview + 1)]
         blocks = {
-            SHAPE: (part.seen_mm - self._rest)[:, 1:].flatten(1) / 10.0,
+            SHAPE: (part.steered_mm - self._rest)[:, 1:].flatten(1) / 10.0,
             **numbered(ERROR, [asinh(error) for error in errors]),
             **numbered(FINE, [asinh(error / self.config.fine_mm) for error in errors[:2]]),
         }
@@ -254,7 +254,7 @@ class Follow:
             return held
         # The model starts from the arm's true shape. Adding only the predicted movement to the
         # measured shape keeps the sensors' noise in the observation.
-        return part.seen_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
+        return part.steered_mm + held - self.arm.predict(part, part.pressure, self.dt_s)
 
     def rewards(self, state: TaskState[FollowGoal]) -> dict[str, dict[str, Tensor]]:
         """Weighted reward terms, see `FollowWeights`."""

@@ -58,12 +58,13 @@ def test_a_draft_imports_its_file(tmp_path, header, layout, pressure, scale):
 
 
 def test_what_a_header_does_not_say_is_marked(tmp_path):
-    header = "nr,pressure1,set1,x0,y0,z0,target_x,target_y,target_z"
+    header = "take,pressure1,set1,x0,y0,z0,target_x,target_y,target_z"
     text = draft_map(lab_file(tmp_path, header))
     assert "rate_hz = 20.0  # check: no column of time" in text
     assert 'columns = ["pressure1"]\nunit = "kPa"  # check: the header names no unit' in text
     assert 'positions = [["x0", "y0", "z0"]]\nunit = "mm"  # check' in text
-    assert "# not used: nr, set1, target_x, target_y, target_z" in text
+    assert '[runs]  # check: a new value begins a new run\ncolumn = "take"' in text
+    assert "# not used: set1, target_x, target_y, target_z" in text
 
 
 def test_no_key_points_and_no_numbers_are_errors(tmp_path):

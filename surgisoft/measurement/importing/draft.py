@@ -28,6 +28,7 @@ ACTUATION = re.compile(
 )
 NOT_MEASURED = re.compile(r"target|goal|soll|reference|desired|predict|\bvel|\bacc", re.I)
 """Words in the names of positions that are no measured ones."""
+RUN = re.compile(r"(run|take|trial|episode|repeat)([_ ]?(id|nr|no|number|index))?", re.I)
 AN_X = re.compile(r"(?<![A-Za-z])[xX](?![A-Za-z])|(?<=[a-z0-9])X(?![a-z])")
 """An x that stands for the axis: `x0`, `tip_x`, `tipX`."""
 
@@ -86,7 +87,8 @@ def draft_map(path: str | Path) -> str:
     for table, found in (("measured", measured), ("commanded", commanded)):
         if found:
             unit = _unit(found, ACTUATION_UNITS, "kPa")
-            lines += [f"[{table}]", f"columns = [{', '.join(column(found))}]", f"unit = {unit}", ""]
+            lines += [f"[{table}]", f"columns = [{', '.join(column(found))}]", f"unit = {unit}"]
+            lines += ['# to = "kPa"  # the unit of your model, if it is another one', ""]
     if not measured and not commanded:
         lines += ["# [measured]  # check: no columns of the actuation are recognised", ""]
     triples = ", ".join(f"[{', '.join(column(point))}]" for point in points)
@@ -100,7 +102,14 @@ def draft_map(path: str | Path) -> str:
         '# origin = "k0"',
         "# gravity = [0, -1, 0]  # direction of weight in your frame",
     ]
-    unused = [name for name in rest if name not in (*measured, *commanded)]
+    runs = next((name for name in rest if RUN.fullmatch(name) and name not in commanded), None)
+    if runs:
+        lines += [
+            "",
+            "[runs]  # check: a new value begins a new run",
+            f"column = {column([runs])[0]}",
+        ]
+    unused = [name for name in rest if name not in (*measured, *commanded, runs)]
     if unused:
         lines += ["", f"# not used: {', '.join(unused)}"]
     return "\n".join(lines) + "\n"

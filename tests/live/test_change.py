@@ -51,8 +51,8 @@ def detector():
 
 
 def test_the_threshold_follows_from_the_wanted_rate(detector):
-    """Lorden (1971): exp(h) blocks of each of two charts for each of nine components."""
-    assert detector.threshold == pytest.approx(np.log(10 * 3600 / 0.5 * 2 * 9))
+    """Lorden (1971): exp(h) blocks of each of three charts for each of nine components."""
+    assert detector.threshold == pytest.approx(np.log(10 * 3600 / 0.5 * 3 * 9))
     other = fit_detector([residual(600, 1)], AlarmDesign(false_alarm_h=1.0))
     assert detector.threshold - other.threshold == pytest.approx(np.log(10.0))
 
@@ -118,16 +118,18 @@ def test_sample_by_sample_is_the_cusum_of_the_block_means(detector):
     assert not w.elsewhere_mm2.any()
     assert unknown[1:].max() < 0.2, "the waves return to where the reference was"
     y = left @ w.axes
-    charts, expected = np.zeros(18), []
+    charts, expected, last = np.zeros(27), [], [np.zeros(27)]
     for now, before, step in zip(y[1:], y[:-1], np.diff(blocks.position, axis=0), strict=True):
         kept = np.exp(-np.hypot(*step) / w.memory.reach - 0.5 / w.memory.time_s)
         rho = (1 - w.memory.white) * kept
         sd = w.level_mm * detector.enlargement
         level, fast = (now / sd) ** 2, (now - rho * before) ** 2 / sd**2 / (1 - rho**2)
-        ratio = 0.5 * np.concatenate([level, fast]) * (1 - design.scale**-2) - np.log(design.scale)
-        ratio[:9] *= (1 - kept**2) / (1 + kept**2)
-        most = np.concatenate([(1 - kept**2) / (1 + kept**2), np.ones(9)]) * h / 3
-        charts = np.maximum(0.0, charts + np.minimum(np.minimum(ratio, h / 4), most))
+        squares, worth = np.concatenate([level, fast, fast]), (1 - kept**2) / (1 + kept**2)
+        count = np.concatenate([worth, np.ones(9), worth >= 0.5])
+        ratio = (0.5 * squares * (1 - design.scale**-2) - np.log(design.scale)) * count
+        charts = np.maximum(0.0, charts + np.minimum(np.minimum(ratio, h / 4), count * h / 3))
+        charts = np.minimum(charts, np.min(last[-6:], axis=0) + h / 2)
+        last.append(charts)
         expected.append(charts.max() / h)
     np.testing.assert_allclose(levels[20::10][: len(expected)], expected[: len(levels[20::10])])
 

@@ -623,9 +623,11 @@ class Alarm:
     at_s: float
     """Time of the sample after which the alarm was raised [s]."""
     since_s: float
-    """Estimated time of the change: the chart that raised it was at zero until then [s]."""
+    """Estimated time of the change: the median of the times until which the charts that have risen
+    to half the threshold were at zero [s]."""
     chart: str
-    """`level`, of an error that lasts, or `innovation`, of one that came fast."""
+    """`level`, of an error that lasts, `innovation`, of one that came fast, or `fast moves`, of one
+    that comes with each of them."""
     before_mm: float
     """RMS distance of the key points from the model in the reference [mm]."""
     after_mm: float
@@ -749,13 +751,15 @@ class Charts:
     def _raise(self, t_s: float) -> Alarm:
         assert self._charts is not None
         assert self._zero_s is not None
-        over = np.flatnonzero(self._charts > self.detector.threshold)
-        chart = int(over[self._zero_s[over].argmin()])
-        since_s = float(self._zero_s[chart])
-        kind = "level" if chart < len(self._charts) // CHARTS else "innovation"
+        kinds = ("level", "innovation", "fast moves")
+        chart = int(self._charts.argmax())
+        # One chart may have risen before the change; the most that have risen did so with it.
+        risen = self._charts > 0.5 * self.detector.threshold
+        since_s = float(np.quantile(self._zero_s[risen], 0.5, method="lower"))
         squares = [square for at_s, square in self._recent if at_s > since_s]
         after = float(np.sqrt(np.mean(squares))) if squares else float("nan")
-        self.alarm = Alarm(t_s, since_s, kind, self.detector.reference_mm, after)
+        name = kinds[chart * CHARTS // len(self._charts)]
+        self.alarm = Alarm(t_s, since_s, name, self.detector.reference_mm, after)
         self.alarms.append(self.alarm)
         return self.alarm
 

@@ -5,7 +5,14 @@ import pytest
 from scipy.signal import lfilter
 
 from surgisoft.errors import InputError
-from surgisoft.live.change import AlarmDesign, Charts, Stretch, block_means, blocks_of
+from surgisoft.live.change import (
+    AlarmDesign,
+    Charts,
+    Coverage,
+    Stretch,
+    block_means,
+    blocks_of,
+)
 from surgisoft.live.change import fit_detector as fit
 
 RATE_HZ = 20.0
@@ -200,3 +207,39 @@ def test_motion_that_the_reference_lacks_is_not_judged(detector):
             charts.update(*each)
         assert len(charts.alarms) == alarms
         assert charts.left_out in ((80, 81) if alarms == 0 else (0,))
+
+
+def test_one_move_alone_raises_no_alarm_and_a_lasting_error_does(detector):
+    """Two seconds of an error of 5 mm are one event; eight seconds of it are not."""
+    for seconds, alarms in ((2.0, 0), (8.0, 1)):
+        t_s, values = residual(120, 6)
+        values[(t_s >= 60.0) & (t_s < 60.0 + seconds), -1] += 5.0
+        charts, levels = fed(detector, t_s, values)
+        assert len(charts.alarms) == alarms
+        assert levels.max() > 0.45
+
+
+def test_a_reference_that_does_not_repeat_judges_nothing():
+    """Straight through the range in four minutes, never coming back; then a lasting error."""
+    t_s, values = residual(240, 3)
+    away = SPAN * np.linspace(0.0, 1.0, len(t_s))[:, None]
+    found = fit([Stretch(t_s, values, away)], SPAN)
+    assert found.repeated < 0.5
+    assert not found.judges
+    values[t_s >= 120.0, -1] += 1.0
+    charts = Charts(found)
+    for each in zip(t_s, values, away, strict=True):
+        charts.update(*each)
+    assert not charts.alarms
+    assert not charts.judged
+
+
+def test_a_motion_is_covered_where_the_reference_came_to_it_twice():
+    there, here = np.full((8, 2), -1.0), np.full((8, 2), 1.0)
+    asked = np.array([1.0, 1.0, 0.0, 0.0])
+    assert Coverage.of([np.concatenate([there, here])], 0.5).visits(asked) == 1
+    twice = Coverage.of([np.concatenate([there, here, there, here])], 0.5)
+    assert twice.visits(asked) == 2
+    assert twice.covers(asked)
+    assert not twice.covers(-0.5 * asked)
+    assert Coverage.of([here, here], 0.5).visits(asked) == 2, "another run is another visit"

@@ -239,14 +239,19 @@ def kept_change(
 
 
 def run(
-    robots: Sequence[int], hours: float, folder: Path, processes: int, report: Progress
+    robots: Sequence[int],
+    changed: Sequence[int],
+    hours: float,
+    folder: Path,
+    processes: int,
+    report: Progress,
 ) -> tuple[list[Clean], list[Change]]:
-    """Both studies on every robot."""
+    """Hours of clean rig of the robots, and effects that begin on those of `changed`."""
     clean: list[Clean] = []
     changes: list[Change] = []
-    for robot in robots:
+    for robot in sorted({*robots, *changed}):
         base_model(robot, folder)
-    cases = list(itertools.product(robots, CHANGES))
+    cases = list(itertools.product(changed, CHANGES))
     with workers(processes) as pool:
         jobs = {
             pool.submit(kept_clean, r, m, hours, folder): clean for r in robots for m in MOTIONS

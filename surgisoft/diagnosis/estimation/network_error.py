@@ -68,8 +68,8 @@ class NetworkError:
 
         def at(pressure: np.ndarray, direction: np.ndarray, size: float) -> NetworkError:
             actuation = low + (high - low) * (pressure + 1.0) / 2.0
-            both = (torch.from_numpy(values).float() for values in (actuation, direction))
-            return cls(network, _spread(network), *both, size)
+            inputs = torch.from_numpy(actuation).float(), torch.from_numpy(direction).float()
+            return cls(network, _spread(network), *inputs, size)
 
         rng = np.random.default_rng(0)
         shape = RANGE_ROWS, len(low)
@@ -86,7 +86,7 @@ class NetworkError:
 
         The sums are over rows and coordinates, each with one of the fields (S, n, 3, P).
         """
-        weights = {name: self.network.get_parameter(name) for name in self.spread}
+        weights: dict[str, Tensor] = {n: self.network.get_parameter(n) for n in self.spread}
         if fields.shape[-1] > MOST_BACKWARD:
             draws = self._draws(weights)
             return self.size * np.einsum("sncp,sncw->pw", fields, draws, optimize=True)
